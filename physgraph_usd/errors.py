@@ -1,0 +1,55 @@
+"""Every error that physgraph_usd raises on purpose.
+
+    PhysGraphError
+    |-- UsageError          an option or argument is wrong (exit code 2)
+    |-- StageError          the input stage cannot be read as asked
+    |   |-- GarmentError    one garment prim is broken: names prim, time code and remedy
+    |   `-- SchemaError     an attribute has an unusable type or value
+    |-- SolveError          the solver met a state it cannot continue from
+    `-- LayerError          the output layer cannot be written or is invalid
+
+A message gives the value, the place and the choices, in one line each.
+"""
+
+from __future__ import annotations
+
+
+class PhysGraphError(Exception):
+    """Root of all errors raised on purpose; its text is meant for the user."""
+
+
+class UsageError(PhysGraphError):
+    """An option or argument is wrong; the command line exits with 2."""
+
+
+class StageError(PhysGraphError):
+    """The input stage cannot be opened or read as asked."""
+
+
+class GarmentError(StageError):
+    """A garment prim is broken.
+
+    Args:
+        path: Prim path.
+        problem: What is wrong, with the value or index found.
+        time: Time code at which it was found, or None when it holds at all times.
+        remedy: What the user can do.
+    """
+
+    def __init__(self, path: str, problem: str, *, time: float | None = None, remedy: str = "") -> None:
+        """Compose the message from place, problem and remedy."""
+        self.path, self.problem, self.time, self.remedy = path, problem, time, remedy
+        where = f"<{path}>" if time is None else f"<{path}> at time code {time:g}"
+        super().__init__(f"{where}: {problem}" + (f"; {remedy}" if remedy else ""))
+
+
+class SchemaError(StageError):
+    """A physgraph attribute has a type or value that cannot be used."""
+
+
+class SolveError(PhysGraphError):
+    """The solver met a state it cannot continue from, such as a non-finite energy."""
+
+
+class LayerError(PhysGraphError):
+    """The output layer cannot be written, or failed validation."""

@@ -1,0 +1,41 @@
+"""Fabric parameters in SI units, and named presets.
+
+Sources and their spread are in docs/fabrics.md; trust ranges over points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Fabric:
+    """One fabric's parameters.
+
+    Attributes:
+        stretch: In-plane Young's modulus of the sheet, Y = E h / (1 - nu^2) [N/m].
+        bend: Bending stiffness D = E h^3 / 12 (1 - nu^2) [N m].
+        density: Areal density [kg/m^2].
+        thickness: Sheet thickness [m].
+        shear: Shear stiffness G h [N/m]; None selects edge springs (G = 0.375 Y).
+    """
+
+    stretch: float = 30.0
+    bend: float = 4.7e-6
+    density: float = 0.187
+    thickness: float = 1e-3
+    shear: float | None = None
+
+
+PRESETS: dict[str, Fabric] = {
+    "paper": Fabric(3.85, 0.29e-6, 0.187),
+    "silk": Fabric(100.0, 1.5e-6, 0.083),
+    "cotton": Fabric(261.0, 5e-6, 0.150),
+    "wool": Fabric(97.0, 7e-6, 0.235),
+    "polyester": Fabric(120.0, 0.75e-6, 0.165),
+    "denim": Fabric(490.0, 20e-6, 0.324),
+    "jersey": Fabric(30.0, 4.7e-6, 0.187),
+    "rib": Fabric(50.0, 9.3e-6, 0.276),
+    "leather": Fabric(640.0, 30e-6, 0.65),
+}
+"""Fabrics by name; shear is left to the edge springs unless an artist authors it."""

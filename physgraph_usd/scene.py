@@ -1,0 +1,106 @@
+"""The nouns of the solver: what a shot is and what one time code gives.
+
+Everything here is SI, in world space, and knows no USD. Only ``usd/`` converts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .fabric import Fabric
+from .mesh.topology import PolygonMesh
+
+
+@dataclass(frozen=True, eq=False)
+class Garment:
+    """One garment's constant data.
+
+    Attributes:
+        path: Prim path, used as its name in reports and errors.
+        mesh: The coarse cage, faces in authored order and winding, holes removed.
+        rest: Rest positions of the cage [m], shape (V, 3), float64.
+        level: Number of subdivisions.
+        flipped: Whether the authored winding is clockwise seen from outside.
+        bent_rest: True: hinges rest at the rest shape's angles; False: flat.
+        stretch_scale: Multiplier of the stretch stiffness, shape (V,).
+        bend_scale: Multiplier of the bending stiffness, shape (V,).
+        guide_scale: Multiplier of the guide stiffness, shape (V,).
+        detail_scale: Multiplier of the detail written out, shape (V,).
+        pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,).
+    """
+
+    path: str
+    mesh: PolygonMesh
+    rest: np.ndarray
+    level: int
+    flipped: bool
+    bent_rest: bool
+    stretch_scale: np.ndarray
+    bend_scale: np.ndarray
+    guide_scale: np.ndarray
+    detail_scale: np.ndarray
+    pin: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentFrame:
+    """One garment at one time code.
+
+    Attributes:
+        points: Coarse positions [m], world space, shape (V, 3), float64.
+        fabric: Fabric at this time.
+        guide: Guide stiffness [N/m^3].
+        detail: Gain of the added detail, 1 writes the solution itself.
+    """
+
+    points: np.ndarray
+    fabric: Fabric
+    guide: float = 2000.0
+    detail: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What the stage gives at one time code.
+
+    Attributes:
+        time: The stage's own time code; None for a shot without samples.
+        garments: One entry per garment of the scene, in its order.
+    """
+
+    time: float | None
+    garments: tuple[GarmentFrame, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays the same over the shot.
+
+    Attributes:
+        garments: The garments to refine.
+        gravity: Gravity [m/s^2], shape (3,).
+        times: Time codes to refine, ascending; empty for a shot without samples.
+    """
+
+    garments: tuple[Garment, ...]
+    gravity: np.ndarray
+    times: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What was computed at one time code.
+
+    Attributes:
+        time: The stage's own time code; None for a shot without samples.
+        points: Fine positions [m], world space, one (V, 3) float32 or float64 array per garment.
+        telemetry: Plain numbers and words per garment, ready for JSON.
+        reused: True when the input equalled the previous frame's and its state was kept.
+    """
+
+    time: float | None
+    points: tuple[np.ndarray, ...]
+    telemetry: tuple[dict[str, object], ...] = field(default=())
+    reused: bool = False
