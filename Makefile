@@ -1,0 +1,56 @@
+# make demo       refine a sample shot and say where the layer, the report and the picture are
+# make test       every check, and the fast tests
+# make test-all   every check, and all tests
+# make format     let ruff rewrite what it can
+# PYTHON=python3.12 picks the interpreter of the environment; JOBS=8 the number of test processes.
+
+PYTHON ?= python3
+JOBS ?= 2
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
+DEMO := out/demo
+TESTS := $(BIN)/pytest -n $(JOBS)
+
+.PHONY: demo test test-all lint format clean
+
+demo: $(VENV)/.demo
+	@mkdir -p $(DEMO)
+	@shot=$$($(BIN)/physgraph-usd sample sleeve -o $(DEMO) --overwrite) && \
+	$(BIN)/physgraph-usd refine $$shot -o $(DEMO)/sleeve.refined.usdc --report $(DEMO)/sleeve.json --overwrite >/dev/null && \
+	$(BIN)/physgraph-usd preview $(DEMO)/sleeve.refined.usdc --shot $$shot -o $(DEMO)/sleeve.png --overwrite >/dev/null && \
+	printf '\nshot     %s\nlayer    %s\nreport   %s\npicture  %s\n' \
+		$$shot $(DEMO)/sleeve.refined.usdc $(DEMO)/sleeve.json $(DEMO)/sleeve.png
+
+test: lint
+	$(TESTS) -m "not slow"
+
+test-all: lint
+	$(TESTS)
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+
+$(VENV)/.python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' || \
+		{ echo 'error: $(PYTHON) is not Python 3.11 to 3.14; choose one with make PYTHON=python3.12'; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+	@touch $@
+
+$(VENV)/.demo: pyproject.toml $(VENV)/.python
+	$(PIP) -e '.[usd,preview]'
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml $(VENV)/.python
+	$(PIP) -e '.[dev]'
+	@touch $@ $(VENV)/.demo
