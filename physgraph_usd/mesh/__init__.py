@@ -1,0 +1,1 @@
+"""Polygon meshes: topology, subdivision and the attributes that ride along."""

@@ -1,0 +1,284 @@
+"""Polygon meshes and the element lists that forces are summed over.
+
+Everything is vectorised numpy on index arrays; positions appear only where a choice depends on them. The winding is the
+authored one throughout.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Incidence:
+    """Which elements touch each vertex, in compressed rows for per-vertex gathers.
+
+    Attributes:
+        starts: Row offsets, shape (V + 1,), int32; the row of vertex v is ``starts[v]:starts[v + 1]``.
+        element: Element of each entry, ascending within a row, shape (N,), int32.
+        corner: Which corner of that element the vertex is, shape (N,), int32.
+    """
+
+    starts: np.ndarray
+    element: np.ndarray
+    corner: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Undirected edges of triangles.
+
+    Attributes:
+        vertices: Edges with the lower vertex first, in lexicographic order, shape (E, 2), int32.
+        face_count: Number of triangles at each edge, shape (E,), int32; triangles that repeat a vertex do not count.
+    """
+
+    vertices: np.ndarray
+    face_count: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleSplit:
+    """A triangulation of polygons.
+
+    Attributes:
+        triangles: Vertices, in face order and with the faces' winding, shape (T, 3), int32.
+        face: The face that each triangle comes from, shape (T,), int32.
+    """
+
+    triangles: np.ndarray
+    face: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class HalfEdges:
+    """The edges of a polygon mesh, and the edge that leaves each corner.
+
+    Attributes:
+        edges: Undirected edges (lo, hi), lexicographic, shape (E, 2), int32; lo == hi where a face repeats a vertex.
+        edge: Edge from each corner to the next one of its face, shape (C,), int32.
+        forward: Whether that half-edge runs from lo to hi, shape (C,), bool.
+        count: Number of half-edges of each edge, shape (E,), int32: 1 on a boundary, 2 inside, more if non-manifold.
+    """
+
+    edges: np.ndarray
+    edge: np.ndarray
+    forward: np.ndarray
+    count: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonMesh:
+    """Topology of a polygon mesh. Its C = sum(counts) corners are numbered as in ``indices``.
+
+    Attributes:
+        counts: Vertices per face, shape (F,), int32.
+        indices: Vertex of each corner, faces one after another, shape (C,), int32.
+        vertex_count: Number of vertices V, those that no face uses included.
+
+    Raises:
+        ValueError: The counts are negative or do not sum to the number of indices.
+    """
+
+    counts: np.ndarray
+    indices: np.ndarray
+    vertex_count: int
+
+    def __post_init__(self) -> None:
+        """Bring arrays to int32 and check that they fit together."""
+        object.__setattr__(self, "counts", np.asarray(self.counts, np.int32).reshape(-1))
+        object.__setattr__(self, "indices", np.asarray(self.indices, np.int32).reshape(-1))
+        object.__setattr__(self, "vertex_count", int(self.vertex_count))
+        total = int(self.counts.sum(dtype=np.int64))
+        if total != len(self.indices) or (len(self.counts) and self.counts.min() < 0):
+            raise ValueError(f"face vertex counts sum to {total} but there are {len(self.indices)} indices")
+
+    @property
+    def face_count(self) -> int:
+        """Number of faces F."""
+        return len(self.counts)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """First corner of each face and, last, the number of corners: shape (F + 1,), int64."""
+        return np.concatenate([[0], np.cumsum(self.counts, dtype=np.int64)])
+
+    @cached_property
+    def is_triangles(self) -> bool:
+        """Whether every face is a triangle."""
+        return bool(np.all(self.counts == 3))
+
+    @cached_property
+    def corner_face(self) -> np.ndarray:
+        """Face of each corner, shape (C,), int32."""
+        return np.repeat(np.arange(self.face_count, dtype=np.int32), self.counts)
+
+    @cached_property
+    def next_corner(self) -> np.ndarray:
+        """The corner after each corner in its face, shape (C,), int64."""
+        following = np.arange(1, len(self.indices) + 1)
+        used = self.counts > 0
+        following[self.starts[1:][used] - 1] = self.starts[:-1][used]
+        return following
+
+    @cached_property
+    def previous_corner(self) -> np.ndarray:
+        """The corner before each corner in its face, shape (C,), int64."""
+        previous = np.empty_like(self.next_corner)
+        previous[self.next_corner] = np.arange(len(previous))
+        return previous
+
+    @cached_property
+    def half_edges(self) -> HalfEdges:
+        """Edges of the faces, and where each half-edge belongs."""
+        here, there = self.indices.astype(np.int64), self.indices[self.next_corner].astype(np.int64)
+        stride = max(self.vertex_count, 1)
+        keys = np.minimum(here, there) * stride + np.maximum(here, there)
+        unique, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
+        edges = np.stack([unique // stride, unique % stride], axis=1).astype(np.int32)
+        return HalfEdges(edges, edge.reshape(-1).astype(np.int32), here <= there, count.astype(np.int32))
+
+    def check_range(self) -> None:
+        """Check the indices.
+
+        Raises:
+            ValueError: An index is negative or not below ``vertex_count``.
+        """
+        bad = np.flatnonzero((self.indices < 0) | (self.indices >= self.vertex_count))
+        if len(bad):
+            where = f"face {self.corner_face[bad[0]]}"
+            raise ValueError(
+                f"{where} uses vertex {self.indices[bad[0]]}, but the mesh has {self.vertex_count} vertices"
+            )
+
+    def triangulate(self, points: np.ndarray | None = None) -> TriangleSplit:
+        """Split the faces into fans of triangles.
+
+        Without points a fan starts at the first corner. On quads made by :func:`.subdivide.subdivide` these diagonals
+        run from a parent's corner to its face point, and so alternate in direction. Faces under three corners vanish.
+
+        Args:
+            points: Positions, shape (V, 3); when given, quads are split along the shorter diagonal (or the one that
+                lies inside, if they are concave) and larger polygons fan from the corner with the fattest fan.
+
+        Returns:
+            The triangles and the face of each.
+        """
+        if self.is_triangles:
+            return TriangleSplit(self.indices.reshape(-1, 3), np.arange(self.face_count, dtype=np.int32))
+        pieces = np.maximum(self.counts - 2, 0)
+        offsets = np.concatenate([[0], np.cumsum(pieces, dtype=np.int64)])
+        triangles = np.empty((int(offsets[-1]), 3), np.int32)
+        for size in np.unique(self.counts[self.counts >= 3]):
+            faces = np.flatnonzero(self.counts == size)
+            corners = self.indices[self.starts[faces, None] + np.arange(size)]
+            first = np.zeros(len(faces), np.int64) if points is None else _fan_corner(corners, points)
+            turned = np.take_along_axis(corners, (first[:, None] + np.arange(size)) % size, axis=1)
+            triangles[offsets[faces, None] + np.arange(size - 2)] = _fans(turned)
+        return TriangleSplit(triangles, np.repeat(np.arange(self.face_count, dtype=np.int32), pieces))
+
+
+def _fans(corners: np.ndarray) -> np.ndarray:
+    """Fans from the first corner: (F, n) to (F, n - 2, 3)."""
+    first = np.broadcast_to(corners[:, :1], (len(corners), corners.shape[1] - 2))
+    return np.stack([first, corners[:, 1:-1], corners[:, 2:]], axis=-1)
+
+
+def _fan_corner(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Corner from which to fan each face of one size: (F, n) to (F,)."""
+    size = corners.shape[1]
+    shape = np.asarray(points, np.float64)[corners]
+    shape = shape - shape.mean(axis=1, keepdims=True)
+    normal = np.cross(shape, np.roll(shape, -1, axis=1)).sum(axis=1)
+    worst = np.empty((len(corners), size if size > 4 else size - 2))
+    for first in range(worst.shape[1]):
+        fan = np.roll(shape, -first, axis=1)
+        spokes = fan[:, 1:] - fan[:, :1]
+        areas = np.cross(spokes[:, :-1], spokes[:, 1:]) @ normal[:, :, None]
+        worst[:, first] = areas[:, :, 0].min(axis=1)
+    if size != 4:
+        return worst.argmax(axis=1)
+    lengths = np.linalg.norm(shape[:, [2, 3]] - shape[:, [0, 1]], axis=2)
+    inside = worst > 0
+    shorter = lengths[:, 1] < lengths[:, 0]
+    return np.where(inside[:, 0] != inside[:, 1], inside[:, 1], shorter).astype(np.int64)
+
+
+def _triangle_sides(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Directed sides of all triangles: from, to, opposite corner (3 T each), and whether the triangle is proper."""
+    triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
+    here = triangles.reshape(-1)
+    there = np.roll(triangles, -1, axis=1).reshape(-1)
+    opposite = np.roll(triangles, -2, axis=1).reshape(-1)
+    proper = (here != there) & (there != opposite) & (opposite != here)
+    return here, there, opposite, proper
+
+
+def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
+    """Find the undirected edges of triangles.
+
+    Args:
+        triangles: Vertices, shape (T, 3).
+        vertex_count: Number of vertices V.
+
+    Returns:
+        Unique edges; a side from a vertex to itself is none.
+    """
+    here, there, _, proper = _triangle_sides(triangles)
+    kept = here != there
+    stride = max(vertex_count, 1)
+    keys = (np.minimum(here, there) * stride + np.maximum(here, there))[kept]
+    unique, inverse = np.unique(keys, return_inverse=True)
+    count = np.bincount(inverse.reshape(-1), weights=proper[kept], minlength=len(unique))
+    vertices = np.stack([unique // stride, unique % stride], axis=1).astype(np.int32)
+    return Edges(vertices, count.astype(np.int32))
+
+
+def hinges_of(triangles: np.ndarray) -> np.ndarray:
+    """Find the pairs of triangles that share an edge with no third one.
+
+    The sign of the angle does not depend on the winding when the normals are taken as
+    ``n1 = (xj - xi) x (xk - xi)`` and ``n2 = (xl - xi) x (xj - xi)``: flat is zero even where windings disagree.
+
+    Args:
+        triangles: Vertices, shape (T, 3). Triangles that repeat a vertex are passed over.
+
+    Returns:
+        Hinges (i, j, k, l), shape (H, 4), int32, in lexicographic order of the shared edge: the edge i-j as the first
+        triangle (i, j, k) runs through it, and l, the corner of the second triangle opposite that edge. Pairs with
+        k == l, which are one triangle twice, are left out.
+    """
+    here, there, opposite, proper = _triangle_sides(triangles)
+    here, there, opposite = here[proper], there[proper], opposite[proper]
+    if len(here) == 0:
+        return np.empty((0, 4), np.int32)
+    keys = np.minimum(here, there) * (int(max(here.max(), there.max())) + 1) + np.maximum(here, there)
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    first = first[np.diff(np.append(first, len(ordered))) == 2]
+    one, two = order[first], order[first + 1]
+    hinges = np.stack([here[one], there[one], opposite[one], opposite[two]], axis=1).astype(np.int32)
+    return hinges[hinges[:, 2] != hinges[:, 3]]
+
+
+def incidence(elements: np.ndarray, vertex_count: int) -> Incidence:
+    """List the elements at each vertex.
+
+    Args:
+        elements: Vertices of each element, shape (N, K).
+        vertex_count: Number of vertices V.
+
+    Returns:
+        One row per vertex, sorted by element, then by corner.
+    """
+    elements = np.asarray(elements)
+    flat = elements.reshape(-1)
+    order = np.argsort(flat, kind="stable").astype(np.int32)
+    counts = np.bincount(flat, minlength=vertex_count)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    size = elements.shape[1]
+    return Incidence(starts, order // np.int32(size), order % np.int32(size))
