@@ -1,0 +1,1 @@
+"""USD in and out: the only rooms, with ``plugins/``, that import pxr."""
