@@ -1,0 +1,95 @@
+"""Refine coarse animated garments in USD shots into fine cloth with physical wrinkles.
+
+    import physgraph_usd as pg
+
+    report = pg.refine_shot("shot.usda", "shot.refined.usdc", pg.RefineOptions(frames=(1, 24)))
+
+Names are looked up when they are first used, so importing this package imports neither torch nor Warp.
+Where pxr can be imported the schemas are registered at once: USD accepts them only before the first stage is read.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .errors import (
+        GarmentError,
+        LayerError,
+        PhysGraphError,
+        SchemaError,
+        SolveError,
+        StageError,
+        UsageError,
+    )
+    from .fabric import PRESETS, Fabric
+    from .shot import RefineOptions, RefineReport, inspect_shot, refine_shot
+    from .usd.reader import Shot, open_shot
+    from .usd.schema import schema_path
+    from .usd.tag import tag
+    from .usd.validate import validate_layer
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "PRESETS",
+    "Fabric",
+    "GarmentError",
+    "LayerError",
+    "PhysGraphError",
+    "RefineOptions",
+    "RefineReport",
+    "SchemaError",
+    "Shot",
+    "SolveError",
+    "StageError",
+    "UsageError",
+    "inspect_shot",
+    "open_shot",
+    "refine_shot",
+    "schema_path",
+    "tag",
+    "validate_layer",
+]
+
+_ROOMS = {
+    "errors": (
+        "GarmentError",
+        "LayerError",
+        "PhysGraphError",
+        "SchemaError",
+        "SolveError",
+        "StageError",
+        "UsageError",
+    ),
+    "fabric": ("PRESETS", "Fabric"),
+    "shot": ("RefineOptions", "RefineReport", "inspect_shot", "refine_shot"),
+    "usd.reader": ("Shot", "open_shot"),
+    "usd.schema": ("schema_path",),
+    "usd.tag": ("tag",),
+    "usd.validate": ("validate_layer",),
+}
+_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    """Import the module that has a public name when the name is first used.
+
+    Args:
+        name: One of ``__all__``.
+
+    Returns:
+        The object of that name.
+
+    Raises:
+        AttributeError: If the package has no such public name.
+    """
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
+    return getattr(importlib.import_module(f".{_ROOM_OF[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    """List the public names, imported or not."""
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,314 @@
+"""The console command: each subcommand declares its options, imports its work and makes one call.
+
+Data goes to stdout; progress, warnings and errors go to stderr.
+Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Never
+
+import click
+
+from . import __version__
+from .errors import PhysGraphError, UsageError
+
+DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
+USD_SUFFIXES = (".usd", ".usda", ".usdc")
+EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview"}
+"""Which extra brings a module that only some commands need."""
+
+Decorator = Callable[[Callable[..., None]], Callable[..., None]]
+
+
+class Commands(click.Group):
+    """A group whose commands end with ``error: ...`` and the error's exit code instead of a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the chosen command; an error of our tree becomes one line on stderr."""
+        try:
+            return super().invoke(ctx)
+        except PhysGraphError as error:
+            _leave(ctx, str(error), WRONG_USAGE if isinstance(error, UsageError) else FAILED)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing not in EXTRAS:
+                raise
+            _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
+
+
+class FrameRange(click.ParamType):
+    """Time codes ``A:B``, or one time code ``A``."""
+
+    name = "A:B"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Turn the text into the first and the last time code."""
+        if isinstance(value, tuple):
+            return value
+        first, colon, last = value.partition(":")
+        try:
+            span = float(first), float(last if colon else first)
+        except ValueError:
+            self.fail(f"{value!r} is not a frame range; write A:B or A, for example 1001:1024", param, ctx)
+        if not span[0] <= span[1]:
+            self.fail(f"{value!r} ends before it starts", param, ctx)
+        return span
+
+
+class RefineLevel(click.ParamType):
+    """A number of subdivisions, or ``auto``, which is passed on as -1."""
+
+    name = "level"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Turn the text into a level."""
+        if value == "auto":
+            return -1
+        if not str(value).isdecimal():
+            self.fail(f"{value!r} is neither a whole number nor 'auto'", param, ctx)
+        return int(value)
+
+
+class PictureSize(click.ParamType):
+    """Width and height in pixels, ``1280x640``."""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Turn the text into width and height."""
+        if isinstance(value, tuple):
+            return value
+        width, _, height = value.partition("x")
+        if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+            self.fail(f"{value!r} is not a size; write WxH, for example 1280x640", param, ctx)
+        return int(width), int(height)
+
+
+def _together(*options: Decorator) -> Decorator:
+    def apply(function: Callable[..., None]) -> Callable[..., None]:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return apply
+
+
+shot_argument = click.argument("shot", type=click.Path(dir_okay=False))
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+garment_option = click.option(
+    "--garment", "garments", multiple=True, metavar="PATH", help="Prim path, glob or collection; repeatable."
+)
+collider_option = click.option(
+    "--collider", "colliders", multiple=True, metavar="PATH", help="Prim path, glob or collection; repeatable."
+)
+scene_options = _together(
+    click.option("--frames", type=FrameRange(), help="Time codes to refine.  [default: all of the shot]"),
+    garment_option,
+    collider_option,
+    click.option("--level", type=RefineLevel(), metavar="N|auto", help="Subdivisions; each makes four faces of one."),
+    click.option("--set", "overrides", multiple=True, metavar="PRIM.ATTR=VALUE", help="Override an attribute."),
+    click.option("--rest", "rest_frame", type=float, metavar="FRAME", help="Take the rest shape from this frame."),
+)
+solve_options = _together(
+    click.option("--integrator", metavar="NAME", help="How forces become displacements."),
+    click.option("--tolerance", type=float, metavar="T", help="Stop when the cloth moves less, in edge lengths."),
+    click.option("--budget-ms", type=float, metavar="MS", help="Stop after this time per frame."),
+    click.option("--device", metavar="cpu|cuda", help="Where to compute."),
+    click.option("--potential", type=click.Choice(["continuum", "paper"]), help="Which form of the energy."),
+    click.option("--temporal", type=click.Choice(["tether", "warm", "off"]), help="How a frame uses the last one."),
+    click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes that share the frames."),
+)
+layer_options = _together(
+    click.option("--mode", type=click.Choice(["over", "sibling"]), help="Refine in place, or beside the coarse mesh."),
+    click.option("--velocities", is_flag=True, help="Also write point velocities."),
+    click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),
+    click.option("--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write what was done as JSON."),
+    overwrite_option,
+    click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
+)
+
+
+def out_option(metavar: str, help_text: str) -> Decorator:
+    """Declare ``-o``, where a command writes.
+
+    Args:
+        metavar: What the help shows for the value.
+        help_text: The option's line in the help.
+    """
+    return click.option("-o", "--out", required=True, type=click.Path(path_type=Path), metavar=metavar, help=help_text)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
+@click.version_option(__version__, prog_name="physgraph-usd")
+def main() -> None:
+    """Refine coarse animated garments in USD shots into fine cloth."""
+
+
+@main.command()
+@click.argument("shots", nargs=-1, required=True, metavar="SHOT...", type=click.Path(dir_okay=False))
+@out_option("OUT", "Layer to write, or a folder.")
+@scene_options
+@solve_options
+@layer_options
+def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path | None, **options: Any) -> None:
+    """Refine the garments of each SHOT into a layer of its own and print the layers' paths.
+
+    The options that are left out keep the defaults of physgraph_usd.RefineOptions.
+    """
+    layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
+    reports = _one_each(shots, report, "--report", suffix=".json")
+    roots = _one_each(shots, root, "--root", suffix=".usda")
+    given = {name: value for name, value in options.items() if value is not None}
+    codes = {
+        _refine_one(shot, layer, given | {"report": report, "root": root}, name=f"{shot}: " if len(shots) > 1 else "")
+        for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
+    }
+    sys.exit(codes.pop() if len(codes) == 1 else IN_PART)
+
+
+@main.command()
+@shot_argument
+@scene_options
+@json_option
+def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
+    """Print what would be refined, with what, from where, and every defect found in SHOT."""
+    from .shot import inspect_shot
+
+    given = {name: value for name, value in options.items() if value is not None}
+    found = inspect_shot(shot, **given)
+    click.echo(json.dumps(found, indent=2) if as_json else "\n".join(_outline(found)))
+
+
+@main.command()
+@shot_argument
+@out_option("OUT", "Layer to write.")
+@garment_option
+@collider_option
+@click.option("--preset", metavar="FABRIC", help="Fabric of the garments, such as denim; see docs/fabrics.md.")
+@overwrite_option
+def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
+    """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
+    from .usd.tag import tag as tag_shot
+
+    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **options))
+
+
+@main.command()
+@click.argument("layer", type=click.Path(dir_okay=False))
+@click.option("--shot", type=click.Path(dir_okay=False), help="Compose the layer over this shot first.")
+@json_option
+def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
+    """Check a refined LAYER by our rules and by USD's own validators; exit with 1 when it breaks one."""
+    from .usd.validate import validate_layer
+
+    problems = validate_layer(layer, shot)
+    if as_json:
+        click.echo(json.dumps([asdict(problem) for problem in problems], indent=2))
+    else:
+        for problem in problems:
+            at = "" if problem.time is None else f" at time code {problem.time:g}"
+            click.echo(f"{problem.severity}: <{problem.path}>{at}: {problem.message}")
+    sys.exit(FAILED if any(problem.severity == "error" for problem in problems) else DONE)
+
+
+@main.command()
+@click.argument("name", default="sleeve")
+@out_option("DIR", "Folder to write into.")
+@overwrite_option
+def sample(name: str, out: Path, *, overwrite: bool) -> None:
+    """Write the sample shot NAME and print its path."""
+    from .samples import write_sample
+
+    click.echo(write_sample(name, out, overwrite=overwrite))
+
+
+@main.command()
+@click.argument("layer", type=click.Path(dir_okay=False))
+@out_option("PNG|GIF", "Picture to write.")
+@click.option("--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the one the layer names]")
+@click.option("--time", "times", type=float, multiple=True, metavar="T", help="Time code to draw; repeatable.")
+@click.option("--size", type=PictureSize(), default="1280x640", help="Pixels.")
+@click.option("--camera", metavar="PRIM", help="Look through this camera.")
+def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
+    """Draw the coarse cloth beside the fine cloth of LAYER and print the picture's path."""
+    from .preview import preview as draw
+
+    click.echo(draw(layer, out, times=times or None, **options))
+
+
+@main.command("schema-path")
+def schema_path() -> None:
+    """Print the folder of the schemas, for PXR_PLUGINPATH_NAME."""
+    from .usd.schema import schema_path as find
+
+    click.echo(find())
+
+
+def _refine_one(shot: str, layer: Path | None, options: dict[str, Any], *, name: str) -> int:
+    from .shot import RefineOptions, refine_shot
+
+    try:
+        with _progress(Path(shot).name) as progress:
+            done = refine_shot(shot, layer, RefineOptions(**options, progress=progress))
+    except UsageError:
+        raise
+    except PhysGraphError as error:
+        click.echo(f"error: {name}{error}", err=True)
+        return FAILED
+    for warning in done.warnings:
+        click.echo(f"warning: {name}{warning}", err=True)
+    click.echo(done.to_json() if options["dry_run"] else done.out)
+    return done.exit_code
+
+
+def _one_each(
+    shots: tuple[str, ...], to: Path | None, option: str, *, suffix: str, accepts: tuple[str, ...] = ()
+) -> list[Path | None]:
+    """Name one output per shot: ``to`` itself when it is a file's name, else files in the folder ``to``."""
+    if to is None:
+        return [None] * len(shots)
+    if to.suffix in (accepts or (suffix,)) and not to.is_dir():
+        if len(shots) > 1:
+            raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
+        return [to]
+    files: list[Path | None] = [to / (Path(shot).stem + suffix) for shot in shots]
+    twice = sorted({str(file) for file in files if files.count(file) > 1})
+    if twice:
+        raise UsageError(f"{option} {to}: two shots would both be written to {twice[0]}; refine them one by one")
+    to.mkdir(parents=True, exist_ok=True)
+    return files
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
+    with click.progressbar(length=1, label=label, file=sys.stderr, hidden=not sys.stderr.isatty()) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.length = total
+            bar.update(done - bar.pos)
+
+        yield show
+
+
+def _outline(value: Any, indent: str = "") -> Iterator[str]:
+    pairs = value.items() if isinstance(value, dict) else (("-", item) for item in value)
+    for key, item in pairs:
+        label = key if key == "-" else f"{key}:"
+        if isinstance(item, dict | list | tuple) and item:
+            yield f"{indent}{label}"
+            yield from _outline(item, indent + "  ")
+        else:
+            yield f"{indent}{label} {'none' if item in (None, [], {}, ()) else item}"
+
+
+def _leave(ctx: click.Context, message: str, code: int) -> Never:
+    click.echo(f"error: {message}", err=True)
+    ctx.exit(code)
