@@ -222,12 +222,11 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
 @main.command()
 @click.argument("name", default="sleeve")
 @out_option("DIR", "Folder to write into.")
-@overwrite_option
-def sample(name: str, out: Path, *, overwrite: bool) -> None:
-    """Write the sample shot NAME and print its path."""
+def sample(name: str, out: Path) -> None:
+    """Write the sample shot NAME and print its path; an unknown name lists those there are."""
     from .samples import write_sample
 
-    click.echo(write_sample(name, out, overwrite=overwrite))
+    click.echo(write_sample(name, out))
 
 
 @main.command()

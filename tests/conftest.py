@@ -1,0 +1,66 @@
+"""What all tests share: fixed seeds, the folder of real assets, and sample shots."""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parents[1]
+SEED = 20
+
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
+
+
+@pytest.fixture(autouse=True)
+def seed() -> int:
+    """Seed every generator that a test may draw from; the seed itself for those that make their own."""
+    random.seed(SEED)
+    np.random.seed(SEED)
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(SEED)
+    return SEED
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real assets; the test skips when it is absent."""
+    folder = Path(os.environ.get("PHYSGRAPH_DATA") or ROOT.parent / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"no real assets: {folder} is not a folder (set PHYSGRAPH_DATA)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A function from a sample's name to its shot file, written once per session; do not change the file."""
+    pytest.importorskip("pxr", reason="samples are written with usd-core")
+    from physgraph_usd.samples import write_sample
+
+    written: dict[str, Path] = {}
+
+    def write(name: str) -> Path:
+        if name not in written:
+            written[name] = write_sample(name, tmp_path_factory.mktemp(name))
+        return written[name]
+
+    return write
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip GPU tests, with the reason, where there is no CUDA device."""
+    gpu = [item for item in items if item.get_closest_marker("gpu")]
+    if not gpu:
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        for item in gpu:
+            item.add_marker(pytest.mark.skip(reason="no CUDA device"))

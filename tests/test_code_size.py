@@ -1,0 +1,126 @@
+"""The rules of size and habit that no linter has; each rule is one function from source to complaints."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "physgraph_usd"
+CODE_FOLDERS = (PACKAGE, "plugins", "samples", "tests", "benchmarks")
+TEXT_SUFFIXES = {".py", ".md", ".toml", ".yaml", ".yml", ".json", ".usda", ".cfg", ".txt", ""}
+MAX_FILE_LINES = 400
+MAX_BODY_LINES = 40
+MAX_POSITIONAL = 3
+MACHINE_PATH = re.compile(r"(?<![\w.}])/(?:home|Users|work|farm|tmp|opt|mnt|scratch)/\w|\b[A-Z]:[\\/]+Users")
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def code_files() -> list[Path]:
+    return sorted(file for folder in CODE_FOLDERS for file in (ROOT / folder).rglob("*.py"))
+
+
+def text_files() -> list[Path]:
+    folders = (*CODE_FOLDERS, "docs", "schemas", ".ci")
+    inside = (file for folder in folders for file in (ROOT / folder).rglob("*"))
+    files = (*ROOT.iterdir(), *inside)
+    return sorted(file for file in files if file.is_file() and file.suffix in TEXT_SUFFIXES and file.name != ".git")
+
+
+def functions(tree: ast.AST) -> Iterator[Function]:
+    return (node for node in ast.walk(tree) if isinstance(node, Function))
+
+
+def body_lines(function: Function) -> int:
+    """Lines from the first statement after the docstring to the end."""
+    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+    return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
+
+
+def positional_after_third(function: Function) -> list[str]:
+    """Arguments past the third, self and cls not counted, that can be given by position."""
+    names = [argument.arg for argument in (*function.args.posonlyargs, *function.args.args)]
+    counted = names[1:] if names[:1] in (["self"], ["cls"]) else names
+    defaults = len(function.args.defaults)
+    optional = set(names[-defaults:]) if defaults else set()
+    return [name for name in counted[MAX_POSITIONAL:] if name in optional]
+
+
+def too_long(tree: ast.AST) -> Iterator[str]:
+    for function in functions(tree):
+        lines = body_lines(function)
+        if lines >= MAX_BODY_LINES:
+            yield f"{function.lineno}: body of {function.name} has {lines} lines, {MAX_BODY_LINES - 1} allowed"
+
+
+def options_by_position(tree: ast.AST) -> Iterator[str]:
+    for function in functions(tree):
+        for name in positional_after_third(function):
+            yield f"{function.lineno}: option {name} of {function.name} must be keyword-only"
+
+
+def prints(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
+            yield f"{node.lineno}: print"
+
+
+def broad_excepts(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ExceptHandler):
+            caught = node.type.elts if isinstance(node.type, ast.Tuple) else [node.type]
+            if any(kind is None or ast.unparse(kind) in {"Exception", "BaseException"} for kind in caught):
+                yield f"{node.lineno}: catches everything"
+
+
+RULES = {rule.__name__: rule for rule in (too_long, options_by_position, prints, broad_excepts)}
+BAD = {
+    "too_long": "def f():\n" + "    x = 1\n" * MAX_BODY_LINES,
+    "options_by_position": "class C:\n    def f(self, a, b, c, d=1): ...",
+    "prints": "print(1)",
+    "broad_excepts": "try:\n    f()\nexcept (ValueError, Exception):\n    pass",
+}
+GOOD = {
+    "too_long": 'def f():\n    """' + "Doc.\n" * MAX_BODY_LINES + '"""\n' + "    x = 1\n" * (MAX_BODY_LINES - 1),
+    "options_by_position": "class C:\n    def f(self, a, b, c=1, *, d=1): ...",
+    "prints": "log.print(1)",
+    "broad_excepts": "try:\n    f()\nexcept (ValueError, OSError):\n    pass",
+}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_rule_tells_bad_from_good(rule: str) -> None:
+    assert list(RULES[rule](ast.parse(BAD[rule])))
+    assert not list(RULES[rule](ast.parse(GOOD[rule])))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_code_keeps_rule(rule: str) -> None:
+    complaints = [
+        f"{file.relative_to(ROOT)}:{complaint}"
+        for file in code_files()
+        for complaint in RULES[rule](ast.parse(file.read_text(encoding="utf-8")))
+    ]
+    assert not complaints, "\n".join(complaints)
+
+
+def test_files_are_short() -> None:
+    lengths = {file.relative_to(ROOT): len(file.read_text(encoding="utf-8").splitlines()) for file in code_files()}
+    assert lengths
+    assert not {str(file): lines for file, lines in lengths.items() if lines >= MAX_FILE_LINES}
+
+
+def test_no_paths_of_one_machine() -> None:
+    assert MACHINE_PATH.search("see " + "/".join(["", "home", "someone"]))
+    assert not MACHINE_PATH.search("#!/usr/bin/env bash, </World/work/Coat>, ../tmp/x, https://example.org/opt/x")
+    found = [
+        f"{file.relative_to(ROOT)}: {match.group()}"
+        for file in text_files()
+        for match in MACHINE_PATH.finditer(file.read_text(encoding="utf-8"))
+    ]
+    assert not found, "\n".join(found)
