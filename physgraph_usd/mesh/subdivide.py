@@ -13,7 +13,7 @@ from functools import reduce
 import numpy as np
 from scipy import sparse
 
-from .topology import PolygonMesh
+from .topology import PolygonMesh, find_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,3 +151,126 @@ def compose(refinements: Sequence[Refinement]) -> sparse.csr_matrix:
     if not refinements:
         raise ValueError("no refinements to compose; the stencil of level 0 is the identity")
     return reduce(lambda product, refinement: refinement.linear @ product, refinements[1:], refinements[0].linear)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rules:
+    """Which smooth rule holds where."""
+
+    smooth_edge: np.ndarray  # (E,) the two faces decide
+    crease: np.ndarray  # (E,) boundary or authored crease
+    smooth_vertex: np.ndarray  # (V,) all faces decide
+    crease_vertex: np.ndarray  # (V,) cubic B-spline along two creases
+
+
+def smooth(
+    mesh: PolygonMesh,
+    refinement: Refinement,
+    *,
+    crease_edges: np.ndarray | None = None,
+    corner_vertices: np.ndarray | None = None,
+) -> sparse.csr_matrix:
+    """Build the smooth placement of the same child vertices.
+
+    Among triangles these are Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and among polygons
+    those of Catmull and Clark, both as OpenSubdiv has them. An edge between a triangle and a polygon takes half of
+    either rule. A vertex between both takes each rule by the share of the full turn that a regular corner has, a sixth
+    or a fourth: with s the sum of shares the rules are evaluated at valence 6 s and 4 s, and each corner adds its part.
+    That is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) where s = 1, and the pure rule among one kind.
+
+    Boundaries and creases are cubic B-splines. Fixed are: vertices with one face, with three or more creases, on
+    non-manifold edges or between several fans, and isolated ones. A single crease ending inside leaves its end smooth.
+
+    Args:
+        mesh: The parent.
+        refinement: Its subdivision, from :func:`subdivide`.
+        crease_edges: Infinitely sharp edges by their vertices, shape (K, 2); pairs that are no edge are passed over.
+        corner_vertices: Infinitely sharp vertices, shape (K,).
+
+    Returns:
+        Stencil, shape (V_child, V_parent), float64; rows sum to 1.
+    """
+    rules = _rules(mesh, crease_edges, corner_vertices)
+    parts = [_fixed_part(mesh, rules), _edge_part(mesh, rules), _crease_part(mesh, rules), _vertex_part(mesh, rules)]
+    rows, columns, weights = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    size = refinement.mesh.vertex_count
+    average = sparse.coo_matrix((weights, (rows, columns)), shape=(size, size)).tocsr()
+    return average @ refinement.linear
+
+
+def _rules(mesh: PolygonMesh, crease_edges: np.ndarray | None, corner_vertices: np.ndarray | None) -> _Rules:
+    """Classify edges and vertices."""
+    half, size = mesh.half_edges, mesh.vertex_count
+    proper = half.edges[:, 0] != half.edges[:, 1]
+    manifold = half.count <= 2
+    crease = half.count == 1
+    if crease_edges is not None:
+        found = find_edges(half.edges, crease_edges)
+        crease[found[found >= 0]] = True
+    crease &= proper & manifold
+    faces = np.bincount(mesh.indices, minlength=size)
+    creases = np.bincount(half.edges[crease].reshape(-1), minlength=size)
+    fixed = (faces < 2) | (creases > 2) | (mesh.fan_counts > 1)
+    fixed[half.edges[~manifold].reshape(-1)] = True
+    if corner_vertices is not None:
+        fixed[np.asarray(corner_vertices, np.int64)] = True
+    crease_vertex = (creases == 2) & ~fixed
+    return _Rules(proper & manifold & ~crease, crease, ~fixed & ~crease_vertex, crease_vertex)
+
+
+_Part = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Rows, columns and weights; columns are child vertices in their linear places."""
+
+
+def _stack(rows: np.ndarray, columns: list[np.ndarray], weights: list[np.ndarray]) -> _Part:
+    """Join several columns for the same rows."""
+    weights = [np.broadcast_to(np.asarray(weight, np.float64), rows.shape) for weight in weights]
+    return np.tile(rows, len(columns)), np.concatenate(columns), np.concatenate(weights)
+
+
+def _fixed_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
+    """Vertices that stay, midpoints of sharp edges, and face points."""
+    edges = mesh.vertex_count + np.flatnonzero(~rules.smooth_edge)
+    faces = face_points(mesh)
+    kept = np.concatenate([np.flatnonzero(~rules.smooth_vertex & ~rules.crease_vertex), edges, faces[faces >= 0]])
+    return kept, kept, np.ones(len(kept))
+
+
+def _edge_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
+    """Each face's half of the rule of a smooth edge."""
+    corners = np.flatnonzero(rules.smooth_edge[mesh.half_edges.edge])
+    polygon = (mesh.counts >= 4)[mesh.corner_face[corners]]
+    here, there = mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]
+    opposite = mesh.indices[mesh.previous_corner[corners]]
+    far = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], opposite)
+    near, across = np.where(polygon, 1 / 8, 3 / 16), np.where(polygon, 1 / 4, 1 / 8)
+    return _stack(mesh.vertex_count + mesh.half_edges.edge[corners], [here, there, far], [near, near, across])
+
+
+def _crease_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
+    """Cubic B-spline vertices, one half per crease."""
+    ends = mesh.half_edges.edges[rules.crease]
+    ends = np.concatenate([ends, ends[:, ::-1]])
+    here, there = ends[rules.crease_vertex[ends[:, 0]]].T
+    return _stack(here, [here, there], [3 / 8, 1 / 8])
+
+
+def _vertex_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
+    """Each corner's part of the rule of a smooth vertex."""
+    corners = np.flatnonzero(rules.smooth_vertex[mesh.indices])
+    polygon = (mesh.counts >= 4)[mesh.corner_face[corners]]
+    here, before = mesh.indices[corners], mesh.previous_corner[corners]
+    turn = np.bincount(here, weights=np.where(polygon, 1 / 4, 1 / 6), minlength=mesh.vertex_count)[here]
+    valence = np.where(polygon, 4, 6) * turn
+    beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
+    ring = np.where(polygon, valence**-2.0, beta / 2)
+    edge = mesh.half_edges.edge
+    left = np.where(polygon, mesh.vertex_count + edge[corners], mesh.indices[mesh.next_corner[corners]])
+    right = np.where(polygon, mesh.vertex_count + edge[before], mesh.indices[before])
+    centre = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], here)
+    own = 1 / valence - 2 * ring
+    return _stack(
+        here,
+        [left, right, centre, here],
+        [ring, ring, np.where(polygon, ring, own), np.where(polygon, own - ring, 0.0)],
+    )

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +156,24 @@ class PolygonMesh:
                 f"{where} uses vertex {self.indices[bad[0]]}, but the mesh has {self.vertex_count} vertices"
             )
 
+    @cached_property
+    def fan_counts(self) -> np.ndarray:
+        """Number of fans at each vertex: groups of corners linked by edges they share, shape (V,), int32.
+
+        It is 1 at manifold vertices, 2 or more where a surface touches itself in a point, 0 at isolated vertices.
+        """
+        half = self.half_edges
+        order = np.argsort(half.edge, kind="stable")
+        same = np.flatnonzero(half.edge[order[1:]] == half.edge[order[:-1]])
+        ends = np.stack([np.arange(len(self.indices)), self.next_corner], axis=1)
+        ends = np.where(half.forward[:, None], ends, ends[:, ::-1])
+        one, two = ends[order[same]].reshape(-1), ends[order[same + 1]].reshape(-1)
+        size = len(self.indices)
+        links = sparse.coo_matrix((np.ones(len(one), bool), (one, two)), shape=(size, size))
+        _, label = csgraph.connected_components(links, directed=False)
+        fans = np.unique(label.astype(np.int64) * max(self.vertex_count, 1) + self.indices)
+        return np.bincount(fans % max(self.vertex_count, 1), minlength=self.vertex_count).astype(np.int32)
+
     def triangulate(self, points: np.ndarray | None = None) -> TriangleSplit:
         """Split the faces into fans of triangles.
 
@@ -215,6 +235,27 @@ def _triangle_sides(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     opposite = np.roll(triangles, -2, axis=1).reshape(-1)
     proper = (here != there) & (there != opposite) & (opposite != here)
     return here, there, opposite, proper
+
+
+def find_edges(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Look up edges by their vertices.
+
+    Args:
+        edges: Edges (lo, hi) in lexicographic order, shape (E, 2).
+        pairs: Vertices in either order, shape (K, 2).
+
+    Returns:
+        Row of each pair in ``edges``, shape (K,), int64; -1 for pairs that are not there.
+    """
+    edges, pairs = np.asarray(edges, np.int64), np.asarray(pairs, np.int64).reshape(-1, 2)
+    if len(edges) == 0:
+        return np.full(len(pairs), -1)
+    stride = int(edges.max()) + 1
+    keys = edges[:, 0] * stride + edges[:, 1]
+    inside = (pairs >= 0).all(axis=1) & (pairs < stride).all(axis=1)
+    wanted = np.where(inside, pairs.min(axis=1) * stride + pairs.max(axis=1), -1)
+    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[found] == wanted, found, -1)
 
 
 def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
