@@ -1,0 +1,179 @@
+"""What rides on a mesh when it is refined: values on vertices, faces and corners, and subsets.
+
+Values of floating type are interpolated linearly, in float64, and come back in their own type. Of anything else
+(integers, booleans, strings) a fine element takes the value of its nearest parent: the one of largest weight, then of
+lowest number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import sparse
+
+from .subdivide import Refinement, compose, subdivide_times
+from .topology import PolygonMesh, find_edges
+
+
+def vertex_values(refinements: Sequence[Refinement], values: np.ndarray) -> np.ndarray:
+    """Refine values that belong to vertices (interpolation "vertex" or "varying").
+
+    Args:
+        refinements: Coarse to fine; none returns the values.
+        values: One per coarse vertex, shape (V, ...).
+
+    Returns:
+        One per fine vertex, shape (V_fine, ...), of the same type.
+
+    Raises:
+        ValueError: The number of values is not the number of coarse vertices.
+    """
+    values = np.asarray(values)
+    if not refinements:
+        return values
+    _check_count("values", len(values), refinements[0].linear.shape[1], "vertices")
+    stencil = compose(refinements)
+    if not np.issubdtype(values.dtype, np.floating):
+        return values[_nearest_parent(stencil)]
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+    return (stencil @ flat.astype(np.float64)).reshape(-1, *values.shape[1:]).astype(values.dtype)
+
+
+def _nearest_parent(stencil: sparse.csr_matrix) -> np.ndarray:
+    """Column of the largest weight of each row, the lowest among equals, shape (rows,)."""
+    largest = np.repeat(np.maximum.reduceat(stencil.data, stencil.indptr[:-1]), np.diff(stencil.indptr))
+    candidates = np.where(stencil.data >= largest * (1 - 1e-9), stencil.indices, stencil.shape[1])
+    return np.minimum.reduceat(candidates, stencil.indptr[:-1])
+
+
+def parent_faces(refinements: Sequence[Refinement]) -> np.ndarray:
+    """Coarse face of each fine face, through all levels.
+
+    Args:
+        refinements: One or more, coarse to fine.
+
+    Returns:
+        Shape (F_fine,), int32, ascending.
+    """
+    parents = refinements[-1].parent_face
+    for refinement in reversed(refinements[:-1]):
+        parents = refinement.parent_face[parents]
+    return parents
+
+
+def uniform_values(refinements: Sequence[Refinement], values: np.ndarray) -> np.ndarray:
+    """Refine values that belong to faces: a child has its parent's.
+
+    Args:
+        refinements: Coarse to fine; none returns the values.
+        values: One per coarse face, shape (F, ...).
+
+    Returns:
+        One per fine face, shape (F_fine, ...).
+
+    Raises:
+        ValueError: There are fewer values than parents.
+    """
+    values = np.asarray(values)
+    if not refinements:
+        return values
+    parents = parent_faces(refinements)
+    if len(parents) and len(values) <= parents[-1]:
+        raise ValueError(f"{len(values)} values for {parents[-1] + 1} or more faces")
+    return values[parents]
+
+
+def corner_values(
+    refinements: Sequence[Refinement], counts: np.ndarray, indices: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refine indexed values that belong to corners (interpolation "faceVarying"), such as texture coordinates.
+
+    The values have a topology of their own, whose seams stay seams; it is split by the same rule, so that its faces and
+    corners come in the order of the refined mesh.
+
+    Args:
+        refinements: Of the mesh itself, coarse to fine; none returns indices and values.
+        counts: Corners per coarse face, shape (F,).
+        indices: Value of each coarse corner, shape (C,).
+        values: Shape (N, ...).
+
+    Returns:
+        Value of each fine corner, shape (C_fine,), int32, and the fine values, shape (N_fine, ...), of the same type.
+
+    Raises:
+        ValueError: An index is out of range, or the faces are not those that were refined.
+    """
+    values = np.asarray(values)
+    topology = PolygonMesh(counts, indices, len(values))
+    if not refinements:
+        return topology.indices, values
+    own = subdivide_times(topology, len(refinements))
+    if not np.array_equal(own[-1].mesh.counts, refinements[-1].mesh.counts):
+        raise ValueError(f"corner values for {topology.face_count} faces do not fit the faces of the refined mesh")
+    return own[-1].mesh.indices, vertex_values(own, values)
+
+
+def face_subset(refinements: Sequence[Refinement], faces: np.ndarray) -> np.ndarray:
+    """Refine a subset of faces; subsets that partition a mesh still do.
+
+    Args:
+        refinements: Coarse to fine; none returns the faces.
+        faces: Coarse faces, shape (K,).
+
+    Returns:
+        The fine faces inside, ascending, int32.
+    """
+    if not refinements:
+        return np.asarray(faces, np.int32)
+    return np.flatnonzero(np.isin(parent_faces(refinements), faces)).astype(np.int32)
+
+
+def vertex_subset(refinements: Sequence[Refinement], vertices: np.ndarray) -> np.ndarray:
+    """Refine a subset of vertices.
+
+    Args:
+        refinements: Coarse to fine; none returns the vertices.
+        vertices: Coarse vertices, shape (K,).
+
+    Returns:
+        The fine vertices all of whose parents are inside, ascending, int32.
+
+    Raises:
+        ValueError: A vertex is out of range.
+    """
+    vertices = np.asarray(vertices, np.int32).reshape(-1)
+    if not refinements:
+        return vertices
+    count = refinements[0].linear.shape[1]
+    bad = vertices[(vertices < 0) | (vertices >= count)]
+    if len(bad):
+        raise ValueError(f"the subset names vertex {bad[0]}, but the mesh has {count} vertices")
+    outside = np.ones(count)
+    outside[vertices] = 0.0
+    return np.flatnonzero(compose(refinements) @ outside == 0.0).astype(np.int32)
+
+
+def edge_subset(refinements: Sequence[Refinement], edges: np.ndarray) -> np.ndarray:
+    """Refine a subset of edges, such as creases.
+
+    Args:
+        refinements: Coarse to fine; none returns the edges.
+        edges: Coarse edges by their vertices, in either order, shape (K, 2). Pairs that are no edge are passed over.
+
+    Returns:
+        Fine edges by their vertices, shape (K 2^levels, 2), int32; those of one coarse edge in its direction, in a row.
+    """
+    edges = np.asarray(edges, np.int32).reshape(-1, 2)
+    for refinement in refinements:
+        found = find_edges(refinement.edges, edges)
+        edges = edges[found >= 0]
+        middle = (refinement.linear.shape[1] + found[found >= 0]).astype(np.int32)
+        edges = np.stack([edges[:, 0], middle, middle, edges[:, 1]], axis=1).reshape(-1, 2)
+    return edges
+
+
+def _check_count(what: str, found: int, wanted: int, elements: str) -> None:
+    """Raise unless both numbers agree."""
+    if found != wanted:
+        raise ValueError(f"{found} {what} for {wanted} {elements}")
