@@ -1,0 +1,113 @@
+"""What is wrong with a mesh, named element by element. Nothing here stops a refinement but indices out of range."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from .topology import PolygonMesh
+
+FLAT = 1e-7
+"""A face whose area is below this fraction of its longest edge squared has none, at the resolution of float32."""
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One thing that is wrong.
+
+    Attributes:
+        kind: "index-out-of-range", "degenerate-face", "zero-area-face", "duplicate-face", "non-manifold-edge",
+            "inconsistent-winding", "bow-tie-vertex" or "isolated-point".
+        index: The face, vertex or, for edges, row of ``mesh.half_edges.edges``.
+        message: The same in words.
+    """
+
+    kind: str
+    index: int
+    message: str
+
+
+def defects(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[Defect]:
+    """Find everything that is wrong with a mesh.
+
+    Args:
+        mesh: Any mesh; faces with an index out of range are named and left out of the other checks, so edges are then
+            numbered without them.
+        points: Positions, shape (V, 3); without them no areas are checked.
+
+    Returns:
+        Defects by kind, in the order of :attr:`Defect.kind`, then by index; empty for a clean manifold mesh.
+    """
+    broken = (mesh.indices < 0) | (mesh.indices >= mesh.vertex_count)
+    bad_faces = np.unique(mesh.corner_face[broken])
+    found = [
+        Defect("index-out-of-range", int(face), f"face {face} uses a vertex that does not exist") for face in bad_faces
+    ]
+    kept = np.setdiff1d(np.arange(mesh.face_count), bad_faces)
+    corners = ~np.isin(mesh.corner_face, bad_faces)
+    sound = PolygonMesh(mesh.counts[kept], mesh.indices[corners], mesh.vertex_count) if len(bad_faces) else mesh
+    found += _face_defects(sound, points, kept)
+    return found + _edge_defects(sound) + _vertex_defects(sound)
+
+
+def _named(kind: str, indices: Iterable[int], message: str) -> list[Defect]:
+    """One defect per index; the message has a place for it."""
+    return [Defect(kind, int(index), message.format(index)) for index in indices]
+
+
+def _face_defects(mesh: PolygonMesh, points: np.ndarray | None, names: np.ndarray) -> list[Defect]:
+    """Check faces; ``names`` are their numbers for the user."""
+    degenerate, duplicate = mesh.counts < 3, np.zeros(mesh.face_count, bool)
+    for size in np.unique(mesh.counts):
+        faces = np.flatnonzero(mesh.counts == size)
+        corners = np.sort(mesh.indices[mesh.starts[faces, None] + np.arange(size)], axis=1)
+        degenerate[faces] |= (corners[:, 1:] == corners[:, :-1]).any(axis=1)
+        first = np.unique(corners, axis=0, return_index=True)[1]
+        duplicate[np.setdiff1d(faces, faces[first])] = True
+    found = _named("degenerate-face", names[degenerate], "face {} repeats a vertex or has fewer than three corners")
+    if points is not None:
+        flat = _areas_vanish(mesh, np.asarray(points, np.float64)) & ~degenerate
+        found += _named("zero-area-face", names[flat], "face {} has no area")
+    return found + _named("duplicate-face", names[duplicate], "face {} has the vertices of an earlier face")
+
+
+def _areas_vanish(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
+    """Whether each face's area is negligible beside its longest edge squared, shape (F,)."""
+    here, there = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
+    origin = here[np.minimum(mesh.starts[:-1], max(len(here) - 1, 0))][mesh.corner_face]
+    twice = np.cross(here - origin, there - origin)
+    area = np.stack([np.bincount(mesh.corner_face, column, mesh.face_count) for column in twice.T], axis=1)
+    longest = np.zeros(mesh.face_count)
+    np.maximum.at(longest, mesh.corner_face, ((there - here) ** 2).sum(axis=1))
+    return ~(0.5 * np.linalg.norm(area, axis=1) > FLAT * longest)
+
+
+def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
+    """Check edges."""
+    half = mesh.half_edges
+    proper = half.edges[:, 0] != half.edges[:, 1]
+    forward = np.bincount(half.edge, half.forward, len(half.edges))
+    crowded = np.flatnonzero(proper & (half.count > 2))
+    twisted = np.flatnonzero(proper & (half.count == 2) & (forward != 1))
+    found = [
+        Defect("non-manifold-edge", int(row), f"edge {_pair(half.edges[row])} has {half.count[row]} faces")
+        for row in crowded
+    ]
+    return found + [
+        Defect("inconsistent-winding", int(row), f"both faces run through edge {_pair(half.edges[row])} the same way")
+        for row in twisted
+    ]
+
+
+def _pair(edge: np.ndarray) -> str:
+    """An edge for the user."""
+    return f"{edge[0]}-{edge[1]}"
+
+
+def _vertex_defects(mesh: PolygonMesh) -> list[Defect]:
+    """Check vertices."""
+    bow_ties, isolated = np.flatnonzero(mesh.fan_counts > 1), np.flatnonzero(mesh.fan_counts == 0)
+    found = _named("bow-tie-vertex", bow_ties, "vertex {} joins several fans of faces in a point")
+    return found + _named("isolated-point", isolated, "no face uses vertex {}")
