@@ -1,0 +1,138 @@
+"""A file that is either complete under its final name or not there at all.
+
+A file is written next to its target under a temporary name that carries the process id, flushed to the disk, and moved
+over the target in one step. A killed process can leave only the temporary file; the next run removes it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+
+from ..errors import LayerError, UsageError
+
+
+def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
+    """Name a temporary file beside its target.
+
+    Args:
+        target: Final path.
+        suffix: Format of the temporary file.
+
+    Returns:
+        ``<target>.<pid>.tmp<suffix>``.
+    """
+    return target.with_name(f"{target.name}.{os.getpid()}.tmp{suffix}")
+
+
+def prepare_target(target: Path, *, overwrite: bool) -> None:
+    """Check that a target may be written and remove what dead processes left beside it.
+
+    Args:
+        target: Final path.
+        overwrite: Whether an existing file may be replaced.
+
+    Raises:
+        UsageError: The target exists and may not be replaced, or is a folder.
+        LayerError: The folder cannot be made.
+    """
+    if target.is_dir():
+        raise UsageError(f"{target} is a folder; name a layer such as {target / 'refined.usdc'}")
+    if target.exists() and not overwrite:
+        raise UsageError(f"{target} exists; choose another name or allow overwriting")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LayerError(f"cannot make the folder {target.parent}: {error.strerror}") from error
+    remove_stale(target)
+
+
+def remove_stale(target: Path) -> list[Path]:
+    """Remove the temporary files of this target whose process is gone, and this process's own.
+
+    Args:
+        target: Final path.
+
+    Returns:
+        The files removed.
+    """
+    pattern = re.compile(re.escape(target.name) + r"\.(\d+)\.tmp\.usd[ac]?")
+    removed = []
+    for path in sorted(target.parent.iterdir()):
+        match = pattern.fullmatch(path.name)
+        if match and not _is_other_process(int(match[1])):
+            # Where the file is still open, Windows refuses and the file stays.
+            with suppress(OSError):
+                path.unlink()
+                removed.append(path)
+    return removed
+
+
+def _is_other_process(pid: int) -> bool:
+    """Whether another live process has this id; on Windows no process is asked, since os.kill would end it."""
+    if pid == os.getpid() or os.name == "nt":
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def publish(temporary: Path, target: Path) -> None:
+    """Flush a finished temporary file to the disk and move it over the target.
+
+    Args:
+        temporary: Complete file in the target's folder.
+        target: Final path.
+
+    Raises:
+        LayerError: The disk is full or the target is held open by another program.
+    """
+    try:
+        _flush(temporary)
+        temporary.replace(target)
+        if os.name != "nt":
+            _flush(target.parent)
+    except OSError as error:
+        raise LayerError(f"cannot write {target}: {error.strerror}; nothing was left under that name") from error
+
+
+def _flush(path: Path) -> None:
+    """Ask the system to bring a file or folder to the disk."""
+    flags = os.O_RDONLY if os.name != "nt" else os.O_RDWR
+    handle = os.open(path, flags)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def termination_raises() -> Iterator[None]:
+    """Turn a polite termination signal into SystemExit, so that ``with`` blocks clean up.
+
+    Does nothing outside the main thread, or where the host program handles the signal itself.
+    """
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, _raise_exit)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _raise_exit(number: int, frame: FrameType | None) -> None:
+    """Signal handler: leave as a shell reports a signal."""
+    raise SystemExit(128 + number)

@@ -1,0 +1,194 @@
+"""A layer written piece by piece: what has been written leaves memory.
+
+Author through ``Sdf``, not through a stage: nothing is composed, so a time sample costs no more than its copy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from pxr import Sdf, Tf
+
+from ..errors import LayerError
+from .atomic import prepare_target, publish, temporary_path
+
+FLUSH_BYTES = 16_000_000
+"""Pending array bytes at which the layer is saved; each save rewrites a few kilobytes of tables."""
+
+
+class LayerStream:
+    """One new layer, atomic and streaming.
+
+    Values go to a temporary binary layer beside the target; `commit` moves it to the final name, converting to text
+    where the target asks for it. Leaving the ``with`` block without `commit` removes the temporary file.
+    """
+
+    def __init__(self, target: Path, *, overwrite: bool = False) -> None:
+        """Start a temporary layer.
+
+        Args:
+            target: Final path, ``.usdc``, ``.usda`` or ``.usd``.
+            overwrite: Whether an existing file may be replaced, at `commit`.
+
+        Raises:
+            UsageError: The target exists and may not be replaced.
+            LayerError: The extension is not a layer's, or the folder cannot be written.
+        """
+        if target.suffix not in {".usdc", ".usda", ".usd"}:
+            raise LayerError(f"cannot write {target}: the extension must be .usdc, .usda or .usd")
+        prepare_target(target, overwrite=overwrite)
+        self.target = target
+        self.temporary = temporary_path(target)
+        self._pending = 0
+        try:
+            self._layer: Sdf.Layer | None = Sdf.Layer.CreateNew(str(self.temporary))
+        except Tf.ErrorException as error:
+            raise self._failure(error) from error
+        if self._layer is None:
+            raise LayerError(f"cannot write in {target.parent}: check that the folder is writable")
+
+    @property
+    def layer(self) -> Sdf.Layer:
+        """The layer being written.
+
+        Raises:
+            LayerError: It is already committed or discarded.
+        """
+        if self._layer is None:
+            raise LayerError(f"{self.target} is closed; nothing more can be written to it")
+        return self._layer
+
+    def prim(self, path: Sdf.Path) -> Sdf.PrimSpec:
+        """The ``over`` at a path, made with its ancestors where missing."""
+        return self.layer.GetPrimAtPath(path) or Sdf.CreatePrimInLayer(self.layer, path)
+
+    def attribute(
+        self,
+        path: Sdf.Path,
+        type_name: Sdf.ValueTypeName,
+        *,
+        uniform: bool = False,
+        interpolation: str = "",
+    ) -> Sdf.AttributeSpec:
+        """The attribute spec at a path, made where missing.
+
+        Args:
+            path: Property path.
+            type_name: Its value type.
+            uniform: Whether it may not vary in time.
+            interpolation: ``interpolation`` metadata to author, if any.
+
+        Returns:
+            The spec.
+        """
+        spec = self.layer.GetAttributeAtPath(path)
+        if spec is None:
+            variability = Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying
+            spec = Sdf.AttributeSpec(self.prim(path.GetPrimPath()), path.name, type_name, variability)
+        if interpolation:
+            spec.SetInfo("interpolation", interpolation)
+        return spec
+
+    def set(self, path: Sdf.Path, value: Any, *, time: float | None = None) -> None:
+        """Author one value of an existing attribute spec.
+
+        Args:
+            path: Property path.
+            value: A ``Vt`` array or plain value.
+            time: Time code, or None for the default.
+
+        Raises:
+            LayerError: The disk is full.
+        """
+        if time is None:
+            self.layer.GetAttributeAtPath(path).default = value
+        else:
+            self.layer.SetTimeSample(path, time, value)
+        self._pending += _size(value)
+        if self._pending >= FLUSH_BYTES:
+            self.flush()
+
+    def block(self, path: Sdf.Path, type_name: Sdf.ValueTypeName) -> None:
+        """Hide every weaker value of an attribute, its samples included."""
+        self.attribute(path, type_name).default = Sdf.ValueBlock()
+
+    def merge_custom_data(self, values: Mapping[str, Any]) -> None:
+        """Replace entries of the layer's ``customLayerData``."""
+        data = dict(self.layer.customLayerData)
+        data.update(values)
+        self.layer.customLayerData = data
+
+    def flush(self) -> None:
+        """Save what is pending and let go of its memory.
+
+        Raises:
+            LayerError: The disk is full or gone.
+        """
+        try:
+            saved = self.layer.Save()
+        except Tf.ErrorException as error:
+            raise self._failure(error) from error
+        if not saved:
+            raise LayerError(f"cannot write {self.target}: saving failed without a reason")
+        self._pending = 0
+
+    def commit(self) -> Path:
+        """Move the layer to its final name.
+
+        Returns:
+            The final path.
+
+        Raises:
+            LayerError: The disk is full, or the target is held open by another program.
+        """
+        self.flush()
+        finished = self._as_text() if self.target.suffix == ".usda" else self.temporary
+        # A layer that is still mapped into memory cannot be moved on Windows.
+        self._layer = None
+        publish(finished, self.target)
+        self.discard()
+        loaded = Sdf.Layer.Find(str(self.target))
+        if loaded:
+            loaded.Reload(True)
+        return self.target
+
+    def _as_text(self) -> Path:
+        """Convert the temporary layer to text."""
+        path = temporary_path(self.target, suffix=".usda")
+        try:
+            self.layer.Export(str(path))
+        except Tf.ErrorException as error:
+            path.unlink(missing_ok=True)
+            raise self._failure(error) from error
+        return path
+
+    def discard(self) -> None:
+        """Remove the temporary file, if it is still there."""
+        self._layer = None
+        self.temporary.unlink(missing_ok=True)
+
+    def _failure(self, error: Tf.ErrorException) -> LayerError:
+        """Say in one line what stopped a save."""
+        reason = str(error.args[0].commentary) if error.args and hasattr(error.args[0], "commentary") else str(error)
+        return LayerError(f"cannot write {self.target}: {reason}; nothing was left under that name")
+
+    def __enter__(self) -> LayerStream:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove the temporary file unless it was committed."""
+        self.discard()
+
+
+def _size(value: Any) -> int:
+    """Bytes of an array value, or a small number."""
+    try:
+        return memoryview(value).nbytes
+    except TypeError:
+        return 64 * len(value) if hasattr(value, "__len__") else 64
