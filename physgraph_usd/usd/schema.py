@@ -1,0 +1,152 @@
+"""The codeless schemas: one table of every attribute, and where their files are.
+
+Everything reads attributes by the names in this table, so it also works in a host where the schemas are not registered.
+``schemas/`` is written from it by ``python -m physgraph_usd.usd.schema_files``. This module imports pxr only to register.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import UsageError
+from ..fabric import PRESETS
+
+GARMENT_API = "PhysGraphGarmentAPI"
+COLLIDER_API = "PhysGraphColliderAPI"
+MATERIAL_API = "PhysGraphMaterialAPI"
+NAMESPACE = "physgraph:"
+MATERIAL = "physgraph:material:"
+AUTO_LEVEL = -1
+"""Level that asks for as many subdivisions as the fabric's buckling wavelength needs."""
+
+_SI = " SI, whatever the stage's metersPerUnit."
+_JERSEY = PRESETS["jersey"]
+
+
+@dataclass(frozen=True)
+class Property:
+    """One property of a schema.
+
+    Attributes:
+        schema: API schema that has it.
+        name: Full attribute name.
+        type: Sdf type name; "rel" is a relationship.
+        fallback: Value when nothing authors it; None when that means something else, told in ``doc``.
+        unit: SI unit, "" when it has none.
+        minimum: Least value allowed, or None.
+        maximum: Greatest value allowed, or None.
+        doc: What it is, for the schema's documentation.
+        uniform: Whether it cannot be animated.
+        interpolation: Of a primvar, else "".
+    """
+
+    schema: str
+    name: str
+    type: str
+    fallback: float | int | bool | None
+    unit: str
+    minimum: float | None
+    maximum: float | None
+    doc: str
+    uniform: bool = False
+    interpolation: str = ""
+
+    @property
+    def short(self) -> str:
+        """Name used in reports: without ``physgraph:`` and ``material:``."""
+        return self.name.removeprefix("primvars:").removeprefix(MATERIAL).removeprefix(NAMESPACE)
+
+
+def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
+    """Rows of the fabric values; a material has no fallbacks, so that only what it authors counts."""
+
+    def row(name: str, fallback: float | None, unit: str, minimum: float, doc: str) -> Property:
+        return Property(
+            schema, MATERIAL + name, "float", fallback if fallbacks else None, unit, minimum, None, doc + _SI
+        )
+
+    return (
+        row("stretchStiffness", _JERSEY.stretch, "N/m", 1e-3, "In-plane stiffness E h / (1 - nu^2)."),
+        row("shearStiffness", None, "N/m", 0.0, "Shear stiffness G h; authoring it selects the triangle membrane."),
+        row("bendStiffness", _JERSEY.bend, "N m", 0.0, "Bending stiffness E h^3 / 12 (1 - nu^2)."),
+        row("density", _JERSEY.density, "kg/m^2", 1e-4, "Mass per area."),
+        row("thickness", _JERSEY.thickness, "m", 1e-6, "Thickness of the cloth."),
+    )
+
+
+def _scale(name: str, fallback: float, maximum: float | None, doc: str) -> Property:
+    full = f"primvars:{NAMESPACE}{name}"
+    return Property(GARMENT_API, full, "float[]", fallback, "", 0.0, maximum, doc, interpolation="vertex")
+
+
+PROPERTIES: tuple[Property, ...] = (
+    Property(GARMENT_API, "physgraph:enabled", "bool", True, "", None, None, "Whether to refine this garment.", True),
+    Property(
+        GARMENT_API, "physgraph:refine:level", "int", 2, "", -1, 5,
+        "Number of subdivisions; -1 chooses it from the buckling wavelength.", True,
+    ),
+    Property(GARMENT_API, "physgraph:refine:detail", "float", 1.0, "", 0.0, 2.0, "Gain of the added detail."),
+    *_material(GARMENT_API, fallbacks=True),
+    Property(
+        GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, None,
+        "How firmly the mean of the fine cloth follows the coarse animation." + _SI,
+    ),
+    Property(
+        GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, None,
+        "Distance kept from colliders." + _SI,
+    ),
+    Property(
+        GARMENT_API, "physgraph:contact:selfCollision", "bool", True, "", None, None,
+        "Whether the garment collides with itself.", True,
+    ),
+    Property(
+        GARMENT_API, "physgraph:colliders", "rel", None, "", None, None,
+        "Colliders of this garment; empty means every collider prim on the stage.",
+    ),
+    _scale("stretchScale", 1.0, None, "Painted multiplier of the stretch stiffness; vertex or constant."),
+    _scale("bendScale", 1.0, None, "Painted multiplier of the bending stiffness; vertex or constant."),
+    _scale("detailScale", 1.0, None, "Painted multiplier of the added detail; vertex or constant."),
+    _scale("guideScale", 1.0, None, "Painted multiplier of the guide stiffness; vertex or constant."),
+    _scale("pin", 0.0, 1.0, "1 where the fine cloth follows the coarse cloth exactly."),
+    Property(
+        COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
+        "Whether garments collide with this prim.", True,
+    ),
+    Property(
+        COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None,
+        "Distance kept from this collider, added to the garment's." + _SI,
+    ),
+    *_material(MATERIAL_API, fallbacks=False),
+)  # fmt: skip
+"""Every property of the three schemas, in the order in which they are documented."""
+
+GARMENT: dict[str, Property] = {row.short: row for row in PROPERTIES if row.schema == GARMENT_API}
+"""Rows of the garment schema by short name."""
+
+
+def find_property(text: str) -> Property:
+    """Find a garment property by full name, by name without ``physgraph:``, or by its last word when only one has it.
+
+    Raises:
+        UsageError: When there is none; the message lists the names.
+    """
+    rows = [row for row in GARMENT.values() if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}]
+    rows = rows or [row for row in GARMENT.values() if row.name.rsplit(":", 1)[-1] == text]
+    if len(rows) != 1:
+        raise UsageError(f"unknown attribute {text!r}; known attributes: {', '.join(sorted(GARMENT))}")
+    return rows[0]
+
+
+def schema_path() -> Path:
+    """Folder that holds plugInfo.json, for PXR_PLUGINPATH_NAME: in the installed package or beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "schemas"
+    return inside if (inside / "plugInfo.json").exists() else package.parent / "schemas"
+
+
+def register() -> None:
+    """Make USD know the schemas; has no effect once any typed prim definition was read."""
+    from pxr import Plug  # noqa: PLC0415  the table must be readable where pxr is missing
+
+    Plug.Registry().RegisterPlugins(str(schema_path()))
