@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
+from shapes import check_shapes
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 20
@@ -64,3 +65,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if not torch.cuda.is_available():
         for item in gpu:
             item.add_marker(pytest.mark.skip(reason="no CUDA device"))
+
+
+def pytest_collection_finish() -> None:
+    """Hold every annotated tensor shape to its word, in the modules that the collected tests import."""
+    check_shapes("physgraph_usd")
