@@ -11,6 +11,7 @@ Where pxr can be imported the schemas are registered at once: USD accepts them o
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -93,3 +94,13 @@ def __getattr__(name: str) -> object:
 def __dir__() -> list[str]:
     """List the public names, imported or not."""
     return sorted({*globals(), *__all__})
+
+
+def _register_schemas() -> None:
+    if find_spec("pxr") is not None:
+        from .usd.schema import register
+
+        register()
+
+
+_register_schemas()

@@ -235,9 +235,12 @@ def sample(name: str, out: Path) -> None:
 @click.option("--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the one the layer names]")
 @click.option("--time", "times", type=float, multiple=True, metavar="T", help="Time code to draw; repeatable.")
 @click.option("--size", type=PictureSize(), default="1280x640", help="Pixels.")
-@click.option("--camera", metavar="PRIM", help="Look through this camera.")
+@click.option("--camera", type=(float, float), metavar="AZIMUTH ELEVATION", help="Where to look from, in degrees.")
 def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
-    """Draw the coarse cloth beside the fine cloth of LAYER and print the picture's path."""
+    """Draw the coarse cloth beside the fine cloth of LAYER and print the picture's path.
+
+    A PNG shows one time code, a GIF all of them.
+    """
     from .preview import preview as draw
 
     click.echo(draw(layer, out, times=times or None, **options))
