@@ -1,0 +1,180 @@
+"""A coarse cloth simulation by projective dynamics, just enough to animate the samples.
+
+Source: Bouaziz et al., "Projective Dynamics: Fusing Constraint Projections for Fast Simulation", 2014.
+Springs resist stretch but give way to compression down to a limit. That is the state in which a coarse
+simulation leaves a garment: shortened in places where the real cloth would have wrinkled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from .grid import springs
+
+GRAVITY = np.array([0.0, -9.81, 0.0])
+"""Gravity of the samples' simulations [m/s^2]; they are made with Y up."""
+
+
+@dataclass(frozen=True)
+class DrapeOptions:
+    """How the coarse cloth behaves.
+
+    Attributes:
+        step: Time step [s].
+        iterations: Projections per step.
+        spring: Spring stiffness [N/m].
+        give: Shortest length of a spring, as a part of its rest length.
+        bend: Weight of the squared Laplacian [N/m], keeps the cage smooth.
+        drag: Part of the velocity lost per second.
+        density: Areal density [kg/m^2].
+    """
+
+    step: float = 1.0 / 48.0
+    iterations: int = 12
+    spring: float = 40.0
+    give: float = 0.8
+    bend: float = 0.15
+    drag: float = 1.0
+    density: float = 0.2
+
+
+class Drape:
+    """A cloth with positions and velocities that is stepped through time.
+
+    Args:
+        rest: Rest positions [m], shape (V, 3).
+        faces: Triangles or quads, shape (F, 3) or (F, 4).
+        pinned: Vertices that follow targets, shape (K,).
+        options: How the cloth behaves.
+        project: Moves positions out of colliders, in place of contact forces; or None.
+        start: Positions at the beginning when they differ from ``rest``.
+    """
+
+    def __init__(
+        self,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        pinned: np.ndarray,
+        *,
+        options: DrapeOptions | None = None,
+        project: Callable[[np.ndarray, float], np.ndarray] | None = None,
+        start: np.ndarray | None = None,
+    ) -> None:
+        """Factorise the constant system."""
+        self.options = options or DrapeOptions()
+        self.faces, self.pinned, self._project = faces, pinned, project
+        self.points = np.array(rest if start is None else start, dtype=float)
+        self.velocity = np.zeros_like(self.points)
+        self.time = 0.0
+        ends = springs(faces)
+        count = len(rest)
+        self._length = np.linalg.norm(rest[ends[:, 1]] - rest[ends[:, 0]], axis=1)
+        rows = np.repeat(np.arange(len(ends)), 2)
+        signs = np.tile([-1.0, 1.0], len(ends))
+        self._difference = sparse.csr_matrix((signs, (rows, ends.ravel())), shape=(len(ends), count))
+        self._gather = (self.options.spring * self._difference.T).tocsr()
+        self._inertia = self.options.density * _areas(rest, faces) / self.options.step**2
+        self._hold = np.zeros(count)
+        self._hold[pinned] = 1e3 * self.options.spring
+        self._solver = self._factorise(rest)
+
+    def _factorise(self, rest: np.ndarray) -> SuperLU:
+        """Factorise inertia + springs + bending + pins."""
+        smooth = _smoothing(rest, self.faces)
+        system = (
+            sparse.diags(self._inertia + self._hold)
+            + self._gather @ self._difference
+            + self.options.bend * self.options.spring * (smooth.T @ smooth)
+        )
+        return splu(sparse.csc_matrix(system))
+
+    def step(self, targets: np.ndarray, *, force: np.ndarray | None = None) -> np.ndarray:
+        """Advance one time step.
+
+        Args:
+            targets: Positions of the pinned vertices [m], shape (K, 3).
+            force: Acceleration besides gravity [m/s^2], shape (V, 3), or None.
+
+        Returns:
+            The new positions [m], shape (V, 3).
+        """
+        step = self.options.step
+        self.time += step
+        pull = GRAVITY if force is None else GRAVITY + force
+        free = self.points + step * (1.0 - self.options.drag * step) * self.velocity + step * step * pull
+        right = self._inertia[:, None] * free
+        right[self.pinned] += self._hold[self.pinned, None] * targets
+        points = free
+        for _ in range(self.options.iterations):
+            edge = self._difference @ points
+            length = np.linalg.norm(edge, axis=1)
+            wanted = np.clip(length, self.options.give * self._length, self._length)
+            points = self._solver.solve(right + self._gather @ (edge * (wanted / length)[:, None]))
+            if self._project is not None:
+                points = self._project(points, self.time)
+        self.velocity = (points - self.points) / step
+        self.points = points
+        return points
+
+    def normals(self) -> np.ndarray:
+        """Return unit vertex normals, shape (V, 3)."""
+        return vertex_normals(self.points, self.faces)
+
+
+def _smoothing(rest: np.ndarray, faces: np.ndarray) -> sparse.csr_matrix:
+    """Distance of each vertex from its neighbours' mean; along the border only from its two border neighbours.
+
+    Rows that do not vanish at rest, at corners for example, are dropped, so that nothing curls by itself.
+    """
+    size, count = faces.shape[1], len(rest)
+    sides = np.sort(np.concatenate([faces[:, [i, (i + 1) % size]] for i in range(size)]), axis=1)
+    edges, uses = np.unique(sides, axis=0, return_counts=True)
+    border = np.zeros(count, bool)
+    border[edges[uses == 1]] = True
+    kept = np.concatenate([springs(faces), edges[uses == 1]])
+    inner = np.arange(len(kept)) < len(kept) - np.count_nonzero(uses == 1)
+    both = np.concatenate([kept, kept[:, ::-1]])
+    both = both[border[both[:, 0]] != np.tile(inner, 2)]
+    weights = sparse.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
+    smooth = sparse.eye(count) - sparse.diags(1.0 / np.maximum(weights.sum(axis=1).A1, 1.0)) @ weights
+    edge = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1).mean()
+    flat = np.linalg.norm(smooth @ rest, axis=1) < 0.3 * edge
+    return sparse.csr_matrix(sparse.diags(flat.astype(float)) @ smooth)
+
+
+def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted unit vertex normals.
+
+    Args:
+        points: Positions, shape (V, 3).
+        faces: Triangles or quads, shape (F, 3) or (F, 4).
+
+    Returns:
+        Unit normals, shape (V, 3).
+    """
+    corners = points[faces]
+    if faces.shape[1] == 4:
+        normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    else:
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(points)
+    for i in range(faces.shape[1]):
+        np.add.at(total, faces[:, i], normal)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+
+
+def _areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Each vertex's share of the area of its faces [m^2]."""
+    corners = points[faces]
+    last = corners[:, 3] - corners[:, 1] if faces.shape[1] == 4 else corners[:, 2] - corners[:, 1]
+    first = corners[:, 2] - corners[:, 0] if faces.shape[1] == 4 else corners[:, 1] - corners[:, 0]
+    area = 0.5 * np.linalg.norm(np.cross(first, last), axis=1)
+    total = np.zeros(len(points))
+    for i in range(faces.shape[1]):
+        np.add.at(total, faces[:, i], area / faces.shape[1])
+    return total

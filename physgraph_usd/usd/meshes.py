@@ -1,0 +1,234 @@
+"""Reads meshes for drawing: world positions, triangles and colours at a time, from any stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel
+
+from ..errors import StageError
+
+NEUTRAL = (0.55, 0.54, 0.52)
+"""Linear colour of a mesh that says nothing of its own."""
+
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Turns Z up into Y up."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMesh:
+    """One visible mesh at one time.
+
+    Attributes:
+        path: Prim path.
+        points: World positions [m], Y up, shape (V, 3).
+        triangles: Corners, counter-clockwise seen from outside, shape (T, 3).
+        edges: Whether the edge opposite each corner is a polygon's edge, shape (T, 3).
+        colors: Linear RGB per triangle, shape (T, 3).
+        faces: Number of authored polygons.
+    """
+
+    path: str
+    points: np.ndarray
+    triangles: np.ndarray
+    edges: np.ndarray
+    colors: np.ndarray
+    faces: int
+
+
+class DrawnStage:
+    """A shot, alone or under a layer, composed in an anonymous root.
+
+    Args:
+        shot: The shot's file, which gives units, axis and rates.
+        over: A layer put over the shot, or None.
+
+    Raises:
+        StageError: When a file cannot be opened.
+    """
+
+    def __init__(self, shot: Path, over: Path | None = None) -> None:
+        """Compose and open."""
+        base = _open_layer(shot)
+        layers = [_open_layer(path).identifier for path in (over, shot) if path is not None]
+        self._root = Sdf.Layer.CreateAnonymous(".usda")
+        for key in ("timeCodesPerSecond", "framesPerSecond", "upAxis", "metersPerUnit", "defaultPrim"):
+            if base.pseudoRoot.HasInfo(key):
+                self._root.pseudoRoot.SetInfo(key, base.pseudoRoot.GetInfo(key))
+        self._root.subLayerPaths = layers
+        self.stage = Usd.Stage.Open(self._root)
+        self.rate = float(self.stage.GetTimeCodesPerSecond())
+        self._scale = float(UsdGeom.GetStageMetersPerUnit(self.stage))
+        self._turn = Z_UP if UsdGeom.GetStageUpAxis(self.stage) == "Z" else np.eye(3)
+
+    def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
+        """Return the time codes at which any of the prims, their ancestors or skeletons have samples."""
+        found: set[float] = set()
+        for prim in [self.stage.GetPrimAtPath(p) for p in paths] + self._animations():
+            while prim and not prim.IsPseudoRoot():
+                if prim.IsA(UsdGeom.Imageable) or prim.IsA(UsdSkel.Animation):
+                    for name in _moving(prim):
+                        found.update(prim.GetAttribute(name).GetTimeSamples())
+                prim = prim.GetParent()
+        return tuple(sorted(found))
+
+    def _animations(self) -> list[Usd.Prim]:
+        """Skeleton animations on the stage."""
+        prims = Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies())
+        return [prim for prim in prims if prim.IsA(UsdSkel.Animation)]
+
+    def bake(self, times: tuple[float, ...]) -> None:
+        """Skin the skinned meshes for the given times, in the anonymous root."""
+        prims = Usd.PrimRange.Stage(self.stage)
+        if not any(prim.IsA(UsdSkel.Root) for prim in prims):
+            return
+        self.stage.SetEditTarget(self._root)
+        span = Gf.Interval(min(times), max(times)) if times else Gf.Interval.GetFullInterval()
+        UsdSkel.BakeSkinning(Usd.PrimRange.Stage(self.stage), span)
+
+    def garments(self) -> tuple[str, ...]:
+        """Return the paths of meshes with the garment schema applied, registered or not."""
+        prims = Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies())
+        applied = [p for p in prims if "PhysGraphGarmentAPI" in p.GetPrimTypeInfo().GetAppliedAPISchemas()]
+        return tuple(str(prim.GetPath()) for prim in applied if prim.IsA(UsdGeom.Mesh))
+
+    def meshes(self, time: float | None) -> list[DrawnMesh]:
+        """Read every visible mesh of purpose default or render.
+
+        Args:
+            time: Time code, or None for the default values.
+
+        Returns:
+            The meshes in stage order; those without usable faces are left out.
+        """
+        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        transforms = UsdGeom.XformCache(code)
+        drawn = []
+        for prim in Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies()):
+            mesh = UsdGeom.Mesh(prim)
+            if not mesh or not _is_seen(mesh, code):
+                continue
+            matrix = np.array(transforms.GetLocalToWorldTransform(prim))
+            read = _read(mesh, code, matrix)
+            if read is not None:
+                points = self._scale * (read.points @ matrix[:3, :3] + matrix[3, :3]) @ self._turn.T
+                drawn.append(DrawnMesh(read.path, points, read.triangles, read.edges, read.colors, read.faces))
+        return drawn
+
+
+def shot_of(layer: Path) -> Path | None:
+    """Find the shot that a refined layer was made from.
+
+    Args:
+        layer: A layer with ``customLayerData["physgraph"]["shot"]``, or any other.
+
+    Returns:
+        The shot's file, or None when the layer does not name one.
+    """
+    opened = _open_layer(layer)
+    record = opened.customLayerData.get("physgraph", {})
+    shot = record.get("shot") if hasattr(record, "get") else None
+    return Path(opened.ComputeAbsolutePath(str(shot))) if shot else None
+
+
+def refined_in(layer: Path) -> tuple[str, ...]:
+    """Return the paths whose points a layer authors itself."""
+    opened, found = _open_layer(layer), []
+
+    def visit(path: Sdf.Path) -> None:
+        if path.IsPropertyPath() and path.name == "points":
+            found.append(str(path.GetPrimPath()))
+
+    opened.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return tuple(sorted(found))
+
+
+def _open_layer(path: Path) -> Sdf.Layer:
+    """Open a layer or say that it cannot be read."""
+    try:
+        layer = Sdf.Layer.FindOrOpen(str(path))
+    except Tf.ErrorException as error:
+        raise StageError(f"{path}: not a readable USD file") from error
+    if not layer:
+        raise StageError(f"{path}: no such USD file")
+    return layer
+
+
+def _moving(prim: Usd.Prim) -> list[str]:
+    """Names of the attributes that move a prim."""
+    ops = [str(name) for name in prim.GetPropertyNames() if str(name).startswith("xformOp:")]
+    named = ("points", "rotations", "translations", "scales", "blendShapeWeights")
+    return ops + [name for name in named if prim.HasAttribute(name)]
+
+
+def _is_seen(mesh: UsdGeom.Mesh, code: Usd.TimeCode) -> bool:
+    """Whether a renderer would draw the mesh."""
+    purpose = mesh.ComputePurpose()
+    return purpose in {"default", "render"} and mesh.ComputeVisibility(code) != "invisible"
+
+
+def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMesh | None:
+    """Read one mesh in its own space and units, or None when it cannot be drawn."""
+    points, counts, indices = (
+        attribute.Get(code)
+        for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    )
+    if not points or not counts or not indices:
+        return None
+    place = np.asarray(points, dtype=np.float64)
+    counts, indices = np.asarray(counts), np.asarray(indices)
+    usable = counts.sum() == len(indices) and indices.min() >= 0 and indices.max() < len(place)
+    if not usable or not np.isfinite(place).all():
+        return None
+    face, triangles, edges = _fan(counts, indices)
+    left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
+    if left != (np.linalg.det(matrix[:3, :3]) < 0):
+        triangles, edges = triangles[:, ::-1], edges[:, ::-1]
+    colors = _colors(mesh, code, len(counts))[face]
+    return DrawnMesh(str(mesh.GetPath()), place, triangles, edges, colors, len(counts))
+
+
+def _fan(counts: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split polygons into fans: face of each triangle, corners, and which edges are polygon edges."""
+    starts = np.cumsum(counts) - counts
+    pieces = np.maximum(counts - 2, 0)
+    face = np.repeat(np.arange(len(counts)), pieces)
+    step = np.arange(len(face)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 1
+    start = starts[face]
+    triangles = np.stack([indices[start], indices[start + step], indices[start + step + 1]], axis=1)
+    last = step + 1 == counts[face] - 1
+    edges = np.stack([np.ones(len(face), bool), last, step == 1], axis=1)
+    return face, triangles, edges
+
+
+def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
+    """Linear colour per authored face: subset's material, else the mesh's, else displayColor, else neutral."""
+    colors = np.tile(np.array(NEUTRAL), (faces, 1))
+    shown = mesh.GetDisplayColorPrimvar().ComputeFlattened(code)
+    if shown:
+        values = np.asarray(shown, dtype=float)
+        colors[:] = values if len(values) == faces else values.mean(axis=0)
+    whole = _material_color(mesh.GetPrim())
+    if whole is not None:
+        colors[:] = whole
+    for subset in UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets():
+        own = _material_color(subset.GetPrim())
+        members = np.asarray(subset.GetIndicesAttr().Get(code) or [], dtype=int)
+        if own is not None:
+            colors[members[members < faces]] = own
+    return colors
+
+
+def _material_color(prim: Usd.Prim) -> np.ndarray | None:
+    """Diffuse colour of the preview surface bound to a prim, or None when it has none or a texture."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    if not material:
+        return None
+    shader = material.ComputeSurfaceSource()[0]
+    diffuse = shader.GetInput("diffuseColor") if shader else None
+    if not diffuse or diffuse.HasConnectedSource():
+        return None
+    value = diffuse.Get()
+    return None if value is None else np.array(value, dtype=float)
