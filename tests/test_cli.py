@@ -1,0 +1,268 @@
+"""The console command: what is printed where, which code it leaves with, and that the installed one starts."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import sysconfig
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from click.testing import CliRunner, Result
+
+from physgraph_usd import cli, errors
+
+pytest.importorskip("pxr", reason="the commands read stages with usd-core")
+
+Sample = Callable[[str], Path]
+SMALL = ("--frames", "1:2", "--level", "1")
+
+
+def run(*args: object) -> Result:
+    result = CliRunner().invoke(cli.main, [str(arg) for arg in args])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture
+def refined(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
+    """Calls of refine_shot, which does nothing here; an element's ``report`` is what it returns."""
+    calls: list[SimpleNamespace] = []
+
+    def refine_shot(shot: str, out: Path, options: object) -> SimpleNamespace:
+        calls.append(SimpleNamespace(shot=shot, out=out, options=options))
+        return SimpleNamespace(out=out, warnings=(), exit_code=0, to_json=lambda: "{}")
+
+    monkeypatch.setattr("physgraph_usd.shot.refine_shot", refine_shot)
+    return calls
+
+
+class TestInstalled:
+    @pytest.fixture
+    def script(self) -> Path:
+        try:
+            distribution("physgraph-usd")
+        except PackageNotFoundError:
+            pytest.skip("physgraph-usd is not installed in this environment; make test installs it")
+        return Path(sysconfig.get_path("scripts")) / "physgraph-usd"
+
+    def test_refines(self, script: Path, sample: Sample, tmp_path: Path) -> None:
+        out = tmp_path / "fine.usdc"
+        command = [script, "refine", sample("swatch"), "-o", out, *SMALL]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert Path(done.stdout.strip()) == out
+        assert out.is_file()
+
+    def test_help_answers_at_once(self, script: Path) -> None:
+        seconds = []
+        for _ in range(5):
+            start = time.perf_counter()
+            subprocess.run([script, "--help"], capture_output=True, check=True)
+            seconds.append(time.perf_counter() - start)
+        assert min(seconds) < 0.5
+
+
+def test_module_is_the_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "physgraph_usd", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("physgraph-usd, version")
+
+
+@pytest.mark.parametrize("command", sorted(cli.main.commands))
+def test_every_command_explains_itself(command: str) -> None:
+    result = run(command, "--help")
+    assert result.exit_code == 0
+    assert f"Usage: main {command}" in result.output
+
+
+class TestRefine:
+    def test_layer_report_and_root(self, sample: Sample, tmp_path: Path) -> None:
+        out, report, root = tmp_path / "fine.usdc", tmp_path / "fine.json", tmp_path / "fine.usda"
+        result = run("refine", sample("swatch"), "-o", out, "--report", report, "--root", root, *SMALL)
+        assert (result.exit_code, result.stdout.split()) == (0, [str(out)])
+        assert json.loads(report.read_text(encoding="utf-8"))
+        assert root.is_file()
+        assert run("validate", out, "--shot", sample("swatch")).exit_code == 0
+
+    def test_quiet_when_not_a_terminal(self, sample: Sample, tmp_path: Path) -> None:
+        result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", *SMALL)
+        assert "%" not in result.stderr
+
+    def test_dry_run_writes_nothing(self, sample: Sample, tmp_path: Path) -> None:
+        result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", "--dry-run", *SMALL)
+        assert result.exit_code == 0
+        assert json.loads(result.stdout)
+        assert not list(tmp_path.iterdir())
+
+    def test_existing_layer_is_kept_unless_told(self, sample: Sample, tmp_path: Path) -> None:
+        out = tmp_path / "fine.usdc"
+        out.write_bytes(b"mine")
+        result = run("refine", sample("swatch"), "-o", out, *SMALL)
+        assert result.exit_code in (1, 2)
+        assert result.stderr.startswith("error: ")
+        assert out.read_bytes() == b"mine"
+        assert run("refine", sample("swatch"), "-o", out, "--overwrite", *SMALL).exit_code == 0
+
+    def test_options_arrive(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+        args = ["--frames", "-2.5:3", "--garment", "/A", "--garment", "/B", "--level", "auto", "--set", "/A.x=1"]
+        run("refine", "a.usda", "-o", tmp_path / "a.usdc", *args, "--temporal", "off", "--rest", "4", "--velocities")
+        options = refined[0].options
+        assert options.frames == (-2.5, 3.0)
+        assert tuple(options.garments) == ("/A", "/B")
+        assert (options.level, tuple(options.overrides)) == (-1, ("/A.x=1",))
+        assert (options.temporal, options.rest_frame, options.velocities) == ("off", 4.0, True)
+
+    def test_what_is_left_out_keeps_its_default(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+        from physgraph_usd.shot import RefineOptions
+
+        run("refine", "a.usda", "-o", tmp_path / "a.usdc")
+        for field in fields(RefineOptions):
+            if field.name != "progress":
+                assert getattr(refined[0].options, field.name) == getattr(RefineOptions(), field.name), field.name
+
+    def test_every_option_is_one_of_the_call(self) -> None:
+        from physgraph_usd.shot import RefineOptions
+
+        declared = {parameter.name for parameter in cli.refine.params} - {"shots", "out"}
+        assert declared == {field.name for field in fields(RefineOptions)} - {"progress"}
+
+
+class TestSeveralShots:
+    def test_each_gets_its_files(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+        result = run("refine", "a/one.usda", "b/two.usd", "-o", tmp_path / "out", "--report", tmp_path / "reports")
+        assert result.exit_code == 0
+        assert [call.out.name for call in refined] == ["one.refined.usdc", "two.refined.usdc"]
+        assert [call.options.report.name for call in refined] == ["one.json", "two.json"]
+
+    def test_equal_names_are_refused(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+        result = run("refine", "a/shot.usda", "b/shot.usda", "-o", tmp_path / "out")
+        assert (result.exit_code, refined) == (2, [])
+        assert "shot.refined.usdc" in result.stderr
+
+    def test_one_file_for_two_is_refused(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+        result = run("refine", "a.usda", "b.usda", "-o", tmp_path / "out.usdc")
+        assert (result.exit_code, refined) == (2, [])
+
+    def test_a_broken_one_leaves_the_others(self, sample: Sample, tmp_path: Path) -> None:
+        missing = tmp_path / "missing.usda"
+        result = run("refine", missing, sample("swatch"), "-o", tmp_path / "out", *SMALL)
+        assert result.exit_code == 3
+        assert "missing.usda" in result.stderr
+        assert [file.name for file in (tmp_path / "out").iterdir()] == ["swatch.refined.usdc"]
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("error", "code"),
+        [
+            (errors.UsageError("unknown integrator 'x'"), 2),
+            (errors.StageError("cannot open"), 1),
+            (errors.GarmentError("/A", "NaN", time=4.0), 1),
+            (errors.SolveError("energy is not finite"), 1),
+            (errors.LayerError("disk full"), 1),
+        ],
+    )
+    def test_code_and_message(
+        self, error: errors.PhysGraphError, code: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        def fail(*_: object) -> None:
+            raise error
+
+        monkeypatch.setattr("physgraph_usd.shot.refine_shot", fail)
+        result = run("refine", "a.usda", "-o", tmp_path / "a.usdc")
+        assert (result.exit_code, result.stdout, result.stderr) == (code, "", f"error: {error}\n")
+
+    @pytest.mark.parametrize(
+        "args",
+        [
+            ("refine", "a.usda"),
+            ("refine", "-o", "a.usdc"),
+            ("refine", "a.usda", "-o", "b.usdc", "--frames", "5:1"),
+            ("refine", "a.usda", "-o", "b.usdc", "--frames", "nan"),
+            ("refine", "a.usda", "-o", "b.usdc", "--frames", "a:b"),
+            ("refine", "a.usda", "-o", "b.usdc", "--level", "fine"),
+            ("refine", "a.usda", "-o", "b.usdc", "--mode", "under"),
+            ("preview", "a.usdc", "-o", "b.png", "--size", "0x3"),
+            ("sample", "trousers", "-o", "x"),
+            ("unknown",),
+        ],
+    )
+    def test_wrong_usage_is_2(self, args: tuple[str, ...]) -> None:
+        result = run(*args)
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert "rror: " in result.stderr
+
+    @pytest.mark.parametrize("command", ["refine", "inspect", "tag", "validate", "preview"])
+    def test_missing_file_is_1(self, command: str, tmp_path: Path) -> None:
+        out = {"inspect": (), "validate": (), "preview": ("-o", tmp_path / "x.png")}.get(
+            command, ("-o", tmp_path / "x.usdc")
+        )
+        garment = ("--garment", "/A") if command == "tag" else ()
+        result = run(command, tmp_path / "missing.usda", *out, *garment)
+        assert result.exit_code == 1
+        assert "missing.usda" in result.stderr + result.stdout
+        assert not list(tmp_path.iterdir())
+
+    def test_done_in_part_is_3(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        report = SimpleNamespace(out=tmp_path / "a.usdc", warnings=("frame 3 failed",), exit_code=3)
+        monkeypatch.setattr("physgraph_usd.shot.refine_shot", lambda *_: report)
+        result = run("refine", "a.usda", "-o", report.out)
+        assert (result.exit_code, result.stderr) == (3, "warning: frame 3 failed\n")
+
+    def test_missing_extra_is_named(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.delitem(sys.modules, "physgraph_usd.preview", raising=False)
+        monkeypatch.setitem(sys.modules, "PIL", None)
+        result = run("preview", "a.usdc", "-o", tmp_path / "x.png")
+        assert result.exit_code == 1
+        assert "pip install 'physgraph-usd[preview]'" in result.stderr
+
+
+class TestOtherCommands:
+    def test_sample_prints_what_it_wrote(self, tmp_path: Path) -> None:
+        result = run("sample", "swatch", "-o", tmp_path)
+        assert [Path(result.stdout.strip())] == list(tmp_path.iterdir())
+
+    def test_inspect(self, sample: Sample) -> None:
+        text, data = run("inspect", sample("swatch")), run("inspect", sample("swatch"), "--json")
+        assert (text.exit_code, data.exit_code) == (0, 0)
+        assert json.loads(data.stdout)
+        assert "swatch" in text.stdout
+
+    def test_tag_then_refine(self, sample: Sample, tmp_path: Path) -> None:
+        found = json.loads(run("inspect", sample("swatch"), "--json").stdout)
+        path = found["garments"][0]["path"]
+        tagged = tmp_path / "tagged.usda"
+        assert run("tag", sample("swatch"), "-o", tagged, "--garment", path, "--preset", "denim").exit_code == 0
+        assert run("refine", tagged, "-o", tmp_path / "fine.usdc", *SMALL).exit_code == 0
+
+    def test_preview(self, sample: Sample, tmp_path: Path) -> None:
+        picture = tmp_path / "picture.png"
+        result = run("preview", sample("swatch"), "-o", picture, "--size", "160x80")
+        assert (result.exit_code, result.stdout) == (0, f"{picture}\n")
+
+    def test_schema_path(self) -> None:
+        assert (Path(run("schema-path").stdout.strip()) / "plugInfo.json").is_file()
+
+
+def test_progress_shows_time_left_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with cli._progress("shot.usda") as progress:
+        for done in range(1, 5):
+            progress(done, 4)
+    assert "shot.usda" in terminal.getvalue()
+    assert "100%" in terminal.getvalue()

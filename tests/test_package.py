@@ -1,0 +1,70 @@
+"""The package as it is imported and as it is shipped."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import physgraph_usd
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = {"torch", "warp", "numpy", "scipy", "trimesh"}
+
+
+def modules_after(code: str) -> set[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\nimport sys; sys.stdout.write(' '.join(sys.modules))"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+    )
+    return set(done.stdout.split())
+
+
+def test_importing_is_light() -> None:
+    assert not HEAVY & modules_after("import physgraph_usd")
+
+
+def test_importing_reads_no_stage() -> None:
+    assert "pxr.Usd" not in modules_after("import physgraph_usd")
+
+
+def test_importing_registers_the_schemas() -> None:
+    pytest.importorskip("pxr")
+    code = (
+        "import physgraph_usd\nfrom pxr import Usd\n"
+        "assert Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('PhysGraphGarmentAPI')"
+    )
+    assert "pxr.Usd" in modules_after(code)
+
+
+def test_importing_works_without_usd() -> None:
+    assert "physgraph_usd" in modules_after("import sys; sys.modules['pxr'] = None\nimport physgraph_usd")
+
+
+@pytest.mark.parametrize("name", physgraph_usd.__all__)
+def test_public_name_is_there(name: str) -> None:
+    pytest.importorskip("pxr")
+    assert getattr(physgraph_usd, name) is not None
+    assert name in dir(physgraph_usd)
+
+
+def test_unknown_name_lists_the_public_ones() -> None:
+    with pytest.raises(AttributeError, match=r"'refine'.*refine_shot"):
+        _ = physgraph_usd.refine
+
+
+def test_wheel_carries_schemas_weights_and_licence(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path], check=True, cwd=ROOT)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert wheel.name.startswith(f"physgraph_usd-{physgraph_usd.__version__}-py3-none-any")
+    for name in ("schemas/plugInfo.json", "schemas/generatedSchema.usda", "weights/README.md", "cli.py"):
+        assert f"physgraph_usd/{name}" in names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert not [name for name in names if name.startswith(("tests/", "schemas/"))]
