@@ -97,10 +97,10 @@ class State:
         time: The stage's own time code; None for a shot without samples.
         points: Fine positions [m], world space, one (V, 3) float32 or float64 array per garment.
         telemetry: Plain numbers and words per garment, ready for JSON.
-        reused: True when the input equalled the previous frame's and its state was kept.
+        reused: For each garment, True when its input equalled the previous frame's and its points were kept.
     """
 
     time: float | None
     points: tuple[np.ndarray, ...]
     telemetry: tuple[dict[str, object], ...] = field(default=())
-    reused: bool = False
+    reused: tuple[bool, ...] = field(default=())

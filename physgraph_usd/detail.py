@@ -1,0 +1,158 @@
+"""Carries the detail of one frame to the next in the moving frames of the coarse surface, and tells when not to.
+
+Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame made of its normal and of
+a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface. Interpolated to the
+fine vertices, they take the detail along.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .level import Level
+from .mesh.stencil import Stencil
+
+
+@dataclass(frozen=True)
+class Reset:
+    """When a frame starts cold.
+
+    Attributes:
+        move: RMS motion of the cage between samples, in mean cage edges, above which detail is dropped.
+        turn: RMS rotation of the frames [rad] above which detail is dropped.
+        gap: Time between samples, in usual spacings, above which detail is dropped.
+    """
+
+    move: float = 25.0
+    turn: float = math.pi / 3.0
+    gap: float = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """One frame's result, kept for the next.
+
+    Attributes:
+        coarse: Cage positions [m], world space.
+        detail: Fine positions minus the smooth base, in the moving frames [m], shape (V, 3).
+        frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
+    """
+
+    coarse: Float[Tensor, "coarse 3"]
+    detail: Float[Tensor, "vertices 3"]
+    frames: Float[Tensor, "coarse 3 3"]
+
+
+class MovingFrames:
+    """The frames of one level's cage and the way from them to the fine vertices."""
+
+    def __init__(self, level: Level, cage_triangles: np.ndarray, cage_rest: np.ndarray) -> None:
+        """Fix each cage vertex's tangent in the rest shape.
+
+        Args:
+            level: The finest level.
+            cage_triangles: Triangles of the cage, shape (T, 3).
+            cage_rest: Rest positions of the cage [m], shape (C, 3).
+        """
+        self._level = level
+        self._triangles = torch.as_tensor(cage_triangles.astype(np.int64), device=level.device)
+        tangent = _tangent_operator(cage_triangles, np.asarray(cage_rest, dtype=np.float64))
+        self._tangent = Stencil(tangent, dtype=level.dtype, device=level.device)
+        self._edge = _mean_edge(cage_triangles, cage_rest)
+
+    def frames(self, coarse: Float[Tensor, "coarse 3"]) -> Float[Tensor, "coarse 3 3"]:
+        """Orthonormal frames at the cage vertices; columns are tangent, bitangent, normal."""
+        corner = coarse[self._triangles]
+        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal = torch.zeros_like(coarse).index_add_(0, self._triangles.T.reshape(-1), area.repeat(3, 1))
+        return _orthonormal(normal, self._tangent.apply(coarse))
+
+    def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> Carried:
+        """Keep a solved frame's detail."""
+        frames = self.frames(coarse)
+        detail = fine - self._level.smooth_base.apply(coarse)
+        local = torch.einsum("vij,vi->vj", self._spread(frames), detail)
+        return Carried(coarse, local, frames)
+
+    def predict(
+        self, kept: Carried, coarse: Float[Tensor, "coarse 3"]
+    ) -> tuple[Float[Tensor, "vertices 3"], float, float]:
+        """Carry detail to new cage positions.
+
+        Returns:
+            Predicted fine positions [m], the RMS motion of the cage in mean cage edges, and its RMS turn [rad].
+        """
+        frames = self.frames(coarse)
+        moved = torch.einsum("vij,vj->vi", self._spread(frames), kept.detail)
+        motion = float((coarse - kept.coarse).square().sum(dim=1).mean().sqrt()) / self._edge
+        cosine = (torch.einsum("cij,cij->c", frames, kept.frames) - 1.0) / 2.0
+        turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
+        return self._level.smooth_base.apply(coarse) + moved, motion, turn
+
+    def _spread(self, frames: Float[Tensor, "coarse 3 3"]) -> Float[Tensor, "vertices 3 3"]:
+        """Interpolate cage frames to the fine vertices."""
+        base = self._level.base
+        tangent = base.apply(frames[:, :, 0].contiguous())
+        return _orthonormal(base.apply(frames[:, :, 2].contiguous()), tangent)
+
+
+def _orthonormal(normal: Tensor, tangent: Tensor) -> Tensor:
+    """Frames from normals and rough tangents; any frame where both vanish."""
+    normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+    tangent = tangent - (tangent * normal).sum(dim=1, keepdim=True) * normal
+    tangent = torch.nn.functional.normalize(tangent, dim=1, eps=1e-30)
+    return torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=2)
+
+
+def _tangent_operator(triangles: np.ndarray, rest: np.ndarray) -> sp.csr_matrix:
+    """Sparse map from cage positions to one tangent a vertex.
+
+    A vertex's reference direction at rest is projected into each incident triangle and written as a combination of that
+    triangle's two edges; the same combination of the deformed edges is that triangle's vote.
+    """
+    count = len(rest)
+    reference = _reference_directions(triangles, rest)
+    rows, columns, values = [], [], []
+    first, second = rest[triangles[:, 1]] - rest[triangles[:, 0]], rest[triangles[:, 2]] - rest[triangles[:, 0]]
+    a, b, c = (np.einsum("tc,tc->t", u, v) for u, v in ((first, first), (first, second), (second, second)))
+    determinant = a * c - b * b
+    sound = determinant > 1e-12 * a * c
+    inverse = np.where(sound, 1.0 / np.where(sound, determinant, 1.0), 0.0)
+    area = np.sqrt(np.maximum(determinant, 0.0))
+    for corner in range(3):
+        vertex = triangles[:, corner]
+        p = np.einsum("tc,tc->t", first, reference[vertex])
+        q = np.einsum("tc,tc->t", second, reference[vertex])
+        along_first, along_second = area * inverse * (c * p - b * q), area * inverse * (a * q - b * p)
+        rows += [vertex] * 3
+        columns += [triangles[:, 0], triangles[:, 1], triangles[:, 2]]
+        values += [-along_first - along_second, along_first, along_second]
+    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.csr_matrix(triplets, shape=(count, count))
+
+
+def _reference_directions(triangles: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """One tangent direction per cage vertex in the rest shape: its first edge, projected."""
+    normal = np.zeros_like(rest)
+    area = np.cross(rest[triangles[:, 1]] - rest[triangles[:, 0]], rest[triangles[:, 2]] - rest[triangles[:, 0]])
+    for corner in range(3):
+        np.add.at(normal, triangles[:, corner], area)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    direction = np.zeros_like(rest)
+    for corner in (2, 1, 0):
+        direction[triangles[:, corner]] = rest[triangles[:, (corner + 1) % 3]] - rest[triangles[:, corner]]
+    return direction - np.einsum("vc,vc->v", direction, normal)[:, None] * normal
+
+
+def _mean_edge(triangles: np.ndarray, rest: np.ndarray) -> float:
+    if not len(triangles):
+        return 1.0
+    sides = rest[triangles] - rest[np.roll(triangles, 1, axis=1)]
+    return max(float(np.linalg.norm(sides, axis=2).mean()), 1e-12)

@@ -1,0 +1,1 @@
+"""Forces: one file a term of the potential."""

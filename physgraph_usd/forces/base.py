@@ -1,0 +1,187 @@
+"""What a force is, and the sum of forces that an integrator sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..mesh.stencil import SCALAR, VECTOR, vectors
+from ..mesh.topology import incidence
+
+
+class Force(Protocol):
+    """One term of the potential.
+
+    A term writes its force by hand; tests hold it against finite differences of its energy.
+    """
+
+    name: str
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add -dE/dx [N] to ``force`` in place and return the energy E [J] as a float64 scalar."""
+        ...
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """A third of the trace of each vertex's positive semi-definite Hessian block [N/m]."""
+        ...
+
+    def rest_matrix(self) -> sp.csr_matrix | None:
+        """The term's scalar Hessian at rest [N/m], shape (V, V), or None when it has none."""
+        ...
+
+
+class ForceModule:
+    """The sum of the terms that one frame needs.
+
+    Attributes:
+        forces: The terms, in order.
+    """
+
+    def __init__(self, forces: Sequence[Force]) -> None:
+        """Keep the terms in order; the order fixes the rounding of their sum."""
+        self.forces = tuple(forces)
+
+    def energy_and_force(
+        self, x: Float[Tensor, "vertices 3"]
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
+        """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
+        force = torch.zeros_like(x)
+        energy = torch.zeros((), dtype=torch.float64, device=x.device)
+        for term in self.forces:
+            energy = energy + term.add_force(x, force)
+        return energy, force
+
+    def energies(self, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
+        """Energy of each term [J] by name."""
+        return {term.name: float(term.add_force(x, torch.zeros_like(x))) for term in self.forces}
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """Sum of the terms' Hessian diagonals [N/m]."""
+        return torch.stack([term.diagonal(x) for term in self.forces]).sum(dim=0)
+
+    def rest_matrix(self) -> sp.csr_matrix:
+        """Sum of the terms' scalar rest Hessians [N/m], shape (V, V); zero when no term has one."""
+        parts = [matrix for term in self.forces if (matrix := term.rest_matrix()) is not None]
+        total = parts[0]
+        for part in parts[1:]:
+            total = total + part
+        return sp.csr_matrix(total)
+
+
+@wp.kernel
+def _gather_corners(
+    starts: wp.array(dtype=wp.int32),
+    slots: wp.array(dtype=wp.int32),
+    corner_force: wp.array(dtype=Any),
+    force: wp.array(dtype=Any),
+):
+    vertex = wp.tid()
+    total = force[vertex]
+    for k in range(starts[vertex], starts[vertex + 1]):
+        total += corner_force[slots[k]]
+    force[vertex] = total
+
+
+_GATHER = {
+    dtype: wp.overload(
+        _gather_corners,
+        [
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=VECTOR[dtype]),
+            wp.array(dtype=VECTOR[dtype]),
+        ],
+    )
+    for dtype in VECTOR
+}
+
+
+class Elements:
+    """Elements of N corners, with buffers for their energies and corner forces.
+
+    Element kernels write one force per corner; vertices then gather theirs, so no two threads
+    write the same place and the sum's order is fixed.
+
+    Attributes:
+        count: Number of elements.
+        corners: Corner vertices, Warp array of N-vectors, shape (count,).
+        energy: Energy of each element [J], shape (count,).
+        corner_force: Force on each corner [N], shape (count * N, 3).
+    """
+
+    def __init__(self, corners: Int[Tensor, "elements corners"], vertex_count: int, *, dtype: torch.dtype) -> None:
+        """Prepare the gather tables and buffers for elements on the device of ``corners``."""
+        self.count, width = corners.shape
+        self.device = str(corners.device)
+        self._vertex_count = vertex_count
+        self._dtype = dtype
+        rows = incidence(corners.cpu().numpy(), vertex_count)
+        slots = rows.element * np.int32(width) + rows.corner
+        self._starts = wp.array(rows.starts, dtype=wp.int32, device=self.device)
+        self._slots = wp.array(slots, dtype=wp.int32, device=self.device)
+        packed = wp.types.vector(length=width, dtype=wp.int32)
+        self._corners = corners.contiguous()
+        self.corners = wp.from_torch(self._corners, dtype=packed)
+        self.energy = torch.zeros(self.count, dtype=dtype, device=self.device)
+        self.corner_force = torch.zeros((self.count * width, 3), dtype=dtype, device=self.device)
+        self._energy, self._corner_force = wp.from_torch(self.energy), vectors(self.corner_force)
+
+    def evaluate(
+        self,
+        kernel: wp.Kernel,
+        inputs: Sequence[wp.array],
+        x: Float[Tensor, "vertices 3"],
+        force: Float[Tensor, "vertices 3"],
+    ) -> Float[Tensor, ""]:
+        """Run an element kernel and gather: adds to ``force`` and returns the energy.
+
+        Args:
+            kernel: Called with (x, corners, *inputs, energy, corner_force).
+            inputs: The kernel's own arrays.
+            x: Positions [m].
+            force: Force [N], added to in place.
+
+        Returns:
+            Energy [J], float64 scalar.
+        """
+        if not self.count:
+            return torch.zeros((), dtype=torch.float64, device=x.device)
+        arguments = [vectors(x), self.corners, *inputs, self._energy, self._corner_force]
+        wp.launch(kernel, dim=self.count, inputs=arguments, device=self.device)
+        gather = [self._starts, self._slots, self._corner_force, vectors(force)]
+        wp.launch(_GATHER[self._dtype], dim=self._vertex_count, inputs=gather, device=self.device)
+        return self.energy.sum(dtype=torch.float64)
+
+
+def element_overloads(kernel: wp.Kernel, *, width: int, parameters: int) -> dict[torch.dtype, wp.Kernel]:
+    """Instantiate a generic element kernel for float32 and float64.
+
+    Args:
+        kernel: Kernel of (x, corners, parameters..., energy, corner_force) with generic arrays.
+        width: Corners of an element.
+        parameters: Number of scalar arrays between corners and energy.
+
+    Returns:
+        The concrete kernel for each torch scalar type.
+    """
+    packed = wp.types.vector(length=width, dtype=wp.int32)
+    return {
+        dtype: wp.overload(
+            kernel,
+            [
+                wp.array(dtype=VECTOR[dtype]),
+                wp.array(dtype=packed),
+                *[wp.array(dtype=SCALAR[dtype])] * parameters,
+                wp.array(dtype=SCALAR[dtype]),
+                wp.array(dtype=VECTOR[dtype]),
+            ],
+        )
+        for dtype in VECTOR
+    }

@@ -1,0 +1,148 @@
+"""Bending: dihedral angles at the edges.
+
+    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D l0^2 / (A1 + A2)   (potential="continuum", DESIGN 4.1)
+                                                w_h = k_b a_h / A          (potential="paper", P7)
+
+| symbol | here | meaning |
+|---|---|---|
+| D | ``rigidity`` | bending stiffness [N m] |
+| theta | atan2(n1 x n2 . e, n1 . n2) | signed angle between the triangles' normals [rad] |
+| l0^2 / (A1 + A2) | ``level.hinge_shape`` | clamped on slivers |
+| k_b | 3.46 D | the paper's constant [N m] for the same D on an equilateral lattice (docs/fabrics.md) |
+
+theta lies in (-pi, pi]; with theta0 = 0 the energy stays continuous through a full fold, its force changes sign there.
+Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from ..level import Level
+from .base import Elements, element_overloads
+from .stretch import garment_area
+
+PAPER_HINGE = 3.46
+"""The paper's k_b over D: both in N m."""
+
+
+@wp.kernel
+def _bending(
+    x: wp.array(dtype=Any),
+    corners: wp.array(dtype=wp.vec4i),
+    weight: wp.array(dtype=Any),
+    rest_angle: wp.array(dtype=Any),
+    energy: wp.array(dtype=Any),
+    corner_force: wp.array(dtype=Any),
+):
+    h = wp.tid()
+    one = weight.dtype(1.0)
+    xi = x[corners[h][0]]
+    axis = x[corners[h][1]] - xi
+    ik = x[corners[h][2]] - xi
+    il = x[corners[h][3]] - xi
+    n1 = wp.cross(axis, ik)
+    n2 = wp.cross(il, axis)
+    square = wp.dot(axis, axis)
+    # The floors are relative to the hinge's own size: they act on collapsed triangles only.
+    tiny = weight.dtype(1.0e-12) * (square + wp.dot(ik, ik) + wp.dot(il, il))
+    square = wp.max(square, tiny + weight.dtype(1.0e-30))
+    length = wp.sqrt(square)
+    floor = tiny * square + weight.dtype(1.0e-37)
+    s1 = wp.max(wp.dot(n1, n1), floor)
+    s2 = wp.max(wp.dot(n2, n2), floor)
+    theta = wp.atan2(wp.dot(wp.cross(n1, n2), axis) / length, wp.dot(n1, n2))
+    bent = theta - rest_angle[h]
+    energy[h] = weight.dtype(0.5) * weight[h] * bent * bent
+    moment = weight[h] * bent * length
+    at_k = n1 * (moment / s1)
+    at_l = n2 * (moment / s2)
+    t1 = wp.dot(ik, axis) / square
+    t2 = wp.dot(il, axis) / square
+    corner_force[4 * h] = -(at_k * (one - t1) + at_l * (one - t2))
+    corner_force[4 * h + 1] = -(at_k * t1 + at_l * t2)
+    corner_force[4 * h + 2] = at_k
+    corner_force[4 * h + 3] = at_l
+
+
+_KERNELS = element_overloads(_bending, width=4, parameters=2)
+
+
+class Bending:
+    """Dihedral springs of one level.
+
+    Attributes:
+        weight: Angular stiffness [N m], shape (H,).
+    """
+
+    name = "bending"
+
+    def __init__(self, level: Level, rigidity: Float[Tensor, " garments"], *, potential: str = "continuum") -> None:
+        """Weigh the hinges of a level.
+
+        Args:
+            level: The level.
+            rigidity: Bending stiffness D of each garment [N m].
+            potential: "continuum" or "paper".
+        """
+        owner = level.hinge_garment.long()
+        scaled = rigidity.to(level.rest)[owner] * level.bend_scale
+        if potential == "paper":
+            self.weight = PAPER_HINGE * scaled * level.hinge_area / garment_area(level)[owner]
+        else:
+            self.weight = scaled * level.hinge_shape
+        self._level = level
+        self._elements = Elements(level.hinges, level.vertex_count, dtype=level.dtype)
+        self._inputs = [wp.from_torch(self.weight), wp.from_torch(level.rest_angle)]
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the force [N] in place and return the energy [J]."""
+        return self._elements.evaluate(_KERNELS[x.dtype], self._inputs, x, force)
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """A third of the trace of w (dtheta/dx)(dtheta/dx)^T at each corner [N/m]."""
+        jacobian = hinge_jacobian(x, self._level.hinges)
+        value = self.weight.unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
+        return torch.zeros_like(self._level.spacing).index_add_(
+            0, self._level.hinges.long().reshape(-1), value.reshape(-1)
+        )
+
+    def rest_matrix(self) -> sp.csr_matrix:
+        """The quadratic form of the flat rest shape [N/m]: w_h |grad theta_h . n|^2 (Bergou et al. 2006)."""
+        hinges = self._level.hinges.cpu().numpy()
+        jacobian = hinge_jacobian(self._level.rest.double(), self._level.hinges).cpu().numpy()
+        size = np.linalg.norm(jacobian, axis=2)
+        sign = np.sign(np.einsum("hcd,hd->hc", jacobian, jacobian[:, 2] + jacobian[:, 3]))
+        row = np.where(sign == 0, 0.0, sign) * size
+        # Constants must stay in the null space even where the rest shape is bent.
+        row[:, :2] -= row.sum(axis=1, keepdims=True) / 2.0
+        blocks = self.weight.double().cpu().numpy()[:, None, None] * row[:, :, None] * row[:, None, :]
+        rows, columns = np.repeat(hinges, 4, axis=1).ravel(), np.tile(hinges, (1, 4)).ravel()
+        count = self._level.vertex_count
+        return sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
+
+
+def hinge_jacobian(
+    x: Float[Tensor, "vertices 3"], hinges: Float[Tensor, "hinges 4"]
+) -> Float[Tensor, "hinges 4 3"]:
+    """dtheta/dx at the four corners of each hinge [1/m]; zero rows where a triangle has no area."""
+    xi, xj, xk, xl = (x[hinges[:, corner].long()] for corner in range(4))
+    axis, ik, il = xj - xi, xk - xi, xl - xi
+    n1, n2 = torch.linalg.cross(axis, ik), torch.linalg.cross(il, axis)
+    square = (axis**2).sum(dim=1, keepdim=True)
+    tiny = 1e-12 * (square + (ik**2).sum(dim=1, keepdim=True) + (il**2).sum(dim=1, keepdim=True))
+    square = torch.maximum(square, tiny + 1e-30)
+    length, floor = square.sqrt(), tiny * square + 1e-37
+    at_k = -n1 * length / torch.maximum((n1**2).sum(dim=1, keepdim=True), floor)
+    at_l = -n2 * length / torch.maximum((n2**2).sum(dim=1, keepdim=True), floor)
+    t1 = (ik * axis).sum(dim=1, keepdim=True) / square
+    t2 = (il * axis).sum(dim=1, keepdim=True) / square
+    at_i, at_j = -(at_k * (1 - t1) + at_l * (1 - t2)), -(at_k * t1 + at_l * t2)
+    return torch.stack([at_i, at_j, at_k, at_l], dim=1)

@@ -1,0 +1,65 @@
+"""Gravity.
+
+    E = - sum_v m_v g . x_v,   m_v = density a_v         (potential="continuum", DESIGN 4.1)
+                               m_v = density a_v^2 / A   (potential="paper", P8)
+
+The solver recentres each frame on the mean of its coarse positions, so the energy is relative to the input's mean height (PAPER fact 3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..level import Level
+from .stretch import garment_area
+
+
+class Gravity:
+    """Weight of one level's vertices.
+
+    Attributes:
+        weight: Force on each vertex [N], shape (V, 3).
+        density: Areal density of each garment [kg/m^2].
+    """
+
+    name = "gravity"
+
+    def __init__(
+        self,
+        level: Level,
+        density: Float[Tensor, " garments"],
+        gravity: np.ndarray,
+        *,
+        potential: str = "continuum",
+    ) -> None:
+        """Weigh the vertices of a level.
+
+        Args:
+            level: The level.
+            density: Areal density of each garment [kg/m^2].
+            gravity: Acceleration [m/s^2], shape (3,).
+            potential: "continuum" or "paper".
+        """
+        owner = level.vertex_garment.long()
+        self.density = density.to(level.rest)
+        mass = self.density[owner] * level.vertex_area
+        if potential == "paper":
+            mass = mass * level.vertex_area / garment_area(level)[owner]
+        self.weight = mass.unsqueeze(1) * torch.as_tensor(gravity, dtype=level.dtype, device=level.device)
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the weight [N] in place and return the energy [J]."""
+        force += self.weight
+        return -(self.weight * x).sum(dtype=torch.float64)
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """Zero: the energy is linear."""
+        return torch.zeros_like(x[:, 0])
+
+    def rest_matrix(self) -> sp.csr_matrix | None:
+        """None: the energy is linear."""
+        return None

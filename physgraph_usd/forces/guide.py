@@ -1,0 +1,114 @@
+"""Guide: ties the average of the fine cloth around each coarse vertex to the coarse animation.
+
+    E = 1/2 sum_c k_g A_c s_c |(R x)_c - x_c|^2 + 1/2 sum_v k_g a_v p_v |x_v - (P x_c)_v|^2
+
+| symbol | here | meaning |
+|---|---|---|
+| k_g | ``stiffness`` | guide stiffness [N/m^3] |
+| A_c | coarse vertex area, the sum of its share of fine areas [m^2] |
+| R | ``average`` | row-normalised transpose of the prolongation P, weighted by fine area |
+| s_c | painted ``guideScale`` |
+| p_v | 10 pin / (1 - pin) | soft pins: 0 where the pin weight is 0, grows without bound towards 1 |
+
+Wrinkles whose mean is zero over a coarse vertex's neighbourhood cost nothing, so large motion stays the artist's.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..level import PIN_MARGIN, Level
+from ..mesh.stencil import Stencil
+
+SOFT_PIN = 10.0
+"""Stiffness of a pin of weight 1/2, in guide stiffnesses."""
+
+
+class GuideMap:
+    """The averaging operator of one level and its transpose; built once per shot."""
+
+    def __init__(self, level: Level) -> None:
+        """Build R, its transpose and the areas from the level's prolongation."""
+        area = sp.diags(level.vertex_area.double().cpu().numpy())
+        shares = sp.csr_matrix(level.from_coarse.T @ area)
+        self.coarse_area = np.asarray(shares.sum(axis=1)).ravel()
+        rows = sp.diags(1.0 / np.maximum(self.coarse_area, np.finfo(float).tiny))
+        matrix = sp.csr_matrix(rows @ shares)
+        self.spread_matrix = sp.csr_matrix(matrix.T)
+        self.average = Stencil(matrix, dtype=level.dtype, device=level.device)
+        self.spread = self.average.transposed()
+        self.squares = sp.csr_matrix(matrix.multiply(matrix).T)
+        self.shares = sp.csr_matrix(shares.T)
+
+
+class Guide:
+    """The guide of one level: weights that last, a target for each frame."""
+
+    name = "guide"
+
+    def __init__(
+        self,
+        level: Level,
+        guide_map: GuideMap,
+        stiffness: Float[Tensor, " coarse"],
+        *,
+        relative_weight: float = 1.0,
+    ) -> None:
+        """Weigh the ties of a level; `retarget` gives them coarse positions.
+
+        Args:
+            level: The level.
+            guide_map: Its averaging operator.
+            stiffness: k_g s_c at each coarse vertex [N/m^3].
+            relative_weight: Multiplier of the whole term (the paper's potential is weighted by area twice).
+        """
+        self._map, self._level = guide_map, level
+        per_area = relative_weight * stiffness.double().cpu().numpy()
+        pin = level.pin.double().cpu().numpy()
+        soft = np.where((pin > 0) & (pin < 1.0 - PIN_MARGIN), SOFT_PIN * pin / np.maximum(1.0 - pin, PIN_MARGIN), 0.0)
+        self._coarse_weight = per_area * guide_map.coarse_area
+        self._pin_weight = soft * np.asarray(guide_map.shares @ per_area).ravel()
+        self._weight = torch.as_tensor(self._coarse_weight, dtype=level.dtype, device=level.device).unsqueeze(1)
+        self._pin = torch.as_tensor(self._pin_weight, dtype=level.dtype, device=level.device).unsqueeze(1)
+        self._has_soft_pins = bool(soft.any())
+        self._target = torch.zeros((len(per_area), 3), dtype=level.dtype, device=level.device)
+        self._base = torch.zeros_like(level.rest)
+
+    def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
+        """The same ties, to the coarse positions of one frame [m]."""
+        guide = copy.copy(self)
+        guide._target = coarse
+        if self._has_soft_pins:
+            guide._base = self._level.base.apply(coarse)
+        return guide
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the force [N] in place and return the energy [J]."""
+        lag = self._map.average.apply(x) - self._target
+        pull = self._weight * lag
+        force -= self._map.spread.apply(pull)
+        energy = 0.5 * (pull * lag).sum(dtype=torch.float64)
+        if self._has_soft_pins:
+            stray = x - self._base
+            force -= self._pin * stray
+            energy = energy + 0.5 * (self._pin * stray * stray).sum(dtype=torch.float64)
+        return energy
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """sum_c k_g A_c R_cv^2, plus the soft pins [N/m]."""
+        value = np.asarray(self._map.squares @ self._coarse_weight).ravel() + self._pin_weight
+        return torch.as_tensor(value, dtype=x.dtype, device=x.device)
+
+    def rest_matrix(self) -> sp.csr_matrix:
+        """The lumped guide [N/m]: the row sums of R^T W R on the diagonal.
+
+        The exact product couples every pair of fine vertices around a coarse one, which would fill the factor; lumping
+        agrees with it on long waves, and stretch and bending outweigh it on short ones.
+        """
+        return sp.csr_matrix(sp.diags(self._map.spread_matrix @ self._coarse_weight + self._pin_weight))

@@ -1,0 +1,111 @@
+"""Stretch: springs along the edges.
+
+    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y a_e / l0_e^2      (potential="continuum", DESIGN 4.1)
+                                        k_e = k_s a_e / A           (potential="paper", P6)
+
+| symbol | here | meaning |
+|---|---|---|
+| Y | ``youngs`` | 2D Young's modulus [N/m] |
+| a_e | ``level.edge_area`` | a third of the adjacent triangles' areas [m^2] |
+| l0 | ``level.rest_length`` | rest length [m] |
+| k_s | 2.598 Y | the paper's spring constant [N/m] for the same Y on an equilateral lattice (docs/fabrics.md) |
+| A | total rest area of the garment [m^2] |
+
+Springs cannot express shear on its own: an isotropic sheet of them has nu = 1/3 and G = 0.375 Y.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from ..level import Level
+from .base import Elements, element_overloads
+
+PAPER_SPRING = 2.598
+"""The paper's k_s over Y: both in N/m."""
+
+
+@wp.kernel
+def _stretch(
+    x: wp.array(dtype=Any),
+    corners: wp.array(dtype=wp.vec2i),
+    stiffness: wp.array(dtype=Any),
+    rest_length: wp.array(dtype=Any),
+    energy: wp.array(dtype=Any),
+    corner_force: wp.array(dtype=Any),
+):
+    e = wp.tid()
+    span = x[corners[e][1]] - x[corners[e][0]]
+    l0 = rest_length[e]
+    length = wp.length(span)
+    extension = length - l0
+    # A collapsed spring has no direction: below a millionth of its rest length its pull fades to zero.
+    pull = span * (stiffness[e] * extension / wp.max(length, l0 * stiffness.dtype(1.0e-6)))
+    energy[e] = stiffness.dtype(0.5) * stiffness[e] * extension * extension
+    corner_force[2 * e] = pull
+    corner_force[2 * e + 1] = -pull
+
+
+_KERNELS = element_overloads(_stretch, width=2, parameters=2)
+
+
+class Stretch:
+    """Edge springs of one level.
+
+    Attributes:
+        stiffness: Spring constants [N/m], shape (E,).
+    """
+
+    name = "stretch"
+
+    def __init__(self, level: Level, youngs: Float[Tensor, " garments"], *, potential: str = "continuum") -> None:
+        """Weigh the springs of a level.
+
+        Args:
+            level: The level.
+            youngs: 2D Young's modulus of each garment [N/m].
+            potential: "continuum" or "paper".
+        """
+        modulus = youngs.to(level.rest)[level.edge_garment.long()] * level.stretch_scale
+        if potential == "paper":
+            area = garment_area(level)[level.edge_garment.long()]
+            self.stiffness = PAPER_SPRING * modulus * level.edge_area / area
+        else:
+            self.stiffness = 3.0 * modulus * level.edge_area / level.rest_length**2
+        self._level = level
+        self._elements = Elements(level.edges, level.vertex_count, dtype=level.dtype)
+        self._inputs = [wp.from_torch(self.stiffness), wp.from_torch(level.rest_length)]
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the force [N] in place and return the energy [J]."""
+        return self._elements.evaluate(_KERNELS[x.dtype], self._inputs, x, force)
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """A third of the trace of k (u u^T + max(0, 1 - l0/l) (I - u u^T)), summed at both ends [N/m]."""
+        ends = self._level.edges.long()
+        length = (x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1)
+        lateral = (1.0 - self._level.rest_length / length.clamp_min(1e-12)).clamp_min(0.0)
+        value = self.stiffness * (1.0 + 2.0 * lateral) / 3.0
+        return torch.zeros_like(self._level.spacing).index_add_(0, ends.T.reshape(-1), value.repeat(2))
+
+    def rest_matrix(self) -> sp.csr_matrix:
+        """Graph Laplacian of the springs [N/m]."""
+        ends = self._level.edges.cpu().numpy()
+        k = self.stiffness.double().cpu().numpy()
+        rows = np.concatenate([ends[:, 0], ends[:, 1], ends[:, 0], ends[:, 1]])
+        columns = np.concatenate([ends[:, 0], ends[:, 1], ends[:, 1], ends[:, 0]])
+        count = self._level.vertex_count
+        return sp.csr_matrix((np.concatenate([k, k, -k, -k]), (rows, columns)), shape=(count, count))
+
+
+def garment_area(level: Level) -> Float[Tensor, " garments"]:
+    """Rest area of each garment [m^2]."""
+    total = torch.zeros(len(level.spans), dtype=level.dtype, device=level.device)
+    return total.index_add_(0, level.vertex_garment.long(), level.vertex_area)

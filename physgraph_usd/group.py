@@ -1,0 +1,265 @@
+"""Garments that are solved together: their levels, forces and metrics, and the solve of one frame."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .detail import Carried, MovingFrames, Reset
+from .errors import SolveError
+from .forces.base import Force, ForceModule
+from .forces.bending import Bending
+from .forces.gravity import Gravity
+from .forces.guide import Guide, GuideMap
+from .forces.stretch import PAPER_SPRING, Stretch, garment_area
+from .forces.tether import Tether
+from .integrate import Method
+from .integrate.base import System
+from .integrate.metric import Metric
+from .integrate.solve import Budget, LevelReport, solve_level
+from .level import Level, build_levels
+from .mesh.subdivide import Refinement
+from .scene import Garment, GarmentFrame
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """How each frame is solved.
+
+    Attributes:
+        method: The integrator and whether it is nested.
+        steps: Most steps at the finest level; each level below may take twice as many, up to eight times.
+        tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
+        budget_ms: Milliseconds a frame, or None.
+        temporal: "tether", "warm" or "off".
+        tether: Tether stiffness [1/s^2].
+        potential: "continuum" or "paper".
+        reset: When a frame starts cold.
+    """
+
+    method: Method
+    steps: int = 20
+    tolerance: float = 2e-3
+    budget_ms: float | None = None
+    temporal: str = "tether"
+    tether: float = 400.0
+    potential: str = "continuum"
+    reset: Reset = Reset()
+
+
+@dataclass(frozen=True, eq=False)
+class _LevelForces:
+    """The terms of one level that last as long as the materials, and their metric."""
+
+    elastic: tuple[Force, ...]
+    guide: Guide
+    metric: Metric
+
+
+class Group:
+    """Garments solved together.
+
+    Attributes:
+        garments: The garments.
+        levels: Their levels, cage first.
+    """
+
+    def __init__(
+        self,
+        garments: Sequence[Garment],
+        refinements: Sequence[Sequence[Refinement]],
+        gravity: np.ndarray,
+        settings: SolveSettings,
+        *,
+        dtype: torch.dtype,
+        device: str,
+    ) -> None:
+        """Build the levels.
+
+        Args:
+            garments: Garments solved together.
+            refinements: Their refinements.
+            gravity: [m/s^2], shape (3,).
+            settings: How to solve.
+            dtype: Scalar type of the solve.
+            device: "cpu" or a CUDA device.
+        """
+        self.garments = tuple(garments)
+        self._gravity, self._settings = gravity, settings
+        self.levels = build_levels(garments, refinements, dtype=dtype, device=device)
+        self._guide_maps = [GuideMap(level) for level in self.levels]
+        cage, finest = self.levels[0], self.levels[-1]
+        triangles = cage.triangles.cpu().numpy()
+        self._frames = MovingFrames(finest, triangles, cage.rest.double().cpu().numpy())
+        self._material: tuple[object, ...] = ()
+        self._forces: list[_LevelForces] = []
+
+    def solve(
+        self, frames: Sequence[GarmentFrame], kept: Carried | None, *, at: float | None
+    ) -> tuple[list[np.ndarray], Carried, dict[str, object]]:
+        """Solve one frame.
+
+        Args:
+            frames: The garments at this time code.
+            kept: The previous frame's result, or None for a cold start.
+            at: The time code, for errors.
+
+        Returns:
+            World positions [m] of each garment, what the next frame needs, and telemetry.
+
+        Raises:
+            SolveError: A term of the potential is not finite.
+        """
+        clock = time.perf_counter()
+        forces = self._forces_for(frames)
+        world = np.concatenate([frame.points for frame in frames])
+        origin = world.mean(axis=0) if len(world) else np.zeros(3)
+        coarse = self._tensor(world - origin)
+        predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
+        prepared = time.perf_counter()
+        try:
+            x, reports, module = self._descend(forces, coarse, predicted, clock)
+        except SolveError as error:
+            raise SolveError(self._blame(forces[-1], coarse, error, at)) from error
+        solved = time.perf_counter()
+        result = self._finish(x, coarse, frames)
+        carried = self._frames.store(coarse, x)
+        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
+        telemetry = self._telemetry(module, x, coarse, reports)
+        telemetry["start"] = start
+        telemetry["milliseconds"] = {
+            "prepare": round(1e3 * (prepared - clock), 3),
+            "solve": round(1e3 * (solved - prepared), 3),
+            "measure": round(1e3 * (time.perf_counter() - solved), 3),
+        }
+        points = result.double().cpu().numpy() + origin
+        return [points[span] for span in self.levels[-1].spans], carried, telemetry
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)
+
+    def _forces_for(self, frames: Sequence[GarmentFrame]) -> list[_LevelForces]:
+        """The lasting terms, rebuilt with their metrics when a material changes."""
+        material = tuple((frame.fabric, frame.guide) for frame in frames)
+        if material != self._material:
+            self._forces = [
+                self._level_forces(level, guide_map, frames)
+                for level, guide_map in zip(self.levels, self._guide_maps, strict=True)
+            ]
+            self._material = material
+        return self._forces
+
+    def _level_forces(self, level: Level, guide_map: GuideMap, frames: Sequence[GarmentFrame]) -> _LevelForces:
+        potential = self._settings.potential
+
+        def each(name: str) -> Tensor:
+            return torch.tensor([getattr(f.fabric, name) for f in frames], dtype=level.dtype, device=level.device)
+
+        guide_stiffness = np.concatenate(
+            [frame.guide * garment.guide_scale for frame, garment in zip(frames, self.garments, strict=True)]
+        )
+        relative = 1.0
+        if potential == "paper":
+            relative = PAPER_SPRING / 3.0 * float(level.rest_length.square().mean() / garment_area(level).mean())
+        elastic: tuple[Force, ...] = (
+            Stretch(level, each("stretch"), potential=potential),
+            Bending(level, each("bend"), potential=potential),
+            Gravity(level, each("density"), self._gravity, potential=potential),
+        )
+        guide = Guide(level, guide_map, torch.as_tensor(guide_stiffness), relative_weight=relative)
+        matrix = ForceModule((*elastic, guide)).rest_matrix()
+        return _LevelForces(elastic, guide, Metric(matrix, free=level.free, dtype=level.dtype))
+
+    def _predict(self, kept: Carried | None, coarse: Tensor, world: Tensor) -> tuple[Tensor | None, str]:
+        """Where the last frame's detail would be now, unless the cage jumped."""
+        if kept is None or self._settings.temporal == "off":
+            return None, "cold"
+        shifted = Carried(self._tensor((kept.coarse - world.mean(dim=0)).numpy()), kept.detail, kept.frames)
+        predicted, motion, turn = self._frames.predict(shifted, coarse)
+        reset = self._settings.reset
+        if motion > reset.move or turn > reset.turn:
+            return None, f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees"
+        fixed = self.levels[-1].base.apply(coarse)
+        return torch.where(self.levels[-1].free, predicted, fixed), "warm"
+
+    def _descend(
+        self, forces: list[_LevelForces], coarse: Tensor, predicted: Tensor | None, clock: float
+    ) -> tuple[Tensor, list[LevelReport], ForceModule]:
+        """Walk the levels; a warm start goes straight to the finest."""
+        integrator = self._settings.method.build()
+        cold = predicted is None
+        first = 0 if cold and self._settings.method.nested else len(self.levels) - 1
+        x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
+        reports: list[LevelReport] = []
+        module = ForceModule(())
+        for index in range(first, len(self.levels)):
+            level, lasting = self.levels[index], forces[index]
+            if index > first and level.from_below is not None:
+                x = level.from_below.apply(x)
+            module = ForceModule((*lasting.elastic, lasting.guide.retarget(coarse)))
+            terms = module
+            if predicted is not None and self._settings.temporal == "tether":
+                density = torch.stack([force.density for force in lasting.elastic if isinstance(force, Gravity)])[0]
+                terms = ForceModule((*module.forces, Tether(level, density, self._settings.tether, predicted)))
+            system = System(terms, lasting.metric, free=level.free, spacing=level.spacing)
+            budget = self._budget(index, len(self.levels), clock)
+            x, report = solve_level(system, integrator, x, level=level.index, budget=budget)
+            reports.append(report)
+        return x, reports, module
+
+    def _budget(self, index: int, count: int, clock: float) -> Budget:
+        """Coarse levels may take more steps: they are cheap and set the folds."""
+        settings = self._settings
+        below = count - 1 - index
+        deadline = None
+        if settings.budget_ms is not None:
+            deadline = clock + 1e-3 * settings.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
+        return Budget(settings.steps * 2 ** min(below, 3), settings.tolerance, deadline)
+
+    def _finish(self, x: Tensor, coarse: Tensor, frames: Sequence[GarmentFrame]) -> Tensor:
+        """Scale the detail where an artist asked for more or less of it."""
+        finest = self.levels[-1]
+        gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
+        if np.all(gain == 1.0):
+            return x
+        fine_gain = self._tensor(finest.from_coarse @ gain).unsqueeze(1)
+        smooth = finest.smooth_base.apply(coarse)
+        return torch.where(finest.free, smooth + fine_gain * (x - smooth), x)
+
+    def _telemetry(
+        self, module: ForceModule, x: Tensor, coarse: Tensor, reports: list[LevelReport]
+    ) -> dict[str, object]:
+        finest = self.levels[-1]
+        return {
+            "levels": [asdict(report) for report in reports],
+            "energy_joules": {
+                "input": module.energies(finest.base.apply(coarse)),
+                "output": module.energies(x),
+            },
+            "strain": edge_strain(finest, x),
+        }
+
+    def _blame(self, lasting: _LevelForces, coarse: Tensor, error: SolveError, at: float | None) -> str:
+        """Name prim, time and the term that is not finite."""
+        x = self.levels[-1].base.apply(coarse)
+        energies = ForceModule((*lasting.elastic, lasting.guide.retarget(coarse))).energies(x)
+        broken = [name for name, value in energies.items() if not np.isfinite(value)] or ["none at the input"]
+        where = ", ".join(f"<{garment.path}>" for garment in self.garments)
+        when = "" if at is None else f" at time code {at:g}"
+        return f"{where}{when}: {error}; terms that are not finite: {', '.join(broken)}"
+
+
+def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
+    """Size of the edges' relative extension: median, 99th percentile and largest."""
+    if not len(level.edges):
+        return {"p50": 0.0, "p99": 0.0, "max": 0.0}
+    ends = level.edges.long()
+    strain = ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) / level.rest_length - 1.0).abs().cpu().numpy()
+    p50, p99 = np.percentile(strain, [50, 99])
+    return {"p50": float(p50), "p99": float(p99), "max": float(strain.max())}

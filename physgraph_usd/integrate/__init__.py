@@ -1,0 +1,51 @@
+"""Integrators: forces in, displacements out.
+
+A new integrator is one file and one line in `METHODS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ..errors import UsageError
+from .base import Integrator
+from .first_order import Adam, GradientDescent
+from .guard import Guard
+from .newton import Newton
+from .quasi_newton import QuasiNewton
+
+
+@dataclass(frozen=True)
+class Method:
+    """An integrator and how it is used.
+
+    Attributes:
+        build: Makes the integrator.
+        nested: Solve coarse levels first; otherwise the finest level only.
+    """
+
+    build: Callable[[], Integrator]
+    nested: bool
+
+
+METHODS: dict[str, Method] = {
+    "quasi-newton": Method(QuasiNewton, nested=True),
+    "quasi-newton-flat": Method(QuasiNewton, nested=False),
+    "lbfgs": Method(lambda: QuasiNewton(use_metric=False), nested=False),
+    "adam": Method(lambda: Guard(Adam()), nested=False),
+    "gd": Method(lambda: Guard(GradientDescent()), nested=False),
+    "newton": Method(Newton, nested=True),
+}
+"""Every method by its name on the command line."""
+
+
+def method_named(name: str) -> Method:
+    """The method of that name.
+
+    Raises:
+        UsageError: No method has that name.
+    """
+    if name not in METHODS:
+        raise UsageError(f"unknown integrator '{name}'; known integrators: {', '.join(METHODS)}")
+    return METHODS[name]

@@ -1,0 +1,111 @@
+"""What an integrator is, and what it is shown of the physics: forces, a metric, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .metric import Metric
+
+
+class ForceField(Protocol):
+    """The only face of the physics that an integrator meets."""
+
+    def energy_and_force(
+        self, x: Float[Tensor, "vertices 3"]
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
+        """Energy [J] and force [N] at positions x [m]."""
+        ...
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """A third of the trace of each vertex's Hessian block [N/m]."""
+        ...
+
+
+class System:
+    """One level in one frame, as an integrator sees it.
+
+    Attributes:
+        free: False where a vertex may not move, shape (V, 1).
+        spacing: Mean rest edge length at each vertex [m], shape (V,).
+        evaluations: Number of force evaluations so far.
+        metric_solves: Number of metric solves so far.
+    """
+
+    def __init__(
+        self,
+        field: ForceField,
+        metric: Metric,
+        *,
+        free: Bool[Tensor, "vertices 1"],
+        spacing: Float[Tensor, " vertices"],
+    ) -> None:
+        """Join a force field with its metric and its mask."""
+        self._field, self._metric = field, metric
+        self.free, self.spacing = free, spacing
+        self._all_free = bool(free.all())
+        self.evaluations = 0
+        self.metric_solves = 0
+
+    def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
+        """Energy [J] and force [N]; the force on vertices that may not move is zero."""
+        self.evaluations += 1
+        energy, force = self._field.energy_and_force(x)
+        return float(energy), force if self._all_free else force * self.free
+
+    def apply_metric_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with."""
+        self.metric_solves += 1
+        return self._metric.solve(force)
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """A third of the trace of each vertex's Hessian block [N/m], positive."""
+        return self._field.diagonal(x).clamp_min(torch.finfo(x.dtype).tiny)
+
+    def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
+        """RMS of H0^-1 F over the free vertices, in local edge lengths."""
+        relative = preconditioned.square().sum(dim=1) / self.spacing.square()
+        return float((relative.sum(dtype=torch.float64) / self.free.sum().clamp_min(1)).sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class Carry:
+    """What an integrator hands from one step to the next.
+
+    Attributes:
+        x: Positions [m].
+        energy: Energy at x [J].
+        force: Force at x [N].
+        preconditioned: H0^-1 F at x [m] where the integrator knows it.
+        mover: Who made the last step: the integrator's name, "halved", "quartered", "fallback" or "stayed".
+        memory: The integrator's own state.
+    """
+
+    x: Float[Tensor, "vertices 3"]
+    energy: float
+    force: Float[Tensor, "vertices 3"]
+    preconditioned: Float[Tensor, "vertices 3"] | None = None
+    mover: str = ""
+    memory: Any = None
+
+    def moved_by(self, mover: str) -> Carry:
+        """The same carry under another mover's name."""
+        return replace(self, mover=mover)
+
+
+class Integrator(Protocol):
+    """Turns forces into displacements."""
+
+    name: str
+
+    def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
+        """Evaluate the start positions [m] and prepare the memory."""
+        ...
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        """Make one step."""
+        ...

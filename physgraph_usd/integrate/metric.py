@@ -1,0 +1,47 @@
+"""The metric: one scalar symmetric positive definite matrix per level, factorised once (DESIGN 4.3)."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from cholespy import CholeskySolverD, CholeskySolverF, MatrixType
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+REGULARISATION = 1e-7
+"""Added to the diagonal, relative to its mean: keeps loose parts without a guide definite."""
+
+
+class Metric:
+    """H0, factorised: the same matrix for x, y and z."""
+
+    def __init__(self, matrix: sp.csr_matrix, *, free: Bool[Tensor, "vertices 1"], dtype: torch.dtype) -> None:
+        """Factorise a scalar Hessian at rest.
+
+        Args:
+            matrix: Symmetric positive semi-definite [N/m], shape (V, V).
+            free: False where a vertex may not move: its row becomes the identity's.
+            dtype: Scalar type of the right-hand sides.
+        """
+        mask = free.cpu().numpy().ravel()
+        diagonal = matrix.diagonal()
+        mean = float(diagonal[mask].mean()) if mask.any() else 1.0
+        # A unit mean diagonal keeps float32 pivots in range whatever the fabric and the level.
+        self._scale = 1.0 / mean if mean > 0 else 1.0
+        keep = sp.diags(mask.astype(np.float64))
+        shift = sp.diags(np.where(mask, REGULARISATION, 1.0))
+        self.matrix = sp.csr_matrix(self._scale * (keep @ matrix @ keep) + shift)
+        coo = self.matrix.tocoo()
+        solver = CholeskySolverD if dtype == torch.float64 else CholeskySolverF
+        rows = torch.as_tensor(coo.row.astype(np.int32), device=free.device)
+        columns = torch.as_tensor(coo.col.astype(np.int32), device=free.device)
+        values = torch.as_tensor(coo.data.astype(np.float64), device=free.device)
+        self._solver = solver(matrix.shape[0], rows, columns, values, MatrixType.COO)
+        self._mask = free
+
+    def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m]; zero where a vertex may not move."""
+        out = torch.empty_like(force)
+        self._solver.solve((force * self._mask * self._scale).contiguous(), out)
+        return out * self._mask

@@ -1,0 +1,163 @@
+"""Quasi-Newton: L-BFGS whose first guess of the inverse Hessian is the metric's (DESIGN 4.3).
+
+| symbol | here | meaning |
+|---|---|---|
+| s_i, y_i | ``moves``, ``yields`` | differences of positions and of negative forces |
+| z_i | ``images`` | H0^-1 y_i, a difference of preconditioned forces: no extra solve |
+| rho_i | 1 / s_i.y_i |
+| gamma | s.y / y.z of the newest pair: scales H0^-1 to the curvature last seen |
+
+The two-loop recursion (Nocedal 1980) applied to F needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, so a step
+costs one metric solve and, when the first trial is accepted, one force evaluation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .base import Carry, System
+
+ARMIJO = 1e-4
+MAX_BACKTRACKS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """One secant pair and its image under H0^-1."""
+
+    move: Tensor
+    yields: Tensor
+    image: Tensor
+    curvature: float
+
+
+class QuasiNewton:
+    """L-BFGS on a metric or, for comparison, on the diagonal.
+
+    Attributes:
+        name: "quasi-newton" or "lbfgs".
+    """
+
+    def __init__(self, *, history: int = 8, use_metric: bool = True) -> None:
+        """Choose the memory and the first guess.
+
+        Args:
+            history: Number of secant pairs kept.
+            use_metric: False scales by the Hessian's diagonal at the start instead of H0.
+        """
+        self.name = "quasi-newton" if use_metric else "lbfgs"
+        self._history, self._use_metric = history, use_metric
+
+    def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
+        """Evaluate x with an empty memory."""
+        energy, force = system.energy_and_force(x)
+        scale = None if self._use_metric else 1.0 / system.diagonal(x).unsqueeze(1)
+        return self._carry(x, energy, force, _Memory((), scale, self._image(system, scale, force)))
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        """One secant step with a backtracking line search; the energy never rises."""
+        memory: _Memory = carry.memory
+        direction = _two_loop(carry.force, memory.image, memory.pairs)
+        slope = _dot(carry.force, direction)
+        if not slope > 0:
+            direction, slope = memory.image, _dot(carry.force, memory.image)
+        found = backtrack(system, carry, direction, slope)
+        if found is None:
+            return self._forget(system, carry)
+        x, energy, force = found
+        image = self._image(system, memory.scale, force)
+        pair = _pair(x - carry.x, carry.force - force, memory.image - image)
+        pairs = memory.pairs if pair is None else (*memory.pairs, pair)[-self._history :]
+        return self._carry(x, energy, force, _Memory(pairs, memory.scale, image))
+
+    def _carry(self, x: Tensor, energy: float, force: Tensor, memory: _Memory) -> Carry:
+        return Carry(x, energy, force, memory.image if self._use_metric else None, self.name, memory)
+
+    def _image(self, system: System, scale: Tensor | None, force: Tensor) -> Tensor:
+        return system.apply_metric_inverse(force) if scale is None else force * scale
+
+    def _forget(self, system: System, carry: Carry) -> Carry:
+        """No secant step lowers the energy: drop the secants; without any, try one step on the diagonal, then stay.
+
+        The diagonal knows the present state, so it frees a collapsed triangle that holds up the metric's direction.
+        """
+        memory: _Memory = carry.memory
+        if memory.pairs:
+            return self._carry(carry.x, carry.energy, carry.force, _Memory((), memory.scale, memory.image))
+        direction = carry.force / system.diagonal(carry.x).unsqueeze(1)
+        found = backtrack(system, carry, direction, _dot(carry.force, direction))
+        if found is None:
+            return carry.moved_by("stayed")
+        x, energy, force = found
+        return self._carry(x, energy, force, _Memory((), memory.scale, self._image(system, memory.scale, force)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    """Secant pairs, the diagonal scaling in place of the metric or None, and the image of the present force."""
+
+    pairs: tuple[Pair, ...]
+    scale: Tensor | None
+    image: Tensor
+
+
+def backtrack(
+    system: System, carry: Carry, direction: Float[Tensor, "vertices 3"], slope: float
+) -> tuple[Tensor, float, Tensor] | None:
+    """Shorten a step until the energy falls enough (Armijo), by quadratic interpolation.
+
+    Args:
+        system: The system.
+        carry: Where the step starts.
+        direction: Displacement of the full step [m].
+        slope: force . direction [J].
+
+    Returns:
+        Positions, energy and force after the step, or None when no step lowers the energy.
+    """
+    if not slope > 0:
+        return None
+    length = 1.0
+    for _ in range(MAX_BACKTRACKS):
+        x = carry.x + length * direction
+        energy, force = system.energy_and_force(x)
+        if energy <= carry.energy - ARMIJO * length * slope:
+            return x, energy, force
+        rise = energy - carry.energy + length * slope
+        guess = 0.5 * length * slope * length / rise if rise > 0 else 0.5 * length
+        length = min(max(guess, 0.1 * length), 0.5 * length)
+    return None
+
+
+def _two_loop(force: Tensor, preconditioned: Tensor, pairs: tuple[Pair, ...]) -> Tensor:
+    """The L-BFGS direction for a force, from its preconditioned image and the secant pairs."""
+    if not pairs:
+        return preconditioned
+    weights = []
+    residual = force.clone()
+    image = preconditioned.clone()
+    for pair in reversed(pairs):
+        weight = _dot(pair.move, residual) / pair.curvature
+        residual.add_(pair.yields, alpha=-weight)
+        image.add_(pair.image, alpha=-weight)
+        weights.append(weight)
+    newest = pairs[-1]
+    image.mul_(newest.curvature / _dot(newest.yields, newest.image))
+    for pair, weight in zip(pairs, reversed(weights), strict=True):
+        image.add_(pair.move, alpha=weight - _dot(pair.yields, image) / pair.curvature)
+    return image
+
+
+def _pair(move: Tensor, yields: Tensor, image: Tensor) -> Pair | None:
+    """A secant pair, or None when its curvature is not safely positive."""
+    curvature = _dot(move, yields)
+    floor = 1e-8 * (_dot(move, move) * _dot(yields, yields)) ** 0.5
+    return Pair(move, yields, image, curvature) if curvature > floor and _dot(yields, image) > 0 else None
+
+
+def _dot(a: Tensor, b: Tensor) -> float:
+    return float(torch.dot(a.reshape(-1), b.reshape(-1)))

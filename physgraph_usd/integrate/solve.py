@@ -1,0 +1,135 @@
+"""The solve of one frame: levels from coarse to fine, steps until the remaining move is small or the budget is spent."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ..errors import SolveError
+from .base import Carry, Integrator, System
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When to stop.
+
+    Attributes:
+        steps: Most steps at one level.
+        tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
+        deadline: `time.perf_counter` value after which no step begins, or None.
+    """
+
+    steps: int
+    tolerance: float = 0.0
+    deadline: float | None = None
+
+
+@dataclass(eq=False)
+class LevelReport:
+    """What one level's solve did.
+
+    Attributes:
+        level: Level index.
+        vertices: Number of fine vertices.
+        steps: Steps made.
+        evaluations: Force evaluations.
+        metric_solves: Metric solves.
+        energy_before: Energy at the start [J].
+        energy_after: Energy at the end [J].
+        remaining_move: RMS of H0^-1 F at the end, in local edge lengths.
+        milliseconds: Wall time of the level.
+        stopped: "tolerance", "steps", "budget" or "stalled".
+        movers: How many steps each mover made.
+    """
+
+    level: int
+    vertices: int
+    steps: int = 0
+    evaluations: int = 0
+    metric_solves: int = 0
+    energy_before: float = 0.0
+    energy_after: float = 0.0
+    remaining_move: float = 0.0
+    milliseconds: float = 0.0
+    stopped: str = "steps"
+    movers: dict[str, int] = field(default_factory=dict)
+
+
+def solve_level(
+    system: System,
+    integrator: Integrator,
+    x: Float[Tensor, "vertices 3"],
+    *,
+    level: int,
+    budget: Budget,
+    observe: Callable[[Carry], None] | None = None,
+) -> tuple[Float[Tensor, "vertices 3"], LevelReport]:
+    """Step until the remaining move is under the tolerance or the budget is spent.
+
+    Args:
+        system: The level in this frame.
+        integrator: Any integrator.
+        x: Start positions [m].
+        level: Index for the report.
+        budget: When to stop.
+        observe: Called with the carry after the start and after each step.
+
+    Returns:
+        Final positions [m] and the report.
+
+    Raises:
+        SolveError: The energy at the start or at the end is not finite.
+    """
+    began = time.perf_counter()
+    report = LevelReport(level, x.shape[0])
+    before = (system.evaluations, system.metric_solves)
+    carry = integrator.start(system, x)
+    _require_finite(carry, level)
+    report.energy_before = carry.energy
+    movers: Counter[str] = Counter()
+    while True:
+        if observe:
+            observe(carry)
+        stopped = _reason_to_stop(system, carry, report.steps, budget)
+        if stopped:
+            break
+        carry = integrator.step(system, carry)
+        movers[carry.mover] += 1
+        report.steps += 1
+    _require_finite(carry, level)
+    report.stopped, report.movers = stopped, dict(movers)
+    report.energy_after = carry.energy
+    report.remaining_move = _remaining_move(system, carry)
+    report.evaluations, report.metric_solves = (
+        system.evaluations - before[0],
+        system.metric_solves - before[1],
+    )
+    report.milliseconds = 1e3 * (time.perf_counter() - began)
+    return carry.x, report
+
+
+def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) -> str:
+    if carry.mover == "stayed":
+        return "stalled"
+    if budget.tolerance > 0 and _remaining_move(system, carry) < budget.tolerance:
+        return "tolerance"
+    if steps >= budget.steps:
+        return "steps"
+    if budget.deadline is not None and time.perf_counter() >= budget.deadline:
+        return "budget"
+    return ""
+
+
+def _remaining_move(system: System, carry: Carry) -> float:
+    known = carry.preconditioned
+    return system.remaining_move(known if known is not None else system.apply_metric_inverse(carry.force))
+
+
+def _require_finite(carry: Carry, level: int) -> None:
+    if not bool(carry.x.isfinite().all()) or carry.energy != carry.energy or abs(carry.energy) == float("inf"):
+        raise SolveError(f"level {level}: the energy or a position is not finite (energy {carry.energy} J)")

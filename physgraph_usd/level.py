@@ -1,0 +1,293 @@
+"""One resolution of the garments that are solved together: topology, rest shape and the maps between levels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from .mesh.stencil import Stencil
+from .mesh.subdivide import Refinement, smooth, subdivide_times
+from .mesh.topology import PolygonMesh, edges_of, hinges_of
+from .scene import Garment
+
+HINGE_SHAPE_LIMIT = 10.0
+"""Cap of l0^2 / (A1 + A2): 1.15 on equilateral triangles, unbounded on slivers (STABILITY.md S3)."""
+
+PIN_MARGIN = 1e-6
+"""A pin within this of 1 is exact."""
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One resolution; tensors live on one device in one dtype, integers are int32.
+
+    Attributes:
+        index: 0 is the cage.
+        spans: Vertex range of each garment.
+        rest: Rest positions [m], shape (V, 3).
+        triangles: Corner vertices, shape (T, 3).
+        edges: End vertices, shape (E, 2).
+        hinges: Edge i-j, then the opposite vertices k and l, shape (H, 4).
+        rest_length: [m], shape (E,).
+        edge_area: A third of the adjacent triangles' areas [m^2], shape (E,).
+        hinge_shape: l0^2 / (A1 + A2), clamped, shape (H,).
+        hinge_area: A third of the two triangles' areas [m^2], shape (H,).
+        rest_angle: [rad], shape (H,).
+        vertex_area: A third of the incident triangles' areas [m^2], shape (V,).
+        spacing: Mean rest length of the incident edges [m], shape (V,).
+        edge_garment, hinge_garment, vertex_garment: Garment number of each element.
+        stretch_scale: Painted multiplier, shape (E,).
+        bend_scale: Painted multiplier, shape (H,).
+        pin: Painted pin weight, shape (V,); fixed where it is 1.
+        from_coarse: Linear map from the cage, shape (V, C).
+        smooth_from_coarse: Smooth map from the cage, shape (V, C).
+        from_below: Linear map from the level below, None at the first level.
+    """
+
+    index: int
+    spans: tuple[slice, ...]
+    rest: Float[Tensor, "vertices 3"]
+    triangles: Int[Tensor, "triangles 3"]
+    edges: Int[Tensor, "edges 2"]
+    hinges: Int[Tensor, "hinges 4"]
+    rest_length: Float[Tensor, " edges"]
+    edge_area: Float[Tensor, " edges"]
+    hinge_shape: Float[Tensor, " hinges"]
+    hinge_area: Float[Tensor, " hinges"]
+    rest_angle: Float[Tensor, " hinges"]
+    vertex_area: Float[Tensor, " vertices"]
+    spacing: Float[Tensor, " vertices"]
+    edge_garment: Int[Tensor, " edges"]
+    hinge_garment: Int[Tensor, " hinges"]
+    vertex_garment: Int[Tensor, " vertices"]
+    stretch_scale: Float[Tensor, " edges"]
+    bend_scale: Float[Tensor, " hinges"]
+    pin: Float[Tensor, " vertices"]
+    from_coarse: sp.csr_matrix
+    smooth_from_coarse: sp.csr_matrix
+    from_below: Stencil | None
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Scalar type of the tensors."""
+        return self.rest.dtype
+
+    @property
+    def device(self) -> str:
+        """Device of the tensors."""
+        return str(self.rest.device)
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices V."""
+        return self.rest.shape[0]
+
+    @cached_property
+    def free(self) -> Bool[Tensor, "vertices 1"]:
+        """False where a vertex follows the coarse cloth exactly or belongs to no triangle."""
+        return ((self.pin < 1.0 - PIN_MARGIN) & (self.vertex_area > 0)).unsqueeze(1)
+
+    @cached_property
+    def base(self) -> Stencil:
+        """Linear map from cage positions to this level."""
+        return Stencil(self.from_coarse, dtype=self.dtype, device=self.device)
+
+    @cached_property
+    def smooth_base(self) -> Stencil:
+        """Smooth map from cage positions to this level."""
+        return Stencil(self.smooth_from_coarse, dtype=self.dtype, device=self.device)
+
+
+def refine_garments(garments: Sequence[Garment], levels: Sequence[int]) -> list[tuple[Refinement, ...]]:
+    """Subdivide each garment's cage.
+
+    Args:
+        garments: The garments.
+        levels: Number of subdivisions of each.
+
+    Returns:
+        The refinements of each garment, coarsest first.
+    """
+    return [subdivide_times(garment.mesh, level) for garment, level in zip(garments, levels, strict=True)]
+
+
+def build_levels(
+    garments: Sequence[Garment],
+    refinements: Sequence[Sequence[Refinement]],
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: str = "cpu",
+) -> tuple[Level, ...]:
+    """Build every level of garments that are solved together, the cage itself first.
+
+    A garment with fewer subdivisions than its neighbours stays at its last level while they go on.
+
+    Args:
+        garments: Garments solved together.
+        refinements: Their refinements, as `refine_garments` gives them.
+        dtype: Scalar type of the tensors.
+        device: Their device.
+
+    Returns:
+        Levels, coarsest first.
+    """
+    depth = max((len(chain) for chain in refinements), default=0)
+    levels: list[Level] = []
+    for index in range(depth + 1):
+        parts = [_garment_level(g, chain[:index]) for g, chain in zip(garments, refinements, strict=True)]
+        below = None
+        if index:
+            maps = [
+                chain[index - 1].linear if index <= len(chain) else sp.identity(part.vertex_count, format="csr")
+                for chain, part in zip(refinements, parts, strict=True)
+            ]
+            below = Stencil(sp.csr_matrix(sp.block_diag(maps)), dtype=dtype, device=device)
+        levels.append(_join(index, parts, below, dtype=dtype, device=device))
+    return tuple(levels)
+
+
+@dataclass(frozen=True, eq=False)
+class _GarmentLevel:
+    """One garment at one level, in numpy."""
+
+    vertex_count: int
+    rest: np.ndarray
+    triangles: np.ndarray
+    edges: np.ndarray
+    hinges: np.ndarray
+    bent_rest: bool
+    vertex_values: dict[str, np.ndarray]
+    linear: sp.csr_matrix
+    smooth: sp.csr_matrix
+
+
+def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLevel:
+    """Carry one garment to the level at the end of a chain of refinements."""
+    mesh: PolygonMesh = garment.mesh
+    linear = sp.identity(mesh.vertex_count, format="csr")
+    smoothing = linear
+    for refinement in chain:
+        smoothing = sp.csr_matrix(smooth(mesh, refinement) @ smoothing)
+        linear = sp.csr_matrix(refinement.linear @ linear)
+        mesh = refinement.mesh
+    rest = linear @ np.asarray(garment.rest, dtype=np.float64)
+    triangles = mesh.triangulate(rest if not chain else None).triangles
+    names = ("stretch_scale", "bend_scale", "pin")
+    return _GarmentLevel(
+        vertex_count=mesh.vertex_count,
+        rest=rest,
+        triangles=triangles,
+        edges=edges_of(triangles, mesh.vertex_count).vertices,
+        hinges=hinges_of(triangles),
+        bent_rest=garment.bent_rest,
+        vertex_values={name: linear @ np.asarray(getattr(garment, name), dtype=np.float64) for name in names},
+        linear=linear,
+        smooth=smoothing,
+    )
+
+
+def _join(
+    index: int, parts: Sequence[_GarmentLevel], below: Stencil | None, *, dtype: torch.dtype, device: str
+) -> Level:
+    """Concatenate garments into one level and measure its rest shape."""
+    counts = [part.vertex_count for part in parts]
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+    def stack(name: str) -> np.ndarray:
+        return np.concatenate([getattr(p, name) + o for p, o in zip(parts, starts, strict=False)])
+
+    def owner(name: str) -> np.ndarray:
+        return np.repeat(np.arange(len(parts)), [len(getattr(p, name)) for p in parts])
+
+    def values(name: str) -> np.ndarray:
+        return np.concatenate([p.vertex_values[name] for p in parts])
+
+    rest = np.concatenate([part.rest for part in parts])
+    triangles, edges, hinges = stack("triangles"), stack("edges"), stack("hinges")
+    bent = np.repeat([part.bent_rest for part in parts], [len(part.hinges) for part in parts])
+    shape = rest_shape(rest, triangles, edges, hinges, bent=bent)
+
+    def real(array: np.ndarray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
+
+    def whole(array: np.ndarray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(array, dtype=np.int32), device=device)
+
+    return Level(
+        index=index,
+        spans=tuple(slice(int(a), int(b)) for a, b in zip(starts[:-1], starts[1:], strict=True)),
+        rest=real(rest),
+        triangles=whole(triangles),
+        edges=whole(edges),
+        hinges=whole(hinges),
+        **{name: real(value) for name, value in shape.items()},
+        edge_garment=whole(owner("edges")),
+        hinge_garment=whole(owner("hinges")),
+        vertex_garment=whole(np.repeat(np.arange(len(parts)), counts)),
+        stretch_scale=real(values("stretch_scale")[edges].mean(axis=1)),
+        bend_scale=real(values("bend_scale")[hinges[:, :2]].mean(axis=1)),
+        pin=real(values("pin")),
+        from_coarse=sp.csr_matrix(sp.block_diag([part.linear for part in parts])),
+        smooth_from_coarse=sp.csr_matrix(sp.block_diag([part.smooth for part in parts])),
+        from_below=below,
+    )
+
+
+def rest_shape(
+    rest: np.ndarray, triangles: np.ndarray, edges: np.ndarray, hinges: np.ndarray, *, bent: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Lengths, areas and angles of the rest shape, under the names of `Level`'s fields.
+
+    Args:
+        rest: Rest positions [m], shape (V, 3), float64.
+        triangles: Shape (T, 3).
+        edges: Shape (E, 2).
+        hinges: Shape (H, 4).
+        bent: True where a hinge rests at the rest shape's angle, shape (H,).
+
+    Returns:
+        rest_length, edge_area, hinge_shape, hinge_area, rest_angle, vertex_area, spacing.
+    """
+    count = len(rest)
+    corners = rest[triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    length = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
+    keys = edges[:, 0].astype(np.int64) * count + edges[:, 1]
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
+    edge_of_side = np.searchsorted(keys, (sides[..., 0] * count + sides[..., 1]).ravel())
+    edge_of_side = np.minimum(edge_of_side, max(len(keys) - 1, 0))
+    edge_area = np.bincount(edge_of_side, np.repeat(area, 3) / 3.0, len(edges)) if len(edges) else np.zeros(0)
+    vertex_area = np.bincount(triangles.ravel(), np.repeat(area, 3) / 3.0, count)
+    degree = np.bincount(edges.ravel(), minlength=count)
+    spacing = np.bincount(edges.ravel(), np.repeat(length, 2), count) / np.maximum(degree, 1)
+    fallback = float(length.mean()) if len(length) else 1.0
+    angle, first, second, hinge_length = hinge_geometry(rest, hinges)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        hinge_shape = np.minimum(hinge_length**2 / (first + second), HINGE_SHAPE_LIMIT)
+    return {
+        "rest_length": np.maximum(length, 1e-9 * fallback),
+        "edge_area": edge_area,
+        "hinge_shape": np.nan_to_num(hinge_shape, nan=0.0),
+        "hinge_area": (first + second) / 3.0,
+        "rest_angle": np.where(bent, angle, 0.0),
+        "vertex_area": vertex_area,
+        "spacing": np.where(spacing > 0, spacing, fallback),
+    }
+
+
+def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Signed angle [rad], both triangle areas [m^2] and edge length [m] of each hinge."""
+    i, j, k, ell = (x[hinges[:, corner]] for corner in range(4))
+    axis = j - i
+    n1, n2 = np.cross(axis, k - i), np.cross(ell - i, axis)
+    length = np.linalg.norm(axis, axis=1)
+    sine = np.einsum("hc,hc->h", np.cross(n1, n2), axis) / np.maximum(length, np.finfo(float).tiny)
+    angle = np.arctan2(sine, np.einsum("hc,hc->h", n1, n2))
+    return angle, 0.5 * np.linalg.norm(n1, axis=1), 0.5 * np.linalg.norm(n2, axis=1), length

@@ -1,0 +1,92 @@
+"""A sparse linear map on vertex arrays, applied on CPU or CUDA by one gather a row.
+
+Gathering keeps the order of each sum fixed, so a run repeats bit for bit on either device.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+
+@wp.kernel
+def _gather_rows(
+    starts: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=Any),
+    x: wp.array(dtype=Any),
+    out: wp.array(dtype=Any),
+):
+    row = wp.tid()
+    total = x[0] * values.dtype(0.0)
+    for k in range(starts[row], starts[row + 1]):
+        total += values[k] * x[columns[k]]
+    out[row] = total
+
+
+VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
+"""Warp's 3-vector for each torch scalar type."""
+SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64}
+"""Warp's scalar for each torch scalar type."""
+
+_GATHER = {
+    dtype: wp.overload(
+        _gather_rows,
+        [
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=SCALAR[dtype]),
+            wp.array(dtype=VECTOR[dtype]),
+            wp.array(dtype=VECTOR[dtype]),
+        ],
+    )
+    for dtype in VECTOR
+}
+
+
+def vectors(tensor: Tensor) -> wp.array:
+    """A Warp view of a contiguous (N, 3) tensor as N vectors, without a copy."""
+    return wp.from_torch(tensor, dtype=VECTOR[tensor.dtype], requires_grad=False)
+
+
+class Stencil:
+    """A sparse matrix that maps (columns, 3) vertex arrays to (rows, 3) ones.
+
+    Attributes:
+        shape: (rows, columns).
+    """
+
+    def __init__(self, matrix: sp.csr_matrix, *, dtype: torch.dtype, device: str) -> None:
+        """Copy a scipy matrix to the device.
+
+        Args:
+            matrix: Any scipy sparse matrix, shape (rows, columns).
+            dtype: torch.float32 or torch.float64.
+            device: "cpu" or a CUDA device.
+        """
+        csr = sp.csr_matrix(matrix)
+        csr.sort_indices()
+        self.shape: tuple[int, int] = (csr.shape[0], csr.shape[1])
+        self._matrix = csr
+        self._dtype, self._device = dtype, device
+        self._starts = wp.array(csr.indptr.astype(np.int32), dtype=wp.int32, device=device)
+        self._columns = wp.array(csr.indices.astype(np.int32), dtype=wp.int32, device=device)
+        self._values = wp.array(csr.data, dtype=SCALAR[dtype], device=device)
+
+    def transposed(self) -> Stencil:
+        """The transpose, on the same device."""
+        return Stencil(sp.csr_matrix(self._matrix.T), dtype=self._dtype, device=self._device)
+
+    def apply(self, x: Float[Tensor, "columns 3"]) -> Float[Tensor, "rows 3"]:
+        """The matrix times x."""
+        out = torch.zeros((self.shape[0], 3), dtype=x.dtype, device=x.device)
+        if self.shape[0] and self.shape[1]:
+            arguments = [self._starts, self._columns, self._values, vectors(x), vectors(out)]
+            wp.launch(_GATHER[self._dtype], dim=self.shape[0], inputs=arguments, device=self._device)
+        return out

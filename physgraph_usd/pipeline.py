@@ -1,0 +1,121 @@
+"""Frames in, states out: warm starts, reuse of equal frames; knows no USD and no force by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from statistics import median
+
+import numpy as np
+import torch
+
+from .detail import Carried
+from .errors import GarmentError
+from .group import Group, SolveSettings
+from .level import refine_garments
+from .mesh.subdivide import Refinement
+from .scene import Frame, GarmentFrame, Scene, State
+
+
+class Refiner:
+    """Refines the frames of one scene in order.
+
+    Garments that cannot touch are solved apart, each in a group of its own.
+
+    Attributes:
+        refinements: The subdivisions of each garment, coarsest first.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: SolveSettings,
+        *,
+        levels: Sequence[int] | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
+    ) -> None:
+        """Subdivide the garments and prepare their levels.
+
+        Args:
+            scene: The scene.
+            settings: How to solve.
+            levels: Subdivisions of each garment; the garments' own when None.
+            dtype: Scalar type of the solve.
+            device: "cpu" or a CUDA device.
+
+        Raises:
+            GarmentError: A rest shape cannot be solved on.
+        """
+        for garment in scene.garments:
+            _require_solvable(garment.path, garment.mesh.indices, garment.mesh.counts, garment.rest)
+        chosen = levels if levels is not None else [garment.level for garment in scene.garments]
+        self.refinements: list[tuple[Refinement, ...]] = refine_garments(scene.garments, chosen)
+        self._settings = settings
+        self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
+        self._groups = [
+            Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device)
+            for garment, chain in zip(scene.garments, self.refinements, strict=True)
+        ]
+        self._kept: list[Carried | None] = [None] * len(self._groups)
+        self._last: tuple[Frame, State] | None = None
+
+    def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
+        """Solve frames in order, one state a frame.
+
+        Raises:
+            SolveError: A term of the potential is not finite.
+        """
+        for frame in frames:
+            yield self.solve(frame)
+
+    def solve(self, frame: Frame) -> State:
+        """Solve one frame, starting from the last one solved where that helps."""
+        gap = self._is_gap(frame.time)
+        points: list[np.ndarray] = []
+        telemetry: list[dict[str, object]] = []
+        reused = []
+        for index, (group, garment) in enumerate(zip(self._groups, frame.garments, strict=True)):
+            if self._last is not None and _same(garment, self._last[0].garments[index]):
+                points.append(self._last[1].points[index])
+                telemetry.append({"start": "reused: the input equals the last frame's"})
+                reused.append(True)
+                continue
+            kept = None if gap else self._kept[index]
+            solved, self._kept[index], entry = group.solve([garment], kept, at=frame.time)
+            if gap:
+                entry["start"] = "cold: the time between samples is too long"
+            points += solved
+            telemetry.append(entry)
+            reused.append(False)
+        state = State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
+        self._last = (frame, state)
+        return state
+
+    def _is_gap(self, time: float | None) -> bool:
+        if time is None or self._last is None or self._last[0].time is None or not self._spacing:
+            return False
+        return time - self._last[0].time > self._settings.reset.gap * self._spacing
+
+
+def _same(a: GarmentFrame, b: GarmentFrame) -> bool:
+    """Whether two frames would give the same answer, to the bit."""
+    settings = (a.fabric, a.guide, a.detail) == (b.fabric, b.guide, b.detail)
+    return settings and a.points.shape == b.points.shape and bool(np.array_equal(a.points, b.points))
+
+
+def _require_solvable(path: str, indices: np.ndarray, counts: np.ndarray, rest: np.ndarray) -> None:
+    """Refuse rest shapes that no length can be measured on."""
+    if not np.isfinite(rest).all():
+        vertex = int(np.flatnonzero(~np.isfinite(rest).all(axis=1))[0])
+        raise GarmentError(path, f"rest position {vertex} is not finite", remedy="give another frame with --rest")
+    if not len(indices):
+        return
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    following = np.arange(len(indices)) + 1
+    following[ends[1:] - 1] = ends[:-1]
+    other = indices[following]
+    zero = np.flatnonzero((np.linalg.norm(rest[indices] - rest[other], axis=1) == 0.0) & (indices != other))
+    if len(zero):
+        a, b = int(indices[zero[0]]), int(other[zero[0]])
+        remedy = "merge the two points, or give another rest shape with --rest"
+        raise GarmentError(path, f"the rest edge between points {a} and {b} has no length", remedy=remedy)
