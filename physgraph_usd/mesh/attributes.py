@@ -32,18 +32,19 @@ def vertex_values(refinements: Sequence[Refinement], values: np.ndarray) -> np.n
     values = np.asarray(values)
     if not refinements:
         return values
-    _check_count("values", len(values), refinements[0].linear.shape[1], "vertices")
+    _check_count("values", len(values), refinements[0].parent_vertex_count, "vertices")
     stencil = compose(refinements)
     if not np.issubdtype(values.dtype, np.floating):
         return values[_nearest_parent(stencil)]
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-    return (stencil @ flat.astype(np.float64)).reshape(-1, *values.shape[1:]).astype(values.dtype)
+    fine = stencil @ flat.astype(np.float64)
+    return fine.reshape(len(fine), *values.shape[1:]).astype(values.dtype)
 
 
 def _nearest_parent(stencil: sparse.csr_matrix) -> np.ndarray:
     """Column of the largest weight of each row, the lowest among equals, shape (rows,)."""
     largest = np.repeat(np.maximum.reduceat(stencil.data, stencil.indptr[:-1]), np.diff(stencil.indptr))
-    candidates = np.where(stencil.data >= largest * (1 - 1e-9), stencil.indices, stencil.shape[1])
+    candidates = np.where(stencil.data >= largest * (1 - 1e-9), stencil.indices, np.iinfo(np.int32).max)
     return np.minimum.reduceat(candidates, stencil.indptr[:-1])
 
 
@@ -145,7 +146,7 @@ def vertex_subset(refinements: Sequence[Refinement], vertices: np.ndarray) -> np
     vertices = np.asarray(vertices, np.int32).reshape(-1)
     if not refinements:
         return vertices
-    count = refinements[0].linear.shape[1]
+    count = refinements[0].parent_vertex_count
     bad = vertices[(vertices < 0) | (vertices >= count)]
     if len(bad):
         raise ValueError(f"the subset names vertex {bad[0]}, but the mesh has {count} vertices")
@@ -168,7 +169,7 @@ def edge_subset(refinements: Sequence[Refinement], edges: np.ndarray) -> np.ndar
     for refinement in refinements:
         found = find_edges(refinement.edges, edges)
         edges = edges[found >= 0]
-        middle = (refinement.linear.shape[1] + found[found >= 0]).astype(np.int32)
+        middle = (refinement.parent_vertex_count + found[found >= 0]).astype(np.int32)
         edges = np.stack([edges[:, 0], middle, middle, edges[:, 1]], axis=1).reshape(-1, 2)
     return edges
 

@@ -76,7 +76,7 @@ def _face_defects(mesh: PolygonMesh, points: np.ndarray | None, names: np.ndarra
 def _areas_vanish(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
     """Whether each face's area is negligible beside its longest edge squared, shape (F,)."""
     here, there = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
-    origin = here[np.minimum(mesh.starts[:-1], max(len(here) - 1, 0))][mesh.corner_face]
+    origin = here[mesh.starts[mesh.corner_face]]
     twice = np.cross(here - origin, there - origin)
     area = np.stack([np.bincount(mesh.corner_face, column, mesh.face_count) for column in twice.T], axis=1)
     longest = np.zeros(mesh.face_count)
@@ -85,14 +85,16 @@ def _areas_vanish(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
 
 
 def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
-    """Check edges."""
+    """Check edges; a face that runs twice through one, because it repeats a vertex, counts once there."""
     half = mesh.half_edges
     proper = half.edges[:, 0] != half.edges[:, 1]
     forward = np.bincount(half.edge, half.forward, len(half.edges))
-    crowded = np.flatnonzero(proper & (half.count > 2))
-    twisted = np.flatnonzero(proper & (half.count == 2) & (forward != 1))
+    visits = np.unique(np.stack([half.edge, mesh.corner_face]), axis=1)
+    faces = np.bincount(visits[0], minlength=len(half.edges))
+    crowded = np.flatnonzero(proper & (faces > 2))
+    twisted = np.flatnonzero(proper & (half.count == 2) & (faces == 2) & (forward != 1))
     found = [
-        Defect("non-manifold-edge", int(row), f"edge {_pair(half.edges[row])} has {half.count[row]} faces")
+        Defect("non-manifold-edge", int(row), f"edge {_pair(half.edges[row])} has {faces[row]} faces")
         for row in crowded
     ]
     return found + [

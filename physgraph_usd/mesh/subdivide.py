@@ -33,6 +33,11 @@ class Refinement:
     parent_face: np.ndarray
     edges: np.ndarray
 
+    @property
+    def parent_vertex_count(self) -> int:
+        """Number of vertices of the parent, V_parent."""
+        return int(self.linear.get_shape()[1])
+
 
 def subdivide(mesh: PolygonMesh) -> Refinement:
     """Split every face once.
@@ -222,10 +227,10 @@ _Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Rows, columns and weights; columns are child vertices in their linear places."""
 
 
-def _stack(rows: np.ndarray, columns: list[np.ndarray], weights: list[np.ndarray]) -> _Part:
+def _stack(rows: np.ndarray, columns: list[np.ndarray], weights: list[np.ndarray | float]) -> _Part:
     """Join several columns for the same rows."""
-    weights = [np.broadcast_to(np.asarray(weight, np.float64), rows.shape) for weight in weights]
-    return np.tile(rows, len(columns)), np.concatenate(columns), np.concatenate(weights)
+    full = [np.broadcast_to(np.asarray(weight, np.float64), rows.shape) for weight in weights]
+    return np.tile(rows, len(columns)), np.concatenate(columns), np.concatenate(full)
 
 
 def _fixed_part(mesh: PolygonMesh, rules: _Rules) -> _Part:

@@ -1,0 +1,211 @@
+"""Smooth placement: libigl, trimesh, Blender's OpenSubdiv, and values worked out by hand."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import any_mesh, cube, faces_of, grid, mesh_of, prism, tetrahedron
+from scipy import sparse
+from scipy.spatial import KDTree
+from test_subdivide import same_surface
+
+from physgraph_usd.mesh.attributes import edge_subset
+from physgraph_usd.mesh.subdivide import Refinement, smooth, subdivide
+from physgraph_usd.mesh.topology import PolygonMesh
+
+BLENDER = """
+import sys, numpy as np, bpy
+given = np.load(sys.argv[1])
+starts = np.concatenate([[0], np.cumsum(given["counts"])])
+faces = [given["indices"][a:b].tolist() for a, b in zip(starts[:-1], starts[1:])]
+mesh = bpy.data.meshes.new("cage")
+mesh.from_pydata(given["points"].tolist(), [], faces)
+creases = {tuple(sorted(edge)) for edge in given["creases"].tolist()}
+layer = mesh.attributes.new("crease_edge", "FLOAT", "EDGE")
+for edge in mesh.edges:
+    layer.data[edge.index].value = float(tuple(sorted(edge.vertices)) in creases)
+cage = bpy.data.objects.new("cage", mesh)
+bpy.context.scene.collection.objects.link(cage)
+modifier = cage.modifiers.new("subdivision", "SUBSURF")
+modifier.subdivision_type = "CATMULL_CLARK"
+modifier.levels = int(given["levels"])
+modifier.use_limit_surface = False
+modifier.boundary_smooth = "PRESERVE_CORNERS"
+fine = cage.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
+np.savez(sys.argv[2], points=[list(v.co) for v in fine.vertices], faces=[list(p.vertices) for p in fine.polygons])
+"""
+
+
+def dense(mesh: PolygonMesh, **options: np.ndarray) -> tuple[Refinement, np.ndarray]:
+    refinement = subdivide(mesh)
+    return refinement, smooth(mesh, refinement, **options).toarray()
+
+
+def umbrella(sides: int) -> PolygonMesh:
+    """A closed double fan: two apexes of the given valence."""
+    ring = [(i, (i + 1) % sides) for i in range(sides)]
+    return mesh_of([[sides, a, b] for a, b in ring] + [[sides + 1, b, a] for a, b in ring])
+
+
+@given(any_mesh(repeats=True), st.integers(0, 2**16))
+def test_affine_maps_commute(mesh: PolygonMesh, seed: int):
+    rng = np.random.default_rng(seed)
+    points, matrix, shift = rng.normal(size=(mesh.vertex_count, 3)), rng.normal(size=(3, 3)), rng.normal(size=3)
+    creases = rng.integers(0, mesh.vertex_count, (3, 2))
+    stencil = smooth(mesh, subdivide(mesh), crease_edges=creases, corner_vertices=creases[:1, 0])
+    np.testing.assert_allclose(stencil.sum(axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(stencil @ (points @ matrix + shift), (stencil @ points) @ matrix + shift, atol=1e-11)
+
+
+@given(any_mesh(), st.integers(0, 2**16))
+def test_the_first_corner_of_a_face_does_not_matter(mesh: PolygonMesh, seed: int):
+    rng = np.random.default_rng(seed)
+    turned = [np.roll(face, rng.integers(len(face))).tolist() for face in faces_of(mesh)]
+    points = rng.normal(size=(mesh.vertex_count, 3))
+    one, two = (smooth(m, subdivide(m)) @ points for m in (mesh, mesh_of(turned, mesh.vertex_count)))
+    np.testing.assert_allclose(one, two, atol=1e-12)
+
+
+@pytest.mark.parametrize("cells", ["quads", "triangles"])
+def test_a_regular_plane_stays_in_place_inside(cells: str):
+    mesh, points = grid(6, 6, cells)
+    refinement, stencil = dense(mesh)
+    fine = refinement.linear @ points
+    inside = np.all((fine[:, :2] >= 1) & (fine[:, :2] <= 5), axis=1)
+    np.testing.assert_allclose((stencil @ points)[inside], fine[inside], atol=1e-14)
+
+
+@pytest.mark.parametrize("sides", [3, 4, 5, 6, 7, 12])
+def test_loop_weights_at_any_valence(sides: int):
+    refinement, stencil = dense(umbrella(sides))
+    beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / sides) / 4) ** 2) / sides
+    wanted = np.full(sides, beta)
+    np.testing.assert_allclose(stencil[sides], [*wanted, 1 - sides * beta, 0], atol=1e-15)
+    spoke = sides + 2 + refinement.edges.tolist().index([0, sides])
+    assert stencil[spoke, [0, sides, 1, sides - 1]].tolist() == [3 / 8, 3 / 8, 1 / 8, 1 / 8]
+
+
+@pytest.mark.parametrize("points_and_mesh", [tetrahedron(), grid(5, 4, "triangles")])
+def test_loop_matches_libigl_where_it_uses_the_same_weights(points_and_mesh: tuple[PolygonMesh, np.ndarray]):
+    """Valence 3 and 6, edges and boundaries; at other valences libigl has Warren's weights, OpenSubdiv Loop's."""
+    mesh, points = points_and_mesh
+    points = points + np.random.default_rng(1).normal(size=points.shape)
+    other, faces = map(np.asarray, igl.loop(points, mesh.indices.reshape(-1, 3).astype(np.int64), 1))
+    refinement, stencil = dense(mesh)
+    fixed = np.bincount(mesh.indices, minlength=mesh.vertex_count) == 1
+    assert len(faces) == refinement.mesh.face_count
+    distance, _ = KDTree(other).query((stencil @ points)[~np.pad(fixed, (0, len(stencil) - len(fixed)))])
+    assert distance.max() < 1e-14
+
+
+def test_loop_matches_trimesh_at_other_valences():
+    shape = trimesh.creation.icosahedron()
+    mesh = mesh_of(np.asarray(shape.faces).tolist())
+    points = np.asarray(shape.vertices) + np.random.default_rng(2).normal(scale=0.1, size=(12, 3))
+    other, faces = trimesh.remesh.subdivide_loop(points, np.asarray(shape.faces), iterations=1)
+    refinement, stencil = dense(mesh)
+    assert same_surface(refinement.mesh, stencil @ points, other, faces.tolist()) < 1e-14
+
+
+def test_catmull_clark_cube():
+    mesh, points = cube()
+    _, stencil = dense(mesh)
+    fine = np.abs(stencil @ points)
+    np.testing.assert_allclose(fine[:8], 5 / 9)
+    np.testing.assert_allclose(np.sort(fine[8:20], axis=1), np.tile([0, 0.75, 0.75], (12, 1)), atol=1e-15)
+    np.testing.assert_allclose(np.sort(fine[20:], axis=1), np.tile([0, 0, 1], (6, 1)), atol=1e-15)
+
+
+def test_where_triangles_meet_quads_the_rule_is_stam_and_loops():
+    """Their scheme is linear subdivision, then a mean over the faces by angle; valid at corners of two quads, three
+    triangles, here at (3, 2) of a grid whose triangles on the left meet quads on the right."""
+    mesh, points = grid(6, 4, "mixed")
+    refinement, stencil = dense(mesh)
+    vertex = 2 * 7 + 3
+    total, weight = np.zeros(len(points)), 0.0
+    for face in faces_of(refinement.mesh):
+        if vertex not in face:
+            continue
+        rows = refinement.linear[face].toarray()
+        masks = np.array([0.25] * 4 if len(face) == 4 else [0.25 if v == vertex else 0.375 for v in face])
+        angle = 1 / 4 if len(face) == 4 else 1 / 6
+        total, weight = total + angle * masks @ rows, weight + angle
+    assert np.isclose(weight, 1.0)
+    np.testing.assert_allclose(stencil[vertex], total, atol=1e-15)
+    seam = len(points) + refinement.edges.tolist().index([vertex, vertex + 7])
+    wanted = dict.fromkeys([vertex, vertex + 7], 3 / 16 + 1 / 8 + 1 / 16) | {vertex - 1: 1 / 8}
+    wanted |= {vertex + 1: 1 / 16, vertex + 8: 1 / 16}
+    assert {int(v): stencil[seam, v] for v in np.flatnonzero(stencil[seam])} == wanted
+
+
+def test_boundaries_are_cubic_splines_and_lone_corners_stay():
+    mesh, _ = grid(3, 2)
+    _, stencil = dense(mesh)
+    assert stencil[1, [0, 1, 2]].tolist() == [1 / 8, 3 / 4, 1 / 8]
+    assert stencil[0, 0] == stencil[3, 3] == stencil[8, 8] == 1.0
+    assert stencil[12, [0, 1]].tolist() == [0.5, 0.5]
+
+
+def test_creases_corners_and_darts():
+    mesh, _ = grid(4, 4)
+    _, plain = dense(mesh)
+    _, line = dense(mesh, crease_edges=np.array([[11, 12], [13, 12], [0, 24]]))
+    assert line[12, [11, 12, 13]].tolist() == [1 / 8, 3 / 4, 1 / 8]
+    assert np.array_equal(line[11], plain[11])
+    _, three = dense(mesh, crease_edges=np.array([[11, 12], [13, 12], [12, 17]]))
+    assert three[12, 12] == 1.0
+    _, corner = dense(mesh, corner_vertices=np.array([12]))
+    assert corner[12, 12] == 1.0
+    assert np.array_equal(corner[13:25], plain[13:25])
+
+
+def test_non_manifold_places_stay():
+    fin = mesh_of([[0, 1, 2], [1, 0, 3], [0, 1, 4], [0, 2, 5], [1, 6, 2]])
+    refinement, stencil = dense(fin)
+    assert stencil[0, 0] == stencil[1, 1] == 1.0
+    assert stencil[7 + refinement.edges.tolist().index([0, 1]), [0, 1]].tolist() == [0.5, 0.5]
+    cones = mesh_of([[0, 1, 2], [0, 2, 3], [0, 3, 1], [0, 4, 5], [0, 5, 6], [0, 6, 4]], 8)
+    _, stencil = dense(cones)
+    assert stencil[0, 0] == stencil[7, 7] == 1.0
+
+
+def blender_surface(
+    folder: Path, mesh: PolygonMesh, points: np.ndarray, *, creases: np.ndarray, levels: int
+) -> tuple[np.ndarray, list[list[int]]]:
+    """Subdivide with Blender in a process of its own."""
+    python = os.environ.get("PHYSGRAPH_BPY_PYTHON")
+    if not python:
+        pytest.skip("PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy")
+    cage = {"counts": mesh.counts, "indices": mesh.indices, "points": points, "creases": creases, "levels": levels}
+    np.savez(folder / "cage.npz", **cage)
+    (folder / "subdivide.py").write_text(BLENDER)
+    command = [python, "subdivide.py", "cage.npz", "fine.npz"]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=300)
+    fine = np.load(folder / "fine.npz")
+    return fine["points"], fine["faces"].tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.blender
+@pytest.mark.parametrize("levels", [1, 2])
+@pytest.mark.parametrize("shape", ["cube", "prism", "grid", "creased"])
+def test_catmull_clark_matches_blenders_opensubdiv(tmp_path: Path, shape: str, levels: int):
+    mesh, points = {"cube": cube, "prism": lambda: prism(5)}.get(shape, lambda: grid(5, 4))()
+    points = points + np.random.default_rng(3).normal(scale=0.2, size=points.shape)
+    creases = np.array([[7, 8], [8, 9], [9, 15], [13, 19]]) if shape == "creased" else np.empty((0, 2), int)
+    theirs, faces = blender_surface(tmp_path, mesh, points, creases=creases, levels=levels)
+    fine: sparse.csr_matrix | np.ndarray = points
+    for _ in range(levels):
+        refinement = subdivide(mesh)
+        fine = smooth(mesh, refinement, crease_edges=creases) @ fine
+        mesh, creases = refinement.mesh, edge_subset([refinement], creases)
+    deviation = same_surface(mesh, fine, theirs, faces)
+    assert deviation < 2e-6, f"Blender computes in float32; found {deviation:.2e}"
