@@ -203,7 +203,9 @@ def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str
 
 @main.command()
 @click.argument("layer", type=click.Path(dir_okay=False))
-@click.option("--shot", type=click.Path(dir_okay=False), help="Compose the layer over this shot first.")
+@click.option(
+    "--shot", type=click.Path(dir_okay=False), help="The shot it goes over.  [default: the one the layer names]"
+)
 @json_option
 def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
     """Check a refined LAYER by our rules and by USD's own validators; exit with 1 when it breaks one."""
@@ -214,8 +216,7 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
         click.echo(json.dumps([asdict(problem) for problem in problems], indent=2))
     else:
         for problem in problems:
-            at = "" if problem.time is None else f" at time code {problem.time:g}"
-            click.echo(f"{problem.severity}: <{problem.path}>{at}: {problem.message}")
+            click.echo(problem)
     sys.exit(FAILED if any(problem.severity == "error" for problem in problems) else DONE)
 
 
