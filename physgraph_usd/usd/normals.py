@@ -18,6 +18,9 @@ class VertexNormals:
         n_v = sum_f a_f / |sum_f a_f|,   a_f = 1/2 sum_i (p_i - p_0) x (p_{i+1} - p_0),
 
     which is exact for planar polygons and independent of how a non-planar one would be cut (Newell's normal).
+
+    Attributes:
+        vertex_count: V.
     """
 
     def __init__(self, mesh: PolygonMesh, *, left_handed: bool = False) -> None:
@@ -27,6 +30,7 @@ class VertexNormals:
             mesh: The topology; faces under three corners are ignored.
             left_handed: Whether faces run clockwise seen from outside.
         """
+        self.vertex_count = mesh.vertex_count
         counts = np.asarray(mesh.counts, np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
         self._diagonals, self._face = _vector_area_corners(counts, starts, np.asarray(mesh.indices))

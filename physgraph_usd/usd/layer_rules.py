@@ -1,0 +1,120 @@
+"""The rules for a refined layer as a whole, and against the shot below it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
+
+from .provenance import read_record
+from .rules import Problem, code_of
+
+_SAME = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
+
+
+def _error(message: str, path: str = "/", time: float | None = None) -> Problem:
+    """An error; ``rule`` is filled in by `validate`."""
+    return Problem("error", path, time, message, "")
+
+
+def record(layer: Sdf.Layer) -> Iterator[Problem]:
+    """The layer says where it comes from."""
+    found = read_record(layer)
+    if found is None:
+        yield _error('has no customLayerData["physgraph"]; is it a refined layer?')
+    elif not found.get("garments") or not found.get("shot"):
+        yield _error("its record names no garments or no shot")
+
+
+def time_scale(layer: Sdf.Layer) -> Iterator[Problem]:
+    """Time codes per second are authored: a layer without them counts as 24 and its samples are rescaled."""
+    if not layer.HasTimeCodesPerSecond():
+        yield _error("timeCodesPerSecond is not authored; USD would take 24 and rescale the samples")
+
+
+def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:
+    """The layer brings no other layer and authors in no variant."""
+    if list(layer.subLayerPaths):
+        yield _error(f"has sublayers {list(layer.subLayerPaths)}; a refined layer stands over the shot, not on it")
+    found: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, found.append)
+    for path in found:
+        if path.IsPrimVariantSelectionPath():
+            yield _error("authors inside a variant of an asset", str(path))
+
+
+def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
+    """Units, axes, rate and range are the shot's."""
+    if layer.timeCodesPerSecond != shot.GetTimeCodesPerSecond():
+        said = f"timeCodesPerSecond is {layer.timeCodesPerSecond:g}; the shot has {shot.GetTimeCodesPerSecond():g}"
+        yield _error(said)
+    root = shot.GetRootLayer().pseudoRoot
+    for key in _SAME:
+        wanted = root.GetInfo(key) if root.HasInfo(key) else None
+        found = layer.pseudoRoot.GetInfo(key) if layer.pseudoRoot.HasInfo(key) else None
+        if wanted is not None and found != wanted:
+            yield _error(f"{key} is {found!r}; the shot has {wanted!r}")
+
+
+def is_mesh(path: str, composed: Usd.Stage) -> str:
+    """Why a path holds no editable mesh, or ""."""
+    prim = composed.GetPrimAtPath(path)
+    if not prim:
+        return "is not on the stage: the layer is not over the shot that it was made from"
+    if prim.IsInstanceProxy():
+        return "lies in an instance, where overs are ignored; its instance root must be instanceable = false"
+    return "" if prim.IsA(UsdGeom.Mesh) else f"is of type {prim.GetTypeName() or 'none'}, not Mesh"
+
+
+def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:
+    """Samples lie at the shot's own times, and the fine mesh is about where and as large as the coarse one."""
+    name = str(target.AppendProperty("points"))
+    written = list(layer.ListTimeSamplesForPath(name))
+    if _is_skinned(coarse):
+        return
+    known = np.array(sorted(_times(coarse)))
+    for time in written:
+        if not len(known) or np.abs(known - time).min() > 1e-6:
+            yield _error("is a sample at a time that the shot does not author", name, time)
+            break
+    spec = layer.GetAttributeAtPath(name)
+    for time in written[:1] + written[-1:] if written else [None]:
+        value = layer.QueryTimeSample(name, time) if time is not None else (spec.default if spec else None)
+        below = UsdGeom.Mesh(coarse).GetPointsAttr().Get(code_of(time))
+        if value is not None and below is not None and len(value) and len(below):
+            yield from _compare(np.asarray(value), np.asarray(below), name, time)
+
+
+def _times(prim: Usd.Prim) -> set[float]:
+    """Authored times of a mesh's points and of every transform above it."""
+    times = set(UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples())
+    while prim and not prim.IsPseudoRoot():
+        if prim.IsA(UsdGeom.Xformable):
+            times.update(UsdGeom.Xformable(prim).GetTimeSamples())
+        prim = prim.GetParent()
+    return times
+
+
+def _is_skinned(prim: Usd.Prim) -> bool:
+    """Whether a skeleton may move the coarse mesh; then its own points are a bind pose."""
+    while prim and not prim.IsPseudoRoot():
+        if prim.IsA(UsdSkel.Root):
+            return True
+        prim = prim.GetParent()
+    return False
+
+
+def _compare(fine: np.ndarray, coarse: np.ndarray, name: str, time: float | None) -> Iterator[Problem]:
+    """Compare two clouds in the same local space by size and place."""
+    good = coarse[np.isfinite(coarse).all(axis=1)].astype(np.float64)
+    if not len(good) or not np.isfinite(fine).all():
+        return
+    size, wanted = (float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (fine.astype(np.float64), good))
+    away = float(np.linalg.norm(fine.mean(axis=0, dtype=np.float64) - good.mean(axis=0)))
+    if not wanted / 4 <= size <= 4 * wanted:
+        yield _error(
+            f"is {size:g} units large; the coarse mesh is {wanted:g}: units or transforms are wrong", name, time
+        )
+    elif away > wanted:
+        yield _error(f"lies {away:g} units from the coarse mesh, which is {wanted:g} large", name, time)

@@ -1,0 +1,180 @@
+"""Where a layer comes from: stage metadata that it must repeat, its record, and the root that shows it.
+
+The record lies in ``customLayerData["physgraph"]``. It holds no clock and no absolute path of this machine, so the same
+input gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pxr import Sdf, Tf, Usd, Vt
+
+from ..errors import LayerError
+from .atomic import prepare_target, publish, temporary_path
+
+RECORD = "physgraph"
+_COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
+_NOT_FOR_ROOT = {"subLayers", "subLayerOffsets", "customLayerData", "documentation", "comment", "hasOwnedSubLayers"}
+
+
+def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float, float] | None = None) -> None:
+    """Repeat in a new layer what a stage says of its time and space.
+
+    Time codes per second are always authored: a layer without them counts as 24 and USD would rescale its samples.
+
+    Args:
+        stage: The shot.
+        layer: The new layer.
+        span: First and last time code written, for a shot that does not author its range.
+    """
+    layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
+    layer.framesPerSecond = stage.GetFramesPerSecond()
+    root = stage.GetRootLayer().pseudoRoot
+    for key in _COPIED:
+        if stage.HasAuthoredMetadata(key):
+            layer.pseudoRoot.SetInfo(key, stage.GetMetadata(key))
+        elif root.HasInfo(key):
+            layer.pseudoRoot.SetInfo(key, root.GetInfo(key))
+    if span is not None and not stage.HasAuthoredTimeCodeRange():
+        layer.startTimeCode, layer.endTimeCode = span
+
+
+def author_record(layer: Sdf.Layer, record: Mapping[str, Any]) -> None:
+    """Write the record into ``customLayerData["physgraph"]``; None entries are left out."""
+    data = dict(layer.customLayerData)
+    data[RECORD] = _plain(record)
+    layer.customLayerData = data
+
+
+def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
+    """The record of a layer that we wrote, or None."""
+    record = layer.customLayerData.get(RECORD)
+    return dict(record) if isinstance(record, Mapping) else None
+
+
+def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
+    """Layers of a stage that hold refined garments: mute them to find the coarse shot below."""
+    found = (layer for layer in stage.GetUsedLayers() if (read_record(layer) or {}).get("garments"))
+    return sorted(found, key=lambda layer: layer.identifier)
+
+
+def file_hashes(stage: Usd.Stage, folder: Path) -> dict[str, str]:
+    """SHA-256 of every file that a stage is composed from.
+
+    Args:
+        stage: The shot.
+        folder: Folder to name the files from.
+
+    Returns:
+        Hash by path relative to the folder, with forward slashes, sorted.
+    """
+    files = {Path(layer.realPath) for layer in stage.GetUsedLayers() if layer.realPath}
+    paths = sorted(path for path in files if path.is_file())
+    return {relative_path(path, folder): _sha256(path) for path in paths}
+
+
+def _sha256(path: Path) -> str:
+    """Hash of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def relative_path(path: str | Path, folder: Path) -> str:
+    """A path as seen from a folder, as USD writes it; absolute where there is no relative one."""
+    full = Path(path).resolve()
+    try:
+        relative = Path(os.path.relpath(full, folder.resolve())).as_posix()
+    except ValueError:
+        return full.as_posix()
+    return relative if relative.startswith(".") else f"./{relative}"
+
+
+def _plain(value: Any) -> Any:
+    """Bring a record to types that layer metadata holds."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in sorted(value.items(), key=str) if item is not None}
+    if isinstance(value, list | tuple | set | frozenset):
+        return _plain_list(sorted(value) if isinstance(value, set | frozenset) else list(value))
+    if isinstance(value, bool | int | float | str):
+        return value
+    return str(value)
+
+
+def _plain_list(items: list[Any]) -> Any:
+    """Bring a list to the narrowest array that holds it."""
+    if items and all(isinstance(item, int) and not isinstance(item, bool) for item in items):
+        return Vt.IntArray(items)
+    if items and all(isinstance(item, int | float) and not isinstance(item, bool) for item in items):
+        return Vt.DoubleArray(items)
+    return Vt.StringArray([str(item) for item in items])
+
+
+def write_root(path: Path, *, layer: Path, shot: Path, overwrite: bool = False) -> Path:
+    """Write a small root layer that shows a refined layer over its shot.
+
+    It repeats the shot's stage metadata, expression variables included: those are read from a root layer alone.
+
+    Args:
+        path: Root to write, ``.usda`` by custom.
+        layer: The refined layer.
+        shot: The shot file, a ``.usdz`` too.
+        overwrite: Whether an existing file may be replaced.
+
+    Returns:
+        The path written.
+
+    Raises:
+        UsageError: The root exists and may not be replaced.
+        LayerError: The shot cannot be read or the root cannot be written.
+    """
+    prepare_target(path, overwrite=overwrite)
+    source = Sdf.Layer.FindOrOpen(str(shot))
+    if not source:
+        raise LayerError(f"cannot read {shot}")
+    below = [relative_path(layer, path.parent), relative_path(shot, path.parent)]
+    return export_layer(root_over(source, below), path)
+
+
+def root_over(source: Sdf.Layer, below: list[str]) -> Sdf.Layer:
+    """Make a root layer in memory with a shot's stage metadata.
+
+    Args:
+        source: The shot's root layer.
+        below: Identifiers of its sublayers, strongest first.
+
+    Returns:
+        The anonymous layer.
+    """
+    root = Sdf.Layer.CreateAnonymous(".usda")
+    for key in source.pseudoRoot.ListInfoKeys():
+        if key not in _NOT_FOR_ROOT and "elocates" not in key:
+            root.pseudoRoot.SetInfo(key, source.pseudoRoot.GetInfo(key))
+    root.timeCodesPerSecond = source.timeCodesPerSecond
+    root.subLayerPaths = below
+    return root
+
+
+def export_layer(layer: Sdf.Layer, path: Path) -> Path:
+    """Write a layer held in memory to a file, complete or not at all.
+
+    Raises:
+        LayerError: The file cannot be written.
+    """
+    temporary = temporary_path(path, suffix=path.suffix)
+    try:
+        if not layer.Export(str(temporary)):
+            raise LayerError(f"cannot write {path}")
+        publish(temporary, path)
+    except Tf.ErrorException as error:
+        raise LayerError(f"cannot write {path}: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    loaded = Sdf.Layer.Find(str(path))
+    if loaded:
+        loaded.Reload(True)
+    return path

@@ -1,0 +1,166 @@
+"""Checks a refined layer: our rules, on it alone and over its shot, and USD's own validators."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Tf, Usd
+
+from ..errors import LayerError
+from . import layer_rules
+from .provenance import read_record, root_over
+from .rules import RULES, Fine, Problem
+
+__all__ = ["Problem", "check_layer", "validate_layer"]
+
+
+def validate_layer(path: str | Path, shot: str | Path | None = None) -> list[Problem]:
+    """Check a refined layer.
+
+    Args:
+        path: The layer.
+        shot: The shot that it goes over; by default the one named in its record, where that file is there.
+
+    Returns:
+        Problems, errors first; each names its path and time.
+
+    Raises:
+        LayerError: The layer or the shot cannot be opened.
+    """
+    layer = _open(Path(path))
+    below = shot if shot is not None else _recorded_shot(layer)
+    root = None if below is None else _open(Path(below))
+    problems = check_layer(layer, root)
+    if root is None:
+        said = "the shot is not where the record says; only the layer itself was checked"
+        problems.append(Problem("warning", "/", None, said, "record"))
+    elif not any(problem.rule == "composition" for problem in problems):
+        problems += _own_validators(layer, root)
+    return sorted(problems, key=lambda problem: problem.severity != "error")
+
+
+def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None = None) -> list[Problem]:
+    """Run our rules.
+
+    Args:
+        layer: The refined layer.
+        shot: Root layer of the shot, or None to check the layer alone.
+        samples: How many time samples to look at, spread over the range; None for all.
+
+    Returns:
+        Problems in the order of the rules.
+    """
+    problems = [
+        replace(problem, rule=rule.__name__)
+        for rule in (layer_rules.record, layer_rules.time_scale, layer_rules.self_contained)
+        for problem in rule(layer)
+    ]
+    if shot is None:
+        return problems
+    paths = _garments(layer)
+    composed = Usd.Stage.Open(root_over(shot, [layer.identifier, shot.identifier]))
+    alone = Usd.Stage.Open(shot)
+    problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
+    for path in paths:
+        fault = layer_rules.is_mesh(path, composed)
+        if fault:
+            problems.append(Problem("error", path, None, fault, "composition"))
+            continue
+        problems += _check_garment(composed.GetPrimAtPath(path), layer, samples)
+        coarse = _coarse(alone, layer, path)
+        if coarse:
+            problems += _named("against_shot", layer_rules.against_shot(layer, coarse, Sdf.Path(path)))
+    return problems
+
+
+def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None) -> Iterator[Problem]:
+    """Run the rules for one garment."""
+    written = list(layer.ListTimeSamplesForPath(prim.GetPath().AppendProperty("points")))
+    if samples is not None and len(written) > samples:
+        written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
+    fine = Fine(prim, layer, (None, *written))
+    for rule in RULES:
+        yield from _named(rule.__name__, rule(fine))
+
+
+def _named(rule: str, problems: Iterable[Problem]) -> Iterator[Problem]:
+    """Name the rule in its problems."""
+    return (replace(problem, rule=rule) for problem in problems)
+
+
+def _garments(layer: Sdf.Layer) -> Sequence[str]:
+    """Fine meshes by the record, or else every prim with points."""
+    named = (read_record(layer) or {}).get("garments")
+    if named:
+        return [str(path) for path in named]
+    found: list[str] = []
+    layer.Traverse(
+        Sdf.Path.absoluteRootPath,
+        lambda path: found.append(str(path.GetPrimPath())) if path.name == "points" else None,
+    )
+    return sorted(found)
+
+
+def _coarse(shot: Usd.Stage, layer: Sdf.Layer, path: str) -> Usd.Prim:
+    """The coarse mesh of a fine one: the prim itself, or the sibling's reference."""
+    spec = layer.GetPrimAtPath(path)
+    references = list(spec.referenceList.prependedItems) if spec else []
+    return shot.GetPrimAtPath(references[0].primPath if references else path)
+
+
+def _open(path: Path) -> Sdf.Layer:
+    """Open a layer."""
+    try:
+        layer = Sdf.Layer.FindOrOpen(str(path))
+    except Tf.ErrorException as error:
+        raise LayerError(f"cannot read {path}: {error}") from error
+    if not layer:
+        raise LayerError(f"cannot read {path}")
+    return layer
+
+
+def _recorded_shot(layer: Sdf.Layer) -> Path | None:
+    """The shot named in a layer's record, if it is there."""
+    named = (read_record(layer) or {}).get("shot")
+    if not named or not layer.realPath:
+        return None
+    path = Path(layer.realPath).parent / str(named)
+    return path if path.is_file() else None
+
+
+def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
+    """Run USD's validators; what the shot itself already has is left out."""
+    try:
+        from pxr import UsdValidation  # noqa: PLC0415 - not in every host
+    except ImportError:
+        return []
+    if not hasattr(UsdValidation, "ValidationContext"):
+        return []
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    before = _findings(UsdValidation, validators, Usd.Stage.Open(shot))
+    composed = Usd.Stage.Open(root_over(shot, [layer.identifier, shot.identifier]))
+    after = _findings(UsdValidation, validators, composed)
+    return [problem for key, problem in after.items() if key not in before]
+
+
+def _findings(module: object, validators: list, stage: Usd.Stage) -> dict[tuple[str, str, str], Problem]:
+    """Findings on one stage by validator, place and message."""
+    findings = {}
+    context = module.ValidationContext(validators)  # type: ignore[attr-defined]
+    for found in context.Validate(stage):
+        sites = found.GetSites()
+        path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
+        if sites and not path:
+            path = str(sites[0].GetPrim().GetPath()) if sites[0].IsPrim() else "/"
+        severity = "error" if found.GetType() == module.ValidationErrorType.Error else "warning"  # type: ignore[attr-defined]
+        problem = Problem(severity, path or "/", None, found.GetMessage(), str(found.GetIdentifier()))
+        findings[(problem.rule, problem.path, _without_names(problem.message))] = problem
+    return findings
+
+
+def _without_names(message: str) -> str:
+    """A message without the name of the anonymous root, which differs between stages."""
+    return " ".join(word for word in message.split() if "anon:" not in word)

@@ -1,0 +1,219 @@
+"""Writes refined garments into one new layer, frame after frame.
+
+The layer holds overs only (and, in sibling mode, the refined siblings). What depends on topology is authored once, when
+the writer opens; points, normals, extent and velocities come per time code. See `stream` for how it stays atomic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
+
+from ..errors import LayerError, UsageError
+from ..mesh.subdivide import Refinement
+from . import overs, provenance
+from .atomic import termination_raises
+from .carry import FineMap
+from .hints import ModelHints
+from .material_opinions import author_used_values
+from .normals import VertexNormals
+from .primvars import carry_primvars, carry_subsets
+from .reader import Shot
+from .stage import Notice
+from .stream import LayerStream
+from .track import PointTrack
+from .validate import check_layer
+
+MODES = ("over", "sibling")
+
+
+class LayerWriter:
+    """One refined layer; a context manager. Leaving it after an error leaves nothing under the final name.
+
+    Attributes:
+        notices: What was hidden, emptied or changed, and why.
+        targets: Path of each garment's fine mesh.
+    """
+
+    def __init__(
+        self,
+        shot: Shot,
+        refinements: Sequence[Sequence[Refinement]],
+        out: Path,
+        *,
+        mode: str = "over",
+        velocities: bool = False,
+        provenance: Mapping[str, Any] | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Start the layer and author everything that does not move.
+
+        Args:
+            shot: The opened shot; never edited.
+            refinements: Per garment, coarse to fine; none keeps the cage.
+            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``.
+            mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
+            velocities: Whether to author velocities, by finite differences.
+            provenance: Further entries of the record in ``customLayerData["physgraph"]``.
+            overwrite: Whether an existing file may be replaced.
+
+        Raises:
+            UsageError: The mode is unknown, the file exists, or it is one that the shot is made of.
+            LayerError: The layer cannot be written.
+        """
+        if mode not in MODES:
+            raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
+        if len(refinements) != len(shot.scene.garments):
+            raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
+        _check_not_input(shot.stage, out)
+        self._shot, self._mode, self._time = shot, mode, -np.inf
+        self._rate = shot.stage.GetTimeCodesPerSecond() if velocities else None
+        self._open = True
+        self._record = dict(provenance or {})
+        self.notices: list[Notice] = []
+        self.targets: list[Sdf.Path] = []
+        self._tracks: list[PointTrack] = []
+        self._hints: list[ModelHints] = []
+        with ExitStack() as stack:
+            stack.enter_context(termination_raises())
+            self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
+            self._author_still(refinements)
+            self._cleanup = stack.pop_all()
+
+    def _author_still(self, refinements: Sequence[Sequence[Refinement]]) -> None:
+        """Author metadata and, per garment, what its topology decides."""
+        times = self._shot.scene.times
+        span = (times[0], times[-1]) if times else None
+        provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
+        for index, steps in enumerate(refinements):
+            self._author_garment(index, steps, span)
+        shot_path = provenance.relative_path(self._shot.path, self._stream.target.parent)
+        garments = [str(path) for path in self.targets]
+        record = {"shot": shot_path, "mode": self._mode, **self._record, "garments": garments}
+        provenance.author_record(self._stream.layer, record)
+
+    def _author_garment(self, index: int, steps: Sequence[Refinement], span: tuple[float, float] | None) -> None:
+        """Author one garment's defaults and start its track."""
+        stream, source = self._stream, self._shot.sources[index]
+        prim = self._shot.stage.GetPrimAtPath(source.path)
+        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
+        fine = FineMap(self._shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
+        self.notices += overs.open_instances(stream, source)
+        target = source.path
+        if self._mode == "sibling":
+            target = overs.make_sibling(stream, prim)
+        self.targets.append(target)
+        overs.author_topology(stream, target, prim, fine)
+        overs.author_unskinned(stream, target, prim, skinned=source.skinned)
+        self.notices += carry_primvars(stream, target, prim, fine, span=span)
+        self.notices += carry_subsets(stream, target, prim, fine, span=span)
+        self.notices += overs.author_rest_points(stream, target, prim, fine)
+        left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        rest = None if source.skinned or not source.times else _refined_default(prim, fine)
+        normals = VertexNormals(fine.fine, left_handed=left)
+        track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=self._rate)
+        self._tracks.append(track)
+        purpose = "render" if self._mode == "sibling" else UsdGeom.Imageable(prim).ComputePurpose()
+        self._hints.append(ModelHints(stream, self._shot.stage, source.path, purpose=purpose))
+
+    def write(self, time: float | None, points: Sequence[np.ndarray], *, changed: Sequence[bool] | None = None) -> None:
+        """Write one time code.
+
+        Args:
+            time: The stage's own time code, later than the last; None once, for a shot without samples.
+            points: Per garment, fine points [m], world space, shape (V_fine, 3).
+            changed: Per garment, False where the points are known to equal the last ones.
+
+        Raises:
+            LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
+        """
+        self._check_call(time, points)
+        if self._time == -np.inf:
+            self._author_values(time)
+        for index, track in enumerate(self._tracks):
+            different = True if changed is None else bool(changed[index])
+            track.write(time, points[index], self._shot.to_metres(index, time), changed=different)
+            self._hints[index].write(time, track.box)
+        self._time = np.inf if time is None else time
+
+    def _author_values(self, time: float | None) -> None:
+        """Leave the values used on the coarse prims."""
+        frame = self._shot.frame(time)
+        for source, garment, values in zip(self._shot.sources, self._shot.scene.garments, frame.garments, strict=True):
+            author_used_values(self._stream, source, garment, values)
+
+    def _check_call(self, time: float | None, points: Sequence[np.ndarray]) -> None:
+        """Refuse calls that would make a wrong layer."""
+        if not self._open:
+            raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
+        if self._time == np.inf or (time is not None and time <= self._time):
+            raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
+        if len(points) != len(self._tracks):
+            raise LayerError(f"{len(points)} arrays of points for {len(self._tracks)} garments")
+        for track, array in zip(self._tracks, points, strict=True):
+            track.check(array, time)
+
+    def close(self) -> Path:
+        """Finish, validate and move the layer to its final name.
+
+        Returns:
+            The layer's path.
+
+        Raises:
+            LayerError: The layer is invalid or cannot be written.
+        """
+        if self._time == -np.inf:
+            raise LayerError(f"no time code was written to {self._stream.target}")
+        for track in self._tracks:
+            track.finish()
+        self._stream.flush()
+        self._check_written()
+        path = self._stream.commit()
+        self._open = False
+        self._cleanup.close()
+        return path
+
+    def _check_written(self) -> None:
+        """Validate the first, middle and last sample of what was written."""
+        problems = check_layer(self._stream.layer, self._shot.stage.GetRootLayer(), samples=3)
+        errors = [problem for problem in problems if problem.severity == "error"]
+        if errors:
+            raise LayerError(f"the layer written is invalid ({len(errors)} problems); first: {errors[0]}")
+
+    def __enter__(self) -> LayerWriter:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close after success; after an error remove what was written."""
+        try:
+            if error is None and self._open:
+                self.close()
+        finally:
+            self._open = False
+            self._cleanup.close()
+
+
+def _check_not_input(stage: Usd.Stage, out: Path) -> None:
+    """Refuse to write over a file that the shot is composed from."""
+    target = out.resolve()
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and Path(layer.realPath).resolve() == target:
+            raise UsageError(f"{out} is part of the shot; the input is never edited, choose another name")
+
+
+def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:
+    """Authored default points, refined linearly, shape (V_fine, 3), float32; None where there are none that fit."""
+    value = UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default())
+    if value is None or len(value) != fine.cage.vertex_count:
+        return None
+    points = fine.interpolate(np.asarray(value, np.float32))
+    return points if np.isfinite(points).all() else None

@@ -1,0 +1,145 @@
+"""Small shots for the tests of written layers, and a refinement of them that needs no solver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
+
+from physgraph_usd.mesh.attributes import vertex_values
+from physgraph_usd.mesh.subdivide import Refinement, subdivide_times
+from physgraph_usd.usd.provenance import root_over
+from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.writer import LayerWriter
+
+COAT = "/World/rig/coat"
+TIMES = (1.0, 2.5, 4.0)
+
+
+def grid(columns: int = 4, rows: int = 3, *, quads: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points in the plane, counts and indices of a sheet that faces +Z."""
+    x, y = np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0))
+    points = np.stack([x, y, 0.1 * np.sin(x)], axis=-1).reshape(-1, 3)
+    ids = np.arange(points.shape[0]).reshape(rows + 1, columns + 1)
+    faces = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
+    if not quads:
+        faces = np.stack([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+    return points, np.full(len(faces), faces.shape[1], np.int32), faces.reshape(-1).astype(np.int32)
+
+
+def vec3(array: np.ndarray) -> Vt.Vec3fArray:
+    """Points for USD."""
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(array, np.float32))
+
+
+def make_shot(
+    path: Path,
+    *,
+    times: Sequence[float] = TIMES,
+    size: tuple[int, int] = (4, 3),
+    quads: bool = True,
+    matrix: Gf.Matrix4d | None = None,
+    metres: float = 0.01,
+    orientation: str = "rightHanded",
+    default: bool = True,
+) -> Usd.Stage:
+    """A coat under a moving rig, in memory of a new layer; saved, and returned for more edits."""
+    stage = Usd.Stage.CreateNew(str(path))
+    stage.SetTimeCodesPerSecond(30.0)
+    stage.SetFramesPerSecond(30.0)
+    UsdGeom.SetStageMetersPerUnit(stage, metres)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    world = UsdGeom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    rig = UsdGeom.Xform.Define(stage, "/World/rig")
+    operation = rig.AddTransformOp()
+    operation.Set(matrix or Gf.Matrix4d(1.0))
+    points, counts, indices = grid(*size, quads=quads)
+    if orientation == "leftHanded":
+        indices = indices.reshape(len(counts), -1)[:, ::-1].reshape(-1).copy()
+    mesh = UsdGeom.Mesh.Define(stage, COAT)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(counts))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(indices))
+    mesh.CreateOrientationAttr(orientation)
+    mesh.CreateDoubleSidedAttr(True)
+    if default:
+        mesh.CreatePointsAttr(vec3(points))
+        mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(vec3(points)))
+    for index, time in enumerate(times):
+        moved = points + np.array([0.0, 0.0, 0.25 * index])
+        mesh.CreatePointsAttr().Set(vec3(moved), time)
+        mesh.CreateExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(vec3(moved)), time)
+    if times:
+        stage.SetStartTimeCode(times[0])
+        stage.SetEndTimeCode(times[-1])
+    mesh.GetPrim().AddAppliedSchema("PhysGraphGarmentAPI")
+    stage.Save()
+    return stage
+
+
+def dress_up(stage: Usd.Stage) -> None:
+    """Give the coat everything that depends on topology: primvars of all kinds, subsets, stale opinions."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(COAT))
+    counts, vertices = len(mesh.GetFaceVertexCountsAttr().Get()), len(mesh.GetPointsAttr().Get())
+    corners = len(mesh.GetFaceVertexIndicesAttr().Get())
+    make, types = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar, Sdf.ValueTypeNames
+    make("heat", types.FloatArray, "vertex").Set(Vt.FloatArray.FromNumpy(np.arange(vertices, dtype=np.float32)))
+    indexed = make("tone", types.Color3fArray, "vertex")
+    indexed.Set(Vt.Vec3fArray([(1, 0, 0), (0, 0, 1)]))
+    indexed.SetIndices(Vt.IntArray.FromNumpy((np.arange(vertices) % 2).astype(np.int32)))
+    make("label", types.StringArray, "uniform").Set([f"f{face}" for face in range(counts)])
+    make("zone", types.IntArray, "varying").Set(Vt.IntArray.FromNumpy(np.arange(vertices, dtype=np.int32)))
+    make("pair", types.HalfArray, "vertex", 2).Set(Vt.HalfArray.FromNumpy(np.arange(2 * vertices, dtype=np.float16)))
+    make("tint", types.Color3fArray, "constant").Set([(0.5, 0.5, 0.5)])
+    uv = make("st", types.TexCoord2fArray, "faceVarying")
+    uv.Set(Vt.Vec2fArray.FromNumpy(np.random.default_rng(0).random((corners, 2), dtype=np.float32)))
+    uv.SetIndices(Vt.IntArray.FromNumpy(np.arange(corners, dtype=np.int32)))
+    make("physgraph:pin", types.FloatArray, "vertex").Set([0.0] * vertices)
+    wave = make("wave", types.FloatArray, "vertex")
+    for time in TIMES:
+        wave.Set(Vt.FloatArray.FromNumpy(np.full(vertices, time, np.float32)), time)
+    material = UsdShade.Material.Define(stage, "/World/Looks/red")
+    binding = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+    binding.Bind(material)
+    for name, faces in (("front", range(counts // 2)), ("back", range(counts // 2, counts))):
+        subset = binding.CreateMaterialBindSubset(name, list(faces))
+        UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
+    binding.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
+    mesh.CreateNormalsAttr([(0, 0, 1)] * vertices)
+    mesh.CreateVelocitiesAttr([(0, 0, 1)] * vertices)
+    mesh.CreateAccelerationsAttr([(0, 0, 1)] * vertices)
+    mesh.CreateCornerIndicesAttr([0])
+    mesh.CreateCornerSharpnessesAttr([10.0])
+    mesh.CreateCreaseIndicesAttr([0, 1])
+    mesh.CreateCreaseLengthsAttr([2])
+    mesh.CreateCreaseSharpnessesAttr([2.0])
+    stage.Save()
+
+
+def refine_all(shot: Shot) -> list[tuple[Refinement, ...]]:
+    """Refinements of every garment at its level."""
+    return [subdivide_times(garment.mesh, garment.level) for garment in shot.scene.garments]
+
+
+def fine_points(shot: Shot, refinements: Sequence[Sequence[Refinement]], time: float | None) -> list[np.ndarray]:
+    """Coarse points refined linearly, world metres."""
+    garments = shot.frame(time).garments
+    return [vertex_values(steps, garment.points) for steps, garment in zip(refinements, garments, strict=True)]
+
+
+def write_layer(path: Path, out: Path, *, level: int = 1, **options: object) -> Path:
+    """Refine a shot linearly into a layer."""
+    shot = open_shot(str(path), level=level)
+    refinements = refine_all(shot)
+    with LayerWriter(shot, refinements, out, **options) as writer:  # type: ignore[arg-type]
+        for time in shot.scene.times or (None,):
+            writer.write(time, fine_points(shot, refinements, time))
+    return out
+
+
+def open_over(path: Path, out: Path) -> Usd.Stage:
+    """The layer composed over its shot."""
+    shot = Sdf.Layer.FindOrOpen(str(path))
+    return Usd.Stage.Open(root_over(shot, [str(out), str(path)]))
