@@ -45,7 +45,7 @@ def build() -> PlainStage:
 def _wave(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
     """Simulate the coarse flag, shape (T, V, 3)."""
     pinned = np.flatnonzero(rest[:, 0] == 0.0)
-    options = DrapeOptions(spring=40.0, iterations=8, give=0.8, bend=1.5, drag=1.5, density=0.165)
+    options = DrapeOptions(spring=40.0, iterations=5, give=0.8, bend=0.9, drag=1.5, density=0.165)
     start = rest + 0.05 * np.sin(4.0 * rest[:, :1]) * [0.0, 0.0, 1.0]
     flag = Drape(rest, quads, pinned, options=options, start=start)
     hold = rest[pinned].copy()
@@ -63,7 +63,7 @@ def _wind(flag: Drape) -> np.ndarray:
     x, y = flag.points[:, 0], flag.points[:, 1]
     phase = 2 * np.pi * (1.1 * flag.time - 0.55 * x)
     swing = 0.55 * np.sin(phase + 1.2 * y) + 0.25 * np.sin(1.7 * phase - 2.0 * y + 1.0)
-    wind = 7.0 * np.stack([np.cos(swing), 0.12 + 0.0 * swing, np.sin(swing)], axis=1)
+    wind = 9.0 * np.stack([np.cos(swing), 0.12 + 0.0 * swing, np.sin(swing)], axis=1)
     normal = flag.normals()
     relative = wind - flag.velocity
     pressure = np.einsum("vk,vk->v", relative, normal)

@@ -12,10 +12,10 @@ from .grid import grid_uv, quad_grid
 SIDE, CELLS = 1.1, 36
 """Side of the cloth [m] and its quads along a side."""
 
-TABLE_RADIUS, ROUND, TABLE_HEIGHT, THICK = 0.30, 0.02, 0.55, 0.05
+TABLE_RADIUS, ROUND, TABLE_HEIGHT, THICK = 0.30, 0.02, 0.55, 0.16
 """Radius of the table, of its rounded edge, height and thickness of its top [m]."""
 
-FRAMES, SETTLE = 12, 80
+FRAMES, SETTLE = 12, 50
 
 
 def build() -> PlainStage:
@@ -42,23 +42,27 @@ def build() -> PlainStage:
         subsets=((Look("Stripe", (0.13, 0.20, 0.38)), border),),
         fabric=PRESETS["cotton"],
     )
-    return PlainStage("FrozenShot", "A draped cloth that does not move", (garment, _table()), np.arange(1.0, FRAMES + 1))
+    return PlainStage(
+        "FrozenShot", "A draped cloth that does not move", (garment, _table()), np.arange(1.0, FRAMES + 1)
+    )
 
 
 def _settle(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
     """Drop the cloth on the table and wait."""
-    options = DrapeOptions(step=1 / 30, spring=40.0, iterations=8, give=0.8, bend=0.6, drag=4.0, density=0.15)
+    options = DrapeOptions(step=1 / 30, spring=40.0, iterations=8, give=0.85, bend=0.15, drag=4.0, density=0.15)
     turned = np.radians(20.0)
     start = rest.copy()
-    start[:, 1] += 0.002 * np.cos(4.0 * np.arctan2(rest[:, 2], rest[:, 0]) + turned)
-    cloth = Drape(rest, quads, np.zeros(0, int), options=options, project=lambda x, _: _push_out(x), start=start)
+    radius = np.hypot(rest[:, 0], rest[:, 2])
+    start[:, 1] += 0.1 * (radius - TABLE_RADIUS).clip(0) * np.cos(6.0 * np.arctan2(rest[:, 2], rest[:, 0]) + turned)
+    top = np.flatnonzero(radius < TABLE_RADIUS - ROUND)
+    cloth = Drape(rest, quads, top, options=options, project=lambda x, _: _push_out(x), start=start)
     for _ in range(SETTLE):
-        cloth.step(np.zeros((0, 3)))
+        cloth.step(rest[top])
     return cloth.points
 
 
 def _push_out(points: np.ndarray) -> np.ndarray:
-    """Move points out of the table's top; those resting on it stick."""
+    """Move points out of the table's top; the part on top is held by its pins."""
     middle = TABLE_HEIGHT - 0.5 * THICK
     radius = np.hypot(points[:, 0], points[:, 2])
     outside = np.stack([radius - (TABLE_RADIUS - ROUND), np.abs(points[:, 1] - middle) - (0.5 * THICK - ROUND)], axis=1)
@@ -66,10 +70,7 @@ def _push_out(points: np.ndarray) -> np.ndarray:
     inside = distance < 0.0
     side = outside.clip(1e-9 * (outside >= outside.max(axis=1, keepdims=True)))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
-    direction = np.stack([points[:, 0] / np.maximum(radius, 1e-9), np.sign(points[:, 1] - middle)], axis=1) * side[:, :1]
-    push = np.zeros_like(points)
-    push[:, 0] = direction[:, 0]
-    push[:, 2] = points[:, 2] / np.maximum(radius, 1e-9) * side[:, 0]
+    push = points / np.maximum(radius, 1e-9)[:, None] * side[:, :1]
     push[:, 1] = np.sign(points[:, 1] - middle) * side[:, 1]
     return np.where(inside[:, None], points - distance[:, None] * push, points)
 

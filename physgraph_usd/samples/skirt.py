@@ -12,13 +12,22 @@ from .grid import ease, grid_uv, quad_grid
 ROWS, AROUND = 27, 62
 """Rows from waist to hem and columns around."""
 
-WAIST, HEM, LENGTH = (0.145, 0.115), 0.40, 0.52
+WAIST, HEM, LENGTH = (0.145, 0.115), 0.46, 0.52
 """Half axes of the waist, radius of the hem at rest and length down the side [m]."""
 
-FRAMES, WARM_UP, STEPS = 48, 20, 2
+FRAMES, WARM_UP, STEPS = 48, 40, 2
 
 PROFILE = np.array(
-    [[0.10, 0.118, 0.088], [0.04, 0.128, 0.098], [-0.02, 0.145, 0.113], [-0.09, 0.168, 0.130], [-0.16, 0.176, 0.136]]
+    [
+        [0.1225, 0.06, 0.045],
+        [0.118, 0.09, 0.067],
+        [0.11, 0.109, 0.081],
+        [0.10, 0.118, 0.088],
+        [0.04, 0.128, 0.098],
+        [-0.02, 0.145, 0.113],
+        [-0.09, 0.168, 0.130],
+        [-0.16, 0.176, 0.136],
+    ]
     + [[-0.24, 0.168, 0.120], [-0.32, 0.150, 0.100], [-0.38, 0.138, 0.090]]
 )
 """The hips: height, half axes across and deep [m]."""
@@ -72,8 +81,8 @@ def _split(quads: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _hips(time: float) -> np.ndarray:
     """The hips' matrix at a time [s]: a turn, a quick turn back, and a swing from side to side."""
-    turn = np.radians(75.0) * ease(time / 0.7) - np.radians(130.0) * ease((time - 0.8) / 0.9)
-    sway = 0.035 * np.sin(2 * np.pi * time / 1.4) * ease(time / 0.5)
+    turn = np.radians(60.0) * ease(time / 0.8) - np.radians(110.0) * ease((time - 0.85) / 1.0)
+    sway = 0.025 * np.sin(2 * np.pi * time / 1.4) * ease(time / 0.5)
     roll = 1.6 * sway
     c, s, p, q = np.cos(turn), np.sin(turn), np.cos(roll), np.sin(roll)
     yaw = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -85,21 +94,24 @@ def _hips(time: float) -> np.ndarray:
 
 def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
     """Simulate the coarse skirt, shape (T, V, 3)."""
-    options = DrapeOptions(spring=40.0, iterations=7, give=0.78, bend=1.0, drag=1.2, density=0.235)
+    options = DrapeOptions(spring=40.0, iterations=5, give=0.84, bend=0.3, drag=1.2, density=0.235)
     band = np.arange(2 * AROUND)
 
     def project(points: np.ndarray, time: float) -> np.ndarray:
-        return _push_out(points, _hips(time - WARM_UP / 24.0))
+        return _push_out(points, _hips(time - WARM_UP * options.step))
 
-    start = rest @ _hips(0.0)[:3, :3].T + _hips(0.0)[:3, 3]
+    fold = 1.0 - 0.12 * np.linspace(0, 1, ROWS).repeat(AROUND) * (1 + np.cos(8 * np.arctan2(rest[:, 2], rest[:, 0])))
+    start = (rest * np.stack([fold, np.ones_like(fold), fold], axis=1)) @ _hips(0.0)[:3, :3].T + _hips(0.0)[:3, 3]
     skirt = Drape(rest, quads, band, options=options, project=project, start=start)
+    for _ in range(WARM_UP):
+        skirt.step(start[band])
     frames = []
-    for _ in range(WARM_UP + FRAMES):
+    for _ in range(FRAMES):
         frames.append(skirt.points)
         for _ in range(STEPS):
-            pose = _hips(skirt.time + options.step - WARM_UP / 24.0)
+            pose = _hips(skirt.time + options.step - WARM_UP * options.step)
             skirt.step(rest[band] @ pose[:3, :3].T + pose[:3, 3])
-    return np.stack(frames[WARM_UP:])
+    return np.stack(frames)
 
 
 def _push_out(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -115,7 +127,7 @@ def _push_out(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 def _hip_mesh(poses: np.ndarray) -> PlainMesh:
     """The hips as a closed mesh of quads with triangle fans at both ends."""
     around, rows = 40, 30
-    height = np.linspace(PROFILE[0, 0], PROFILE[-1, 0], rows)
+    height = np.concatenate([[0.1225, 0.118, 0.11], np.linspace(0.10, PROFILE[-1, 0], rows - 3)])
     across = np.interp(-height, -PROFILE[:, 0], PROFILE[:, 1])
     deep = np.interp(-height, -PROFILE[:, 0], PROFILE[:, 2])
     a = 2 * np.pi * np.arange(around) / around
