@@ -49,7 +49,7 @@ class Refiner:
         for garment in scene.garments:
             _require_solvable(garment.path, garment.mesh.indices, garment.mesh.counts, garment.rest)
         chosen = levels if levels is not None else [garment.level for garment in scene.garments]
-        self.refinements: list[tuple[Refinement, ...]] = refine_garments(scene.garments, chosen)
+        self.refinements = self.subdivide(scene, chosen)
         self._settings = settings
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
         self._groups = [
@@ -58,6 +58,16 @@ class Refiner:
         ]
         self._kept: list[Carried | None] = [None] * len(self._groups)
         self._last: tuple[Frame, State] | None = None
+
+    @staticmethod
+    def subdivide(scene: Scene, levels: Sequence[int]) -> list[tuple[Refinement, ...]]:
+        """The refinements of each garment, without the solver."""
+        return refine_garments(scene.garments, levels)
+
+    def forget(self) -> None:
+        """Start the next frame cold."""
+        self._kept = [None] * len(self._groups)
+        self._last = None
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
         """Solve frames in order, one state a frame.

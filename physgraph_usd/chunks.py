@@ -1,0 +1,125 @@
+"""Splits a shot's time codes over processes, and hands the states back in order.
+
+Each process opens the shot for itself and begins a few frames before its chunk (the run-up), so that warm starts have settled
+when the chunk begins. Results travel as files in a temporary folder, so memory does not grow with the number of frames.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import shutil
+import tempfile
+import time as clock
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import SolveError
+
+RUN_UP = 6
+"""Frames solved before a chunk and thrown away, when frames depend on one another."""
+POLL_SECONDS = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of one time code.
+
+    Attributes:
+        time: The time code; None for a shot without samples.
+        points: Fine world positions [m] of each garment, or () when the solve failed.
+        reused: For each garment, True when it kept the previous frame's points.
+        record: Telemetry, or {"error": message}, ready for JSON.
+    """
+
+    time: float | None
+    points: tuple[np.ndarray, ...]
+    reused: tuple[bool, ...]
+    record: dict[str, object]
+
+
+Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
+"""Solves time codes in order; must be picklable to run in several processes."""
+
+
+def chunks_of(times: Sequence[float | None], workers: int) -> list[tuple[int, int]]:
+    """Contiguous index ranges of nearly equal length, at most one per worker."""
+    bounds = np.linspace(0, len(times), min(workers, max(len(times), 1)) + 1).round().astype(int)
+    return [(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b > a]
+
+
+def solve_in_chunks(
+    solver: Solver, times: Sequence[float | None], *, workers: int, run_up: int = RUN_UP
+) -> Iterator[Outcome]:
+    """Solve all time codes, in this process or in several, and yield them in order.
+
+    Args:
+        solver: Solves time codes in order.
+        times: The time codes.
+        workers: Number of processes; 1 solves in this one.
+        run_up: Frames solved before each later chunk.
+
+    Raises:
+        SolveError: A process died.
+    """
+    parts = chunks_of(times, workers)
+    if len(parts) < 2:
+        yield from solver(times)
+        return
+    folder = Path(tempfile.mkdtemp(prefix="physgraph-"))
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(len(parts), mp_context=context)
+    try:
+        futures = [
+            pool.submit(_solve_chunk, solver, list(times[max(0, a - run_up) : b]), a - max(0, a - run_up), folder, a)
+            for a, b in parts
+        ]
+        for (a, b), future in zip(parts, futures, strict=True):
+            for index in range(a, b):
+                yield _collect(folder / f"{index}.npz", times[index], future)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _solve_chunk(solver: Solver, times: list[float | None], skip: int, folder: Path, first: int) -> None:
+    """Solve a chunk in a process of its own and leave one file a frame."""
+    for position, outcome in enumerate(solver(times)):
+        if not folder.exists():
+            return
+        if position < skip:
+            continue
+        index = first + position - skip
+        partial = folder / f"{index}.part.npz"
+        arrays = {f"points{k}": points for k, points in enumerate(outcome.points)}
+        np.savez(partial, record=json.dumps(outcome.record), reused=np.array(outcome.reused, dtype=bool), **arrays)
+        partial.rename(folder / f"{index}.npz")
+
+
+def _collect(file: Path, time: float | None, future: Future[None]) -> Outcome:
+    """Wait for one frame's file, read it and remove it."""
+    while not file.exists():
+        if future.done():
+            _raise_if_dead(future)
+            if not file.exists():
+                raise SolveError(f"a worker ended without the result of time code {time}")
+        clock.sleep(POLL_SECONDS)
+    with np.load(file) as data:
+        count = sum(name.startswith("points") for name in data.files)
+        points = tuple(data[f"points{k}"] for k in range(count))
+        record = json.loads(str(data["record"]))
+        reused = tuple(bool(value) for value in data["reused"])
+    file.unlink()
+    return Outcome(time, points, reused, record)
+
+
+def _raise_if_dead(future: Future[None]) -> None:
+    try:
+        future.result()
+    except BrokenProcessPool as error:
+        raise SolveError("a worker process died, perhaps for lack of memory; use fewer --workers") from error

@@ -1,0 +1,64 @@
+"""The report of a run: what was modelled, what was left out and why, and how far each frame got."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+DONE, FAILED, IN_PART = 0, 1, 3
+
+
+@dataclass(eq=False)
+class RefineReport:
+    """What `refine_shot` did.
+
+    Attributes:
+        shot: Input file.
+        out: Layer written, or None after a dry run.
+        options: The options used.
+        garments: Per garment: path, counts, level and why, material values and their sources.
+        modelled: Terms of the potential that were on, with the reason.
+        left_out: What was left out, with the reason.
+        frames: Telemetry, one entry a time code.
+        failed: Time codes that have no sample in the layer, with the error.
+        warnings: What the user should know.
+        seconds: Wall time of each stage [s].
+        peak_memory_mb: Peak resident memory of this process [MB].
+    """
+
+    shot: str
+    out: Path | None
+    options: dict[str, Any]
+    garments: list[dict[str, Any]] = field(default_factory=list)
+    modelled: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    frames: list[dict[str, Any]] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    peak_memory_mb: float = 0.0
+
+    @property
+    def exit_code(self) -> int:
+        """0 done, 1 every frame failed, 3 done in part."""
+        if not self.failed:
+            return DONE
+        return FAILED if len(self.failed) == len(self.frames) else IN_PART
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as plain values."""
+        plain = {name: value for name, value in vars(self).items() if name != "out"}
+        return {"out": None if self.out is None else str(self.out), "exit_code": self.exit_code, **plain}
+
+    def to_json(self) -> str:
+        """The report as JSON."""
+        return json.dumps(self.to_dict(), indent=2, default=str)
+
+    def write(self, path: Path) -> None:
+        """Write the report as JSON, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".part")
+        partial.write_text(self.to_json() + "\n", encoding="utf-8")
+        partial.replace(path)
