@@ -16,7 +16,7 @@ from .usd.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
 STILL, LOOP = ".png", ".gif"
 """Formats by suffix."""
 
-LIGHT_VERTICES = 12_000
+LIGHT_VERTICES = 6_000
 """A mesh with fewer vertices is split for drawing, flat, so that its light is as fine as its neighbour's."""
 
 INK, FAINT = (38, 40, 44), (112, 114, 118)
@@ -111,8 +111,9 @@ def _frame(
         if not meshes:
             continue
         wanted = [mesh.points for mesh in meshes if mesh.path in panels[0].garments]
-        clouds += wanted or [mesh.points for mesh in meshes]
-        floor = min(floor, min(float(points[:, 1].min()) for points in clouds))
+        wanted = wanted or [mesh.points for mesh in meshes]
+        clouds += wanted + [_near(mesh.points, np.concatenate(wanted)) for mesh in meshes]
+        floor = min(floor, min(float(points[:, 1].min()) for points in clouds if len(points)))
     if not clouds:
         raise StageError("nothing to draw: the stage shows no mesh")
     points = np.concatenate(clouds)
@@ -121,15 +122,20 @@ def _frame(
     return fit_view(points, aspect, azimuth=camera[0], elevation=camera[1]), floor - drop
 
 
+def _near(points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The points in a box a little larger than what must be seen, so that a collider shows around its garment."""
+    low, high = wanted.min(axis=0), wanted.max(axis=0)
+    margin = 0.25 * float((high - low).max())
+    return points[((points > low - margin) & (points < high + margin)).all(axis=1)]
+
+
 def _extremes(panel: _Panel, codes: list[float | None]) -> list[float | None]:
     """The drawn time with some others, so that stills of one shot share their framing."""
     found = panel.stage.times(panel.garments)
     return codes + [found[i] for i in np.linspace(0, len(found) - 1, 5).astype(int)] if found else codes
 
 
-def _compose(
-    panels: list[_Panel], code: float | None, size: tuple[int, int], views: tuple[View, float]
-) -> Image.Image:
+def _compose(panels: list[_Panel], code: float | None, size: tuple[int, int], views: tuple[View, float]) -> Image.Image:
     """Draw all panels at one time and label them."""
     width = size[0] // len(panels)
     picture = Image.new("RGB", size, encode_color(tuple(BACKGROUND)))
@@ -198,5 +204,10 @@ def _save_loop(pictures: list[Image.Image], out: Path, rate: float, codes: list[
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     gap = float(np.median(np.diff([c for c in codes if c is not None]))) if len(codes) > 1 else 1.0
     frames[0].save(
-        out, save_all=True, append_images=frames[1:], duration=max(20, round(1000.0 * gap / rate)), loop=0, optimize=True
+        out,
+        save_all=True,
+        append_images=frames[1:],
+        duration=max(20, round(1000.0 * gap / rate)),
+        loop=0,
+        optimize=True,
     )

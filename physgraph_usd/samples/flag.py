@@ -6,14 +6,13 @@ import numpy as np
 
 from ..fabric import PRESETS
 from ..usd.plain import Look, PlainMesh, PlainStage
-from .drape import Drape, DrapeOptions
 from .grid import grid_uv, quad_grid
 
 ROWS, COLUMNS = 28, 42
 WIDTH, HEIGHT = 1.5, 1.0
 """Size of the flag [m]."""
 
-FRAMES, WARM_UP, STEPS = 48, 30, 2
+FRAMES = 48
 
 
 def build() -> PlainStage:
@@ -33,7 +32,7 @@ def build() -> PlainStage:
         indices=quads.ravel(),
         points=rest,
         look=Look("Red", (0.55, 0.07, 0.06)),
-        samples=_wave(rest, quads),
+        samples=_wave(),
         uv=grid_uv(ROWS, COLUMNS),
         subsets=((Look("White", (0.75, 0.73, 0.68)), faces),),
         pin=(u.ravel() == 0.0).astype(float),
@@ -42,29 +41,24 @@ def build() -> PlainStage:
     return PlainStage("FlagShot", "A flag in a gusty wind", (mesh,), np.arange(1.0, FRAMES + 1))
 
 
-def _wave(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
-    """Simulate the coarse flag, shape (T, V, 3)."""
-    pinned = np.flatnonzero(rest[:, 0] == 0.0)
-    options = DrapeOptions(spring=40.0, iterations=5, give=0.8, bend=0.9, drag=1.5, density=0.165)
-    start = rest + 0.05 * np.sin(4.0 * rest[:, :1]) * [0.0, 0.0, 1.0]
-    flag = Drape(rest, quads, pinned, options=options, start=start)
-    hold = rest[pinned].copy()
-    hold[:, 1] *= 0.88  # the two grommets were tied closer than the hoist is long
-    frames = []
-    for _ in range(WARM_UP + FRAMES):
-        for _ in range(STEPS):
-            flag.step(hold, force=_wind(flag))
-        frames.append(flag.points)
-    return np.stack(frames[WARM_UP:])
+def _wave() -> np.ndarray:
+    """The coarse flag, shape (T, V, 3): travelling waves that keep the length of a row but for some compression."""
+    u = np.linspace(0.0, 1.0, COLUMNS)[None, :]
+    v = np.linspace(-0.5, 0.5, ROWS)[:, None]
+    return np.stack([_pose(u, v, frame / 24.0) for frame in range(FRAMES)])
 
 
-def _wind(flag: Drape) -> np.ndarray:
-    """Pressure of the wind on each vertex [m/s^2], for a wind that swings about +X and travels along the flag."""
-    x, y = flag.points[:, 0], flag.points[:, 1]
-    phase = 2 * np.pi * (1.1 * flag.time - 0.55 * x)
-    swing = 0.55 * np.sin(phase + 1.2 * y) + 0.25 * np.sin(1.7 * phase - 2.0 * y + 1.0)
-    wind = 9.0 * np.stack([np.cos(swing), 0.12 + 0.0 * swing, np.sin(swing)], axis=1)
-    normal = flag.normals()
-    relative = wind - flag.velocity
-    pressure = np.einsum("vk,vk->v", relative, normal)
-    return 5.0 * pressure[:, None] * normal + 0.5 * relative
+def _pose(u: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
+    """One sample: integrate the direction of each row from the pole outwards."""
+    phase = 2 * np.pi * (1.45 * u - 1.0 * time + 0.22 * v)
+    gust = 1.0 + 0.25 * np.sin(2 * np.pi * 0.5 * time + 1.0)
+    lead = u * (2.0 - u)
+    angle = gust * lead * (0.95 * np.sin(phase) + 0.30 * np.sin(2.1 * phase + 4.0 * v + 1.0)) + 0.25
+    droop = 0.30 * u * (1.0 + 0.35 * np.sin(phase - 1.0)) + 0.10
+    short = 1.0 - 0.16 * np.exp(-(((v - 0.5 + 1.1 * u) / 0.35) ** 2)) - 0.05 * (1.0 + np.sin(phase + 2.0))
+    step = WIDTH / (COLUMNS - 1) * short
+    along = [step * np.cos(droop) * np.cos(angle), -step * np.sin(droop), step * np.cos(droop) * np.sin(angle)]
+    x, y, z = (np.cumsum(part, axis=1) - part[:, :1] for part in np.broadcast_arrays(*along))
+    height = HEIGHT * (1.0 - 0.12 * np.exp(-3.0 * u) - 0.06 * u * np.sin(phase) ** 2)
+    lean = 0.10 * u * np.sin(phase + 0.8)
+    return np.stack([x + 0.05 * v * u, y + v * height, z + lean * v], axis=-1).reshape(-1, 3)

@@ -78,14 +78,15 @@ def _push_out(points: np.ndarray) -> np.ndarray:
 def _table() -> PlainMesh:
     """The table's top and its leg, a lathed outline of quads."""
     turn = np.linspace(0.0, 0.5 * np.pi, 5)
-    top, low = TABLE_HEIGHT - ROUND, TABLE_HEIGHT - THICK + ROUND
-    rim = TABLE_RADIUS - ROUND
+    # drawn a little smaller than simulated, so that the coarse cloth's flat quads stay outside
+    height, rim = TABLE_HEIGHT - 0.006, TABLE_RADIUS - ROUND - 0.012
+    top, low = height - ROUND, height - 0.05 + ROUND
     outline = np.concatenate(
         [
-            np.stack([np.linspace(0.0, rim, 5)[1:-1], np.full(3, TABLE_HEIGHT)], axis=1),
+            np.stack([np.linspace(0.0, rim, 5)[1:-1], np.full(3, height)], axis=1),
             np.stack([rim + ROUND * np.sin(turn), top + ROUND * np.cos(turn)], axis=1),
             np.stack([rim + ROUND * np.cos(turn), low - ROUND * np.sin(turn)], axis=1),
-            [[0.05, TABLE_HEIGHT - THICK], [0.04, 0.30], [0.045, 0.06], [0.19, 0.03], [0.20, 0.0]],
+            [[0.05, height - 0.05], [0.04, 0.30], [0.045, 0.06], [0.19, 0.03], [0.20, 0.0]],
         ]
     )
     around = 48
@@ -94,7 +95,7 @@ def _table() -> PlainMesh:
         np.broadcast_arrays(outline[:, :1] * np.cos(a), outline[:, 1:], outline[:, :1] * np.sin(a)), axis=-1
     ).reshape(-1, 3)
     quads = quad_grid(len(outline), around, closed=True)[:, ::-1]
-    cap = np.array([[0.0, TABLE_HEIGHT, 0.0]])
+    cap = np.array([[0.0, height, 0.0]])
     fan = np.stack([np.full(around, len(points)), (np.arange(around) + 1) % around, np.arange(around)], axis=1)
     return PlainMesh(
         name="Table",

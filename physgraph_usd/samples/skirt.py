@@ -9,10 +9,10 @@ from ..usd.plain import Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
 from .grid import ease, grid_uv, quad_grid
 
-ROWS, AROUND = 27, 62
-"""Rows from waist to hem and columns around."""
+ROWS, AROUND, FOLDS = 23, 76, 8
+"""Rows from waist to hem, columns around, and folds at the hem."""
 
-WAIST, HEM, LENGTH = (0.145, 0.115), 0.46, 0.52
+WAIST, HEM, LENGTH = (0.145, 0.115), 0.36, 0.52
 """Half axes of the waist, radius of the hem at rest and length down the side [m]."""
 
 FRAMES, WARM_UP, STEPS = 48, 40, 2
@@ -60,13 +60,15 @@ def build() -> PlainStage:
 
 
 def _rest() -> np.ndarray:
-    """The skirt as cut, flared from the waist, row by row."""
+    """The skirt hanging in soft folds that open towards the hem, row by row."""
     v, a = np.meshgrid(np.linspace(0, 1, ROWS), 2 * np.pi * np.arange(AROUND) / AROUND, indexing="ij")
     v, a = v.ravel(), a.ravel()
-    across = WAIST[0] + (HEM - WAIST[0]) * v
-    deep = WAIST[1] + (HEM - WAIST[1]) * v
-    drop = np.sqrt(LENGTH**2 - (HEM - WAIST[0]) ** 2)
-    return np.stack([across * np.cos(a), 0.02 - drop * v, deep * np.sin(a)], axis=1)
+    fold = 1.0 + 0.15 * v**1.6 * np.cos(FOLDS * a + 0.6 * np.sin(2 * a) + 0.4 * np.sin(3 * a + 1.0))
+    across = (WAIST[0] + (HEM - WAIST[0]) * v) * fold
+    deep = (WAIST[1] + (HEM - WAIST[1]) * v) * fold
+    out = np.hypot((across - WAIST[0]) * np.cos(a), (deep - WAIST[1]) * np.sin(a))
+    drop = np.sqrt((LENGTH * v) ** 2 - out**2)  # every line from waist to hem has the same length
+    return np.stack([across * np.cos(a), 0.02 - drop, deep * np.sin(a)], axis=1)
 
 
 def _split(quads: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +83,7 @@ def _split(quads: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _hips(time: float) -> np.ndarray:
     """The hips' matrix at a time [s]: a turn, a quick turn back, and a swing from side to side."""
-    turn = np.radians(60.0) * ease(time / 0.8) - np.radians(110.0) * ease((time - 0.85) / 1.0)
+    turn = np.radians(55.0) * ease(time / 0.8) - np.radians(90.0) * ease((time - 0.85) / 1.15)
     sway = 0.025 * np.sin(2 * np.pi * time / 1.4) * ease(time / 0.5)
     roll = 1.6 * sway
     c, s, p, q = np.cos(turn), np.sin(turn), np.cos(roll), np.sin(roll)
@@ -94,14 +96,13 @@ def _hips(time: float) -> np.ndarray:
 
 def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
     """Simulate the coarse skirt, shape (T, V, 3)."""
-    options = DrapeOptions(spring=40.0, iterations=5, give=0.84, bend=0.3, drag=1.2, density=0.235)
+    options = DrapeOptions(spring=40.0, iterations=5, give=0.84, bend=0.12, drag=1.2, density=0.235)
     band = np.arange(2 * AROUND)
 
     def project(points: np.ndarray, time: float) -> np.ndarray:
         return _push_out(points, _hips(time - WARM_UP * options.step))
 
-    fold = 1.0 - 0.12 * np.linspace(0, 1, ROWS).repeat(AROUND) * (1 + np.cos(8 * np.arctan2(rest[:, 2], rest[:, 0])))
-    start = (rest * np.stack([fold, np.ones_like(fold), fold], axis=1)) @ _hips(0.0)[:3, :3].T + _hips(0.0)[:3, 3]
+    start = rest @ _hips(0.0)[:3, :3].T + _hips(0.0)[:3, 3]
     skirt = Drape(rest, quads, band, options=options, project=project, start=start)
     for _ in range(WARM_UP):
         skirt.step(start[band])
