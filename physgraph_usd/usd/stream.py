@@ -12,7 +12,7 @@ from typing import Any
 
 from pxr import Sdf, Tf
 
-from ..errors import LayerError
+from ..errors import LayerError, UsageError
 from .atomic import prepare_target, publish, temporary_path
 
 FLUSH_BYTES = 16_000_000
@@ -34,11 +34,11 @@ class LayerStream:
             overwrite: Whether an existing file may be replaced, at `commit`.
 
         Raises:
-            UsageError: The target exists and may not be replaced.
-            LayerError: The extension is not a layer's, or the folder cannot be written.
+            UsageError: The extension is not a layer's, or the target exists and may not be replaced.
+            LayerError: The folder cannot be written.
         """
         if target.suffix not in {".usdc", ".usda", ".usd"}:
-            raise LayerError(f"cannot write {target}: the extension must be .usdc, .usda or .usd")
+            raise UsageError(f"cannot write {target}: the extension must be .usdc, .usda or .usd")
         prepare_target(target, overwrite=overwrite)
         self.target = target
         self.temporary = temporary_path(target)

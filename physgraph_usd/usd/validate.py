@@ -140,7 +140,8 @@ def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
     if not hasattr(UsdValidation, "ValidationContext"):
         return []
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    before = _findings(UsdValidation, validators, Usd.Stage.Open(shot))
+    # Both under an anonymous root, whose name the messages repeat and `_without_names` drops.
+    before = _findings(UsdValidation, validators, Usd.Stage.Open(root_over(shot, [shot.identifier])))
     composed = Usd.Stage.Open(root_over(shot, [layer.identifier, shot.identifier]))
     after = _findings(UsdValidation, validators, composed)
     return [problem for key, problem in after.items() if key not in before]

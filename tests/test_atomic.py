@@ -1,0 +1,202 @@
+"""Files that are complete or not there."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layers import vec3
+from pxr import Sdf
+
+from physgraph_usd.errors import LayerError, UsageError
+from physgraph_usd.usd.atomic import remove_stale, temporary_path
+from physgraph_usd.usd.stream import LayerStream
+
+POINTS = Sdf.Path("/World/coat.points")
+
+
+def fill(stream: LayerStream, frames: int, *, vertices: int = 10) -> None:
+    stream.attribute(POINTS, Sdf.ValueTypeNames.Point3fArray)
+    for frame in range(frames):
+        stream.set(POINTS, vec3(np.full((vertices, 3), float(frame))), time=float(frame))
+
+
+def interrupt(target: Path) -> None:
+    """Write a little and be stopped by the user."""
+    with LayerStream(target, overwrite=True) as stream:
+        fill(stream, 3)
+        stream.flush()
+        raise KeyboardInterrupt
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usd"])
+def test_a_committed_layer_is_whole(tmp_path: Path, suffix: str) -> None:
+    target = tmp_path / f"out{suffix}"
+    with LayerStream(target) as stream:
+        fill(stream, 3)
+        assert not target.exists()
+        stream.commit()
+    assert names(tmp_path) == [target.name]
+    assert list(Sdf.Layer.OpenAsAnonymous(str(target)).ListTimeSamplesForPath(POINTS)) == [0.0, 1.0, 2.0]
+
+
+def test_an_error_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        interrupt(tmp_path / "out.usdc")
+    assert names(tmp_path) == []
+
+
+def test_an_error_keeps_the_file_that_was_there(tmp_path: Path) -> None:
+    target = tmp_path / "out.usdc"
+    target.write_text("old")
+    with pytest.raises(UsageError, match="exists"):
+        LayerStream(target)
+    with pytest.raises(KeyboardInterrupt):
+        interrupt(target)
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["out.usdc"]
+
+
+def test_a_closed_layer_takes_nothing_more(tmp_path: Path) -> None:
+    with LayerStream(tmp_path / "out.usdc") as stream:
+        fill(stream, 1)
+        stream.commit()
+    with pytest.raises(LayerError, match="is closed"):
+        fill(stream, 1)
+
+
+def test_folders_and_strange_names_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder.usdc").mkdir()
+    with pytest.raises(UsageError, match="is a folder"):
+        LayerStream(tmp_path / "folder.usdc")
+    with pytest.raises(UsageError, match=r"\.usdc, \.usda or \.usd"):
+        LayerStream(tmp_path / "out.abc")
+
+
+def test_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
+    target = tmp_path / "out.usdc"
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    stale = tmp_path / f"out.usdc.{int(dead.stdout)}.tmp.usdc"
+    alive = tmp_path / f"out.usdc.{os.getppid()}.tmp.usdc"
+    other = tmp_path / f"shot.usdc.{int(dead.stdout)}.tmp.usdc"
+    for path in (stale, alive, other):
+        path.write_text("x")
+    assert remove_stale(target) == [stale]
+    assert names(tmp_path) == sorted([alive.name, other.name])
+    assert temporary_path(target).parent == tmp_path
+
+
+WRITE = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from pxr import Sdf, Vt
+from physgraph_usd.usd.atomic import termination_raises
+from physgraph_usd.usd.stream import LayerStream
+points = Sdf.Path("/World/coat.points")
+with termination_raises(), LayerStream(Path(sys.argv[1]), overwrite=True) as stream:
+    stream.attribute(points, Sdf.ValueTypeNames.Point3fArray)
+    for frame in range(100000):
+        stream.set(points, Vt.Vec3fArray.FromNumpy(np.full((1000, 3), frame, np.float32)), time=float(frame))
+        stream.flush()
+        if frame == 3:
+            sys.stdout.write("ready\\n")
+            sys.stdout.flush()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path, number: signal.Signals) -> None:
+    target = tmp_path / "out.usdc"
+    process = subprocess.Popen(
+        [sys.executable, "-c", WRITE, str(target)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd=Path(__file__).resolve().parents[1],
+    )
+    with process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(0.05)
+        process.send_signal(number)
+        process.wait(timeout=30)
+    left = names(tmp_path)
+    assert target.name not in left
+    if number is not signal.SIGKILL:
+        assert left == []
+    with LayerStream(target) as stream:
+        fill(stream, 2)
+        stream.commit()
+    assert names(tmp_path) == ["out.usdc"]
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from pxr import Sdf, Vt
+from physgraph_usd.errors import LayerError
+from physgraph_usd.usd.stream import LayerStream
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+points = Sdf.Path("/World/coat.points")
+try:
+    with LayerStream(Path(sys.argv[1])) as stream:
+        stream.attribute(points, Sdf.ValueTypeNames.Point3fArray)
+        for frame in range(100):
+            stream.set(points, Vt.Vec3fArray.FromNumpy(np.full((1000, 3), frame, np.float32)), time=float(frame))
+        stream.commit()
+except LayerError as error:
+    sys.stdout.write(str(error))
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX")
+@pytest.mark.parametrize("suffix", [".usdc", ".usda"])
+def test_a_full_disk_is_a_clear_error(tmp_path: Path, suffix: str) -> None:
+    target = tmp_path / f"out{suffix}"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(target)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=Path(__file__).resolve().parents[1],
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"cannot write {target}" in done.stdout
+    assert "File too large" in done.stdout
+    assert "\n" not in done.stdout
+    assert names(tmp_path) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="mounting a small disk needs root")
+def test_a_full_file_system_is_a_clear_error(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)], check=False)
+    if mounted.returncode:
+        pytest.skip("this system mounts no tmpfs")
+    try:
+        with pytest.raises(LayerError, match="No space left on device"):
+            overflow(disk / "out.usdc")
+        assert names(disk) == []
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def overflow(target: Path) -> None:
+    """Write more than a small disk holds."""
+    with LayerStream(target) as stream:
+        fill(stream, 100, vertices=1000)
+        stream.commit()
