@@ -17,7 +17,8 @@ from .forces.base import Force, ForceModule
 from .forces.bending import Bending
 from .forces.gravity import Gravity
 from .forces.guide import Guide, GuideMap
-from .forces.stretch import PAPER_SPRING, Stretch, garment_area
+from .forces.membrane import in_plane_terms
+from .forces.stretch import PAPER_SPRING, garment_area
 from .forces.tether import Tether
 from .integrate import Method
 from .integrate.base import System
@@ -168,7 +169,7 @@ class Group:
         if potential == "paper":
             relative = PAPER_SPRING / 3.0 * float(level.rest_length.square().mean() / garment_area(level).mean())
         elastic: tuple[Force, ...] = (
-            Stretch(level, each("stretch"), potential=potential),
+            *in_plane_terms(level, [frame.fabric for frame in frames], potential=potential),
             Bending(level, each("bend"), potential=potential),
             Gravity(level, each("density"), self._gravity, potential=potential),
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -42,8 +43,12 @@ class Level:
         rest_angle: [rad], shape (H,).
         vertex_area: A third of the incident triangles' areas [m^2], shape (V,).
         spacing: Mean rest length of the incident edges [m], shape (V,).
-        edge_garment, hinge_garment, vertex_garment: Garment number of each element.
+        triangle_area: Rest area [m^2], shape (T,).
+        triangle_inverse: Inverse of the rest sides in the material's axes [1/m], rows (a, b, c, d) of [[a, b], [c, d]],
+            shape (T, 4); zero where a triangle has no area.
+        edge_garment, hinge_garment, vertex_garment, triangle_garment: Garment number of each element.
         stretch_scale: Painted multiplier, shape (E,).
+        triangle_scale: The same multiplier for triangles, shape (T,).
         bend_scale: Painted multiplier, shape (H,).
         pin: Painted pin weight, shape (V,); fixed where it is 1.
         from_coarse: Linear map from the cage, shape (V, C).
@@ -64,10 +69,14 @@ class Level:
     rest_angle: Float[Tensor, " hinges"]
     vertex_area: Float[Tensor, " vertices"]
     spacing: Float[Tensor, " vertices"]
+    triangle_area: Float[Tensor, " triangles"]
+    triangle_inverse: Float[Tensor, "triangles 4"]
     edge_garment: Int[Tensor, " edges"]
     hinge_garment: Int[Tensor, " hinges"]
     vertex_garment: Int[Tensor, " vertices"]
+    triangle_garment: Int[Tensor, " triangles"]
     stretch_scale: Float[Tensor, " edges"]
+    triangle_scale: Float[Tensor, " triangles"]
     bend_scale: Float[Tensor, " hinges"]
     pin: Float[Tensor, " vertices"]
     from_coarse: sp.csr_matrix
@@ -213,6 +222,7 @@ def _join(
     triangles, edges, hinges = stack("triangles"), stack("edges"), stack("hinges")
     bent = np.repeat([part.bent_rest for part in parts], [len(part.hinges) for part in parts])
     shape = rest_shape(rest, triangles, edges, hinges, bent=bent)
+    triangle_area, triangle_inverse = triangle_shape(rest, triangles)
 
     def real(array: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
@@ -222,16 +232,20 @@ def _join(
 
     return Level(
         index=index,
-        spans=tuple(slice(int(a), int(b)) for a, b in zip(starts[:-1], starts[1:], strict=True)),
+        spans=tuple(slice(int(a), int(b)) for a, b in pairwise(starts)),
         rest=real(rest),
         triangles=whole(triangles),
         edges=whole(edges),
         hinges=whole(hinges),
         **{name: real(value) for name, value in shape.items()},
+        triangle_area=real(triangle_area),
+        triangle_inverse=real(triangle_inverse),
         edge_garment=whole(owner("edges")),
         hinge_garment=whole(owner("hinges")),
         vertex_garment=whole(np.repeat(np.arange(len(parts)), counts)),
+        triangle_garment=whole(owner("triangles")),
         stretch_scale=real(values("stretch_scale")[edges].mean(axis=1)),
+        triangle_scale=real(values("stretch_scale")[triangles].mean(axis=1)),
         bend_scale=real(values("bend_scale")[hinges[:, :2]].mean(axis=1)),
         pin=real(values("pin")),
         from_coarse=sp.csr_matrix(sp.block_diag([part.linear for part in parts])),
@@ -280,6 +294,36 @@ def rest_shape(
         "vertex_area": vertex_area,
         "spacing": np.where(spacing > 0, spacing, fallback),
     }
+
+
+def triangle_shape(rest: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Area of each triangle and its sides' inverse in the material's axes.
+
+    The first material axis of a triangle is the rest frame's axis that lies most nearly in its plane, projected into
+    it; the second is a quarter turn further. A membrane with equal stiffness along both axes is the same after a
+    quarter turn, so wherever the cloth is tangent to a rest axis, neighbours agree whichever of the axes they take.
+
+    Args:
+        rest: Rest positions [m], shape (V, 3), float64.
+        triangles: Shape (T, 3).
+
+    Returns:
+        Areas [m^2], shape (T,), and the rows of the inverse [1/m], shape (T, 4), zero where there is no area.
+    """
+    corners = rest[triangles]
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(first, second)
+    double = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.maximum(double, np.finfo(float).tiny)
+    warp = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    warp = warp - normal * np.einsum("tc,tc->t", warp, normal)[:, None]
+    warp /= np.linalg.norm(warp, axis=1, keepdims=True)
+    weft = np.cross(normal, warp)
+    a, b, c, d = (np.einsum("tc,tc->t", s, axis) for axis in (warp, weft) for s in (first, second))
+    sides = (first**2).sum(axis=1, keepdims=True) + (second**2).sum(axis=1, keepdims=True)
+    whole = double > 1e-12 * sides
+    adjugate = np.stack([d, -b, -c, a], axis=1)
+    return 0.5 * double[:, 0], np.where(whole, adjugate / np.where(whole, double, 1.0), 0.0)
 
 
 def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -289,7 +289,9 @@ def _begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
                 "path": garment.path,
                 "points": garment.mesh.vertex_count,
                 "faces": len(garment.mesh.counts),
-                "size_m": [round(float(v), 4) for v in np.ptp(garment.rest, axis=0)] if len(garment.rest) else [0, 0, 0],
+                "size_m": [round(float(v), 4) for v in np.ptp(garment.rest, axis=0)]
+                if len(garment.rest)
+                else [0, 0, 0],
                 "samples": len(source.times),
                 "level": choice.level,
                 "level_reason": choice.reason,
@@ -299,7 +301,7 @@ def _begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
             }
         )
     report.modelled = {
-        "stretch": "edge springs",
+        **_in_plane(report),
         "bending": "dihedral angles, " + ("rest shape" if any(g.bent_rest for g in opened.scene.garments) else "flat"),
         "gravity": f"{np.linalg.norm(opened.scene.gravity):.3g} m/s^2",
         "guide": "ties the local average to the coarse animation",
@@ -311,11 +313,18 @@ def _begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
         "self contact": "not in this version",
         "network": "not in this version; quasi-Newton integrates",
     }
-    shear = [g["path"] for g in report.garments if g["fabric"]["shear"] is not None]
-    if shear:
-        report.left_out["shear"] = f"shear stiffness on {', '.join(shear)} is ignored: edge springs imply 0.375 Y"
+    if "membrane" not in report.modelled:
+        report.left_out["triangle membrane"] = "no garment authors shear stiffness: edge springs have G = 0.375 Y"
     report.warnings += [str(notice) for notice in opened.warnings]
     return report
+
+
+def _in_plane(report: RefineReport) -> dict[str, str]:
+    """Which garments are sheets of edge springs, and which of triangles because shear stiffness is authored."""
+    springs = [g["path"] for g in report.garments if g["fabric"]["shear"] is None]
+    triangles = [g["path"] for g in report.garments if g["fabric"]["shear"] is not None]
+    modelled = {"stretch": "edge springs" + (f" for {', '.join(springs)}" if triangles else "")} if springs else {}
+    return modelled | ({"membrane": f"triangle membrane for {', '.join(triangles)}"} if triangles else {})
 
 
 def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:

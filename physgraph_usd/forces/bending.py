@@ -10,19 +10,21 @@
 | l0^2 / (A1 + A2) | ``level.hinge_shape`` | clamped on slivers |
 | k_b | 3.46 D | the paper's constant [N m] for the same D on an equilateral lattice (docs/fabrics.md) |
 
-theta lies in (-pi, pi]; with theta0 = 0 the energy stays continuous through a full fold, its force changes sign there.
+theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is continuous wherever a hinge turns: a hem
+pressed to theta0 = 3 may pass pi. Its force changes sign half a turn from theta0.
 Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -59,7 +61,12 @@ def _bending(
     s1 = wp.max(wp.dot(n1, n1), floor)
     s2 = wp.max(wp.dot(n2, n2), floor)
     theta = wp.atan2(wp.dot(wp.cross(n1, n2), axis) / length, wp.dot(n1, n2))
+    half_turn = weight.dtype(math.pi)
     bent = theta - rest_angle[h]
+    if bent > half_turn:
+        bent = bent - half_turn - half_turn
+    if bent < -half_turn:
+        bent = bent + half_turn + half_turn
     energy[h] = weight.dtype(0.5) * weight[h] * bent * bent
     moment = weight[h] * bent * length
     at_k = n1 * (moment / s1)
@@ -129,9 +136,7 @@ class Bending:
         return sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
 
 
-def hinge_jacobian(
-    x: Float[Tensor, "vertices 3"], hinges: Float[Tensor, "hinges 4"]
-) -> Float[Tensor, "hinges 4 3"]:
+def hinge_jacobian(x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges 4"]) -> Float[Tensor, "hinges 4 3"]:
     """dtheta/dx at the four corners of each hinge [1/m]; zero rows where a triangle has no area."""
     xi, xj, xk, xl = (x[hinges[:, corner].long()] for corner in range(4))
     axis, ik, il = xj - xi, xk - xi, xl - xi
