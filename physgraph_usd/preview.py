@@ -105,7 +105,7 @@ def _frame(
 ) -> tuple[View, float]:
     """One view for every panel and time, and the height of the ground."""
     spread = codes if len(codes) > 1 else _extremes(panels[0], codes)
-    clouds, floor = [], np.inf
+    clouds: list[np.ndarray] = []
     for code in spread:
         meshes = panels[0].stage.meshes(code)
         if not meshes:
@@ -113,10 +113,10 @@ def _frame(
         wanted = [mesh.points for mesh in meshes if mesh.path in panels[0].garments]
         wanted = wanted or [mesh.points for mesh in meshes]
         clouds += wanted + [_near(mesh.points, np.concatenate(wanted)) for mesh in meshes]
-        floor = min(floor, min(float(points[:, 1].min()) for points in clouds if len(points)))
     if not clouds:
         raise StageError("nothing to draw: the stage shows no mesh")
     points = np.concatenate(clouds)
+    floor = float(points[:, 1].min())
     aspect = size[0] / len(panels) / size[1]
     drop = 0.03 * float(np.ptp(points, axis=0).max())
     return fit_view(points, aspect, azimuth=camera[0], elevation=camera[1]), floor - drop
@@ -148,7 +148,8 @@ def _compose(panels: list[_Panel], code: float | None, size: tuple[int, int], vi
         shown = [mesh for mesh in meshes if mesh.path in panel.garments] or meshes
         _label(pen, panel.title, shown, (i * width, size[1]))
     if code is not None:
-        _write(pen, f"{code:g}", (size[0] - size[1] // 36, size[1] - size[1] // 24), size[1] // 40, FAINT, "rs")
+        place = (size[0] - size[1] // 36, size[1] - size[1] // 24)
+        pen.text(place, f"{code:g}", FAINT, ImageFont.load_default(max(size[1] // 40, 8)), anchor="rs")
     return picture
 
 
@@ -182,16 +183,11 @@ def _label(pen: ImageDraw.ImageDraw, title: str, meshes: list[DrawnMesh], corner
     unit = corner[1] // 36
     count = sum(len(mesh.points) for mesh in meshes)
     if title:
-        _write(pen, title, (corner[0] + unit, 2 * unit), int(1.25 * unit), INK, "ls")
+        font = ImageFont.load_default(max(int(1.25 * unit), 9))
+        pen.text((corner[0] + unit, 2 * unit), title, INK, font, anchor="ls")
     below = int((3.3 if title else 2.0) * unit)
-    _write(pen, f"{count:,} vertices", (corner[0] + unit, below), int(0.9 * unit), FAINT, "ls")
-
-
-def _write(
-    pen: ImageDraw.ImageDraw, text: str, place: tuple[int, int], height: int, color: tuple[int, int, int], anchor: str
-) -> None:
-    """Write one line of text."""
-    pen.text(place, text, fill=color, font=ImageFont.load_default(max(height, 8)), anchor=anchor)
+    font = ImageFont.load_default(max(int(0.9 * unit), 8))
+    pen.text((corner[0] + unit, below), f"{count:,} vertices", FAINT, font, anchor="ls")
 
 
 def _save_loop(pictures: list[Image.Image], out: Path, rate: float, codes: list[float | None]) -> None:

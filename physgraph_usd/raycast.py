@@ -19,10 +19,10 @@ KEY = np.array([-0.62, 0.62, 0.48])
 BACKGROUND = np.array([0.80, 0.80, 0.79])
 """Linear colour of the studio."""
 
-AMBIENT_RAYS, KEY_RAYS, RAY_BUDGET = 96, 24, 6_000_000
+AMBIENT_RAYS, KEY_RAYS, RAY_BUDGET = 72, 20, 5_000_000
 """Rays per vertex for each light, and how many to spend on a picture at most."""
 
-GROUND_CELLS = 110
+GROUND_CELLS = 84
 """The ground gathers light at a square grid with this many cells a side."""
 
 
@@ -104,15 +104,13 @@ def draw(surfaces: list[Surface], view: View, *, size: tuple[int, int], floor: f
     Returns:
         sRGB picture, shape (height, width, 3) uint8.
     """
-    width, height = size[0] * samples, size[1] * samples
-    directions = _directions(view, width, height)
-    picture = np.broadcast_to(BACKGROUND, (height * width, 3)).astype(np.float32)
-    world = _World(surfaces, view) if surfaces else None
-    if world is not None:
-        _draw_ground(picture, directions, view, world, floor)
-        _draw_surfaces(picture, directions, view, world, 2.0 * view.tangent / height * samples)
-    mean = picture.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3))
-    return _encode(mean)
+    picture = np.broadcast_to(BACKGROUND.astype(np.float32), (size[1], size[0], 3)).copy()
+    if surfaces:
+        world = _World(surfaces, view)
+        if view.eye[1] > floor:
+            _draw_ground(picture, view, world, floor)
+        _draw_surfaces(picture, view, world, samples)
+    return _encode(picture)
 
 
 def encode_color(color: tuple[float, float, float]) -> tuple[int, int, int]:
@@ -163,12 +161,12 @@ class _World:
         return (hits < 0).astype(np.float32)
 
 
-def _draw_ground(picture: np.ndarray, directions: np.ndarray, view: View, world: _World, floor: float) -> None:
+def _draw_ground(picture: np.ndarray, view: View, world: _World, floor: float) -> None:
     """Darken the studio where the ground is shadowed."""
-    down = directions[:, 1] < -1e-4
+    height, width = picture.shape[:2]
+    directions = _directions(view, (width, height), (0, 0, width, height), 1)
+    down = np.flatnonzero(directions[:, 1] < -1e-4)
     travel = (floor - view.eye[1]) / directions[down, 1]
-    if view.eye[1] <= floor:
-        return
     spot = view.eye[[0, 2]] + travel[:, None] * directions[down][:, [0, 2]]
     low, high = world.points.min(axis=0)[[0, 2]], world.points.max(axis=0)[[0, 2]]
     centre, half = 0.5 * (low + high), 1.1 * max(float(np.max(high - low)), 0.6 * world.size)
@@ -179,19 +177,33 @@ def _draw_ground(picture: np.ndarray, directions: np.ndarray, view: View, world:
     shade = (0.62 * light.ambient + 0.38 * light.key).reshape(x.shape)
     fade = np.clip(2.6 * (1.0 - np.sqrt(x * x + z * z) / half), 0.0, 1.0)
     shade = 1.0 + fade * fade * (3 - 2 * fade) * (0.30 + 0.70 * shade - 1.0)
-    picture[down] *= _bilinear(shade, (spot - centre + half) / (2 * half) * GROUND_CELLS)[:, None]
+    at = (spot - centre + half) / (2 * half) * GROUND_CELLS
+    picture.reshape(-1, 3)[down] *= _bilinear(shade, at)[:, None]
 
 
-def _draw_surfaces(picture: np.ndarray, directions: np.ndarray, view: View, world: _World, pixel: float) -> None:
-    """Shade the samples whose rays meet a surface; ``pixel`` is a pixel's size at distance 1."""
+def _draw_surfaces(picture: np.ndarray, view: View, world: _World, samples: int) -> None:
+    """Shade the samples whose rays meet a surface, over what is already drawn."""
+    height, width = picture.shape[:2]
+    box = _covered(view, world.points, (width, height))
+    left, top, right, bottom = box
+    if right <= left or bottom <= top:
+        return
+    directions = _directions(view, (width, height), box, samples)
     origins = np.broadcast_to(view.eye.astype(np.float32), directions.shape)
     found = world.scene.run(np.ascontiguousarray(origins), directions, output=True)
     hit = np.flatnonzero(found["primID"] >= 0)
-    face = found["primID"][hit]
+    area = picture[top:bottom, left:right]
+    fine = np.repeat(np.repeat(area, samples, axis=0), samples, axis=1).reshape(-1, 3)
     weights = np.stack([1.0 - found["u"][hit] - found["v"][hit], found["u"][hit], found["v"][hit]], axis=1)
+    pixel = 2.0 * view.tangent / height * found["tfar"][hit]
+    fine[hit] = _color(world, found["primID"][hit], weights, -directions[hit], pixel)
+    area[:] = fine.reshape(bottom - top, samples, right - left, samples, 3).mean(axis=(1, 3))
+
+
+def _color(world: _World, face: np.ndarray, weights: np.ndarray, to_eye: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """Colour of points on faces; ``pixel`` is the size of a pixel there."""
     corners = world.triangles[face]
     normal = _unit(np.einsum("hc,hck->hk", weights, world.normals[corners]))
-    to_eye = -directions[hit]
     inside = np.einsum("hk,hk->h", normal, to_eye) < 0
     normal[inside] *= -1
     ambient = np.einsum("hc,hc->h", weights, world.light.ambient[corners])
@@ -200,8 +212,7 @@ def _draw_surfaces(picture: np.ndarray, directions: np.ndarray, view: View, worl
     color[inside] *= 0.72
     sheen = 0.10 * ambient * (1.0 - np.einsum("hk,hk->h", normal, to_eye)).clip(0, 1) ** 3
     color += sheen[:, None]
-    line = _line(world, face, weights, pixel * found["tfar"][hit])
-    picture[hit] = color * (1.0 - 0.38 * line[:, None])
+    return color * (1.0 - 0.38 * _line(world, face, weights, pixel)[:, None])
 
 
 def _shade(world: _World, normal: np.ndarray, to_eye: np.ndarray, ambient: np.ndarray, key: np.ndarray) -> np.ndarray:
@@ -215,21 +226,40 @@ def _shade(world: _World, normal: np.ndarray, to_eye: np.ndarray, ambient: np.nd
 
 def _line(world: _World, face: np.ndarray, weights: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     """1 on drawn edges, 0 a pixel away from them, shape (H,)."""
-    corners = world.points[world.triangles]
+    line = np.zeros(len(face), np.float32)
+    lined = np.flatnonzero(world.edges.any(axis=1)[face])
+    face = face[lined]
+    corners = world.points[world.triangles[face]]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     opposite = np.linalg.norm(np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1), axis=2)
     heights = area[:, None] / np.maximum(opposite, 1e-20)
-    distance = weights * heights[face] / pixel[:, None]
-    distance = np.where(world.edges[face], distance, np.inf).min(axis=1)
-    return np.clip(1.1 - distance, 0.0, 1.0)
+    distance = weights[lined] * heights / pixel[lined, None]
+    line[lined] = np.clip(1.1 - np.where(world.edges[face], distance, np.inf).min(axis=1), 0.0, 1.0)
+    return line
 
 
-def _directions(view: View, width: int, height: int) -> np.ndarray:
-    """Unit ray directions of all samples, row by row, float32."""
-    y = (1.0 - (np.arange(height) + 0.5) / height * 2.0) * view.tangent
-    x = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * view.tangent * width / height
-    local = np.stack([np.tile(x, height), np.repeat(y, width), np.full(width * height, -1.0)], axis=1)
-    return _unit((local @ view.axes).astype(np.float32))
+def _covered(view: View, points: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom pixel of the box that the points cover; everything when some are behind the eye."""
+    seen = (points - view.eye) @ view.axes.T
+    if np.any(seen[:, 2] > -1e-9):
+        return 0, 0, size[0], size[1]
+    scale = 0.5 * size[1] / view.tangent
+    across, down = -scale * seen[:, 0] / seen[:, 2], scale * seen[:, 1] / seen[:, 2]
+    low = np.floor([0.5 * size[0] + across.min(), 0.5 * size[1] + down.min()]).astype(int)
+    high = np.ceil([0.5 * size[0] + across.max(), 0.5 * size[1] + down.max()]).astype(int)
+    (left, top), (right, bottom) = np.clip(low, 0, size), np.clip(high, 0, size)
+    return int(left), int(top), int(right), int(bottom)
+
+
+def _directions(view: View, size: tuple[int, int], box: tuple[int, int, int, int], samples: int) -> np.ndarray:
+    """Unit ray directions of all samples of a box of pixels, row by row, float32."""
+    left, top, right, bottom = box
+    x = (left + (np.arange((right - left) * samples) + 0.5) / samples) * 2.0 - size[0]
+    y = size[1] - (top + (np.arange((bottom - top) * samples) + 0.5) / samples) * 2.0
+    scale = view.tangent / size[1]
+    across = (scale * x[:, None] * view.axes[0]).astype(np.float32)
+    down = (scale * y[:, None] * view.axes[1] - view.axes[2]).astype(np.float32)
+    return _unit((down[:, None, :] + across[None, :, :]).reshape(-1, 3))
 
 
 def _vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

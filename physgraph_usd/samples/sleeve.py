@@ -77,7 +77,7 @@ def _triangulate(flat: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.nda
     """Delaunay triangles on the unrolled tube, and their corners as (values, indices) of the seamed UVs."""
     scale = np.array([2 * np.pi * 0.5 * (RADIUS_TOP + RADIUS_CUFF), LENGTH])
     count = len(flat)
-    tiled = np.concatenate([flat + [shift, 0.0] for shift in (-1.0, 0.0, 1.0)])
+    tiled = np.concatenate([flat + np.array([shift, 0.0]) for shift in (-1.0, 0.0, 1.0)])
     simplices = Delaunay(tiled * scale).simplices
     centre = tiled[simplices, 0].mean(axis=1)
     simplices = simplices[(centre >= 0.0) & (centre < 1.0)]

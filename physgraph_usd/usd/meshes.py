@@ -67,11 +67,10 @@ class DrawnStage:
         """Return the time codes at which any of the prims, their ancestors or skeletons have samples."""
         found: set[float] = set()
         for prim in [self.stage.GetPrimAtPath(p) for p in paths] + self._animations():
-            while prim and not prim.IsPseudoRoot():
-                if prim.IsA(UsdGeom.Imageable) or prim.IsA(UsdSkel.Animation):
-                    for name in _moving(prim):
-                        found.update(prim.GetAttribute(name).GetTimeSamples())
-                prim = prim.GetParent()
+            for above in prim.GetPath().GetPrefixes():
+                holder = self.stage.GetPrimAtPath(above)
+                for name in _moving(holder):
+                    found.update(holder.GetAttribute(name).GetTimeSamples())
         return tuple(sorted(found))
 
     def _animations(self) -> list[Usd.Prim]:
