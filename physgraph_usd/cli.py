@@ -23,6 +23,8 @@ DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview"}
 """Which extra brings a module that only some commands need."""
+MOST_LISTED = 8
+"""Longest list of numbers that is printed in full."""
 
 Decorator = Callable[[Callable[..., None]], Callable[..., None]]
 
@@ -303,14 +305,25 @@ def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _outline(value: Any, indent: str = "") -> Iterator[str]:
+    """Lines of a report for reading: nested records indented, plain lists on one line."""
     pairs = value.items() if isinstance(value, dict) else (("-", item) for item in value)
     for key, item in pairs:
         label = key if key == "-" else f"{key}:"
-        if isinstance(item, dict | list | tuple) and item:
+        if isinstance(item, dict | list) and any(isinstance(part, dict | list | str) for part in item):
             yield f"{indent}{label}"
             yield from _outline(item, indent + "  ")
         else:
-            yield f"{indent}{label} {'none' if item in (None, [], {}, ()) else item}"
+            yield f"{indent}{label} {_in_words(item)}"
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, list) and len(value) > MOST_LISTED:
+        return f"{_in_words(value[:3])}, ..., {_in_words(value[-1])} ({len(value)} in all)"
+    if isinstance(value, list) and value:
+        return ", ".join(map(_in_words, value))
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "none" if value is None or value in ([], {}) else str(value)
 
 
 def _leave(ctx: click.Context, message: str, code: int) -> Never:

@@ -237,6 +237,7 @@ class TestOtherCommands:
         assert (text.exit_code, data.exit_code) == (0, 0)
         assert json.loads(data.stdout)
         assert "swatch" in text.stdout
+        assert "times: 1, 2, 3, ..., 24 (24 in all)" in text.stdout
 
     def test_tag_then_refine(self, sample: Sample, tmp_path: Path) -> None:
         found = json.loads(run("inspect", sample("swatch"), "--json").stdout)
