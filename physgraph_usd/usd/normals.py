@@ -55,7 +55,7 @@ class VertexNormals:
             areas = self._face @ areas
         normals = self._faces_of @ areas
         lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-        bad = ~(lengths > _tiny(points))
+        bad = ~(lengths > _tiny(lengths))
         if bad.any():
             normals[bad] = self._from_neighbours(normals, lengths, bad)
             lengths = np.where(bad, 1.0, lengths)
@@ -97,7 +97,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def _tiny(points: np.ndarray) -> float:
-    """Area under which a direction is rounding noise."""
-    size = float(np.ptp(points, axis=0).max(initial=0.0)) if len(points) else 0.0
-    return max(1e-14 * size * size, np.finfo(np.float32).tiny)
+def _tiny(lengths: np.ndarray) -> float:
+    """Area under which a direction is rounding noise, by the largest area of a vertex."""
+    return max(1e-12 * float(lengths.max(initial=0.0)), float(np.finfo(np.float32).tiny))
