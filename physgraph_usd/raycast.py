@@ -173,7 +173,7 @@ def _draw_ground(picture: np.ndarray, view: View, world: _World, floor: float) -
     side = np.linspace(-half, half, GROUND_CELLS + 1)
     x, z = np.meshgrid(side, side, indexing="ij")
     nodes = np.stack([centre[0] + x.ravel(), np.full(x.size, floor), centre[1] + z.ravel()], axis=1)
-    light = world.gather(nodes.astype(np.float32), np.broadcast_to(np.float32([0, 1, 0]), nodes.shape))
+    light = world.gather(nodes.astype(np.float32), np.broadcast_to(np.array([0, 1, 0], np.float32), nodes.shape))
     shade = (0.62 * light.ambient + 0.38 * light.key).reshape(x.shape)
     fade = np.clip(2.6 * (1.0 - np.sqrt(x * x + z * z) / half), 0.0, 1.0)
     shade = 1.0 + fade * fade * (3 - 2 * fade) * (0.30 + 0.70 * shade - 1.0)
@@ -220,14 +220,14 @@ def _shade(world: _World, normal: np.ndarray, to_eye: np.ndarray, ambient: np.nd
     lambert = np.einsum("hk,k->h", normal, world.key).clip(0, 1) * key
     sky = ambient * (0.75 + 0.25 * normal[:, 1])
     front = ambient * np.einsum("hk,hk->h", normal, to_eye).clip(0, 1)
-    warm, cool = np.float32([1.04, 1.0, 0.95]), np.float32([0.95, 1.0, 1.06])
+    warm, cool = np.array([1.04, 1.0, 0.95], np.float32), np.array([0.95, 1.0, 1.06], np.float32)
     return 0.98 * lambert[:, None] * warm + (0.36 * sky + 0.10 * front)[:, None] * cool
 
 
 def _line(world: _World, face: np.ndarray, weights: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     """1 on drawn edges, 0 a pixel away from them, shape (H,)."""
     line = np.zeros(len(face), np.float32)
-    lined = np.flatnonzero(world.edges.any(axis=1)[face])
+    lined = np.flatnonzero(np.any(world.edges[face], axis=1))
     face = face[lined]
     corners = world.points[world.triangles[face]]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -280,7 +280,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def _frames(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors across each normal."""
-    helper = np.where(np.abs(normals[:, :1]) < 0.7, np.float32([[1, 0, 0]]), np.float32([[0, 1, 0]]))
+    helper = np.where(np.abs(normals[:, :1]) < 0.7, np.eye(3, dtype=np.float32)[:1], np.eye(3, dtype=np.float32)[1:2])
     first = _unit(np.cross(normals, helper))
     return first, np.cross(normals, first)
 

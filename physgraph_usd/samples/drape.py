@@ -141,7 +141,7 @@ def _smoothing(rest: np.ndarray, faces: np.ndarray) -> sparse.csr_matrix:
     both = np.concatenate([kept, kept[:, ::-1]])
     both = both[border[both[:, 0]] != np.tile(inner, 2)]
     weights = sparse.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
-    smooth = sparse.eye(count) - sparse.diags(1.0 / np.maximum(weights.sum(axis=1).A1, 1.0)) @ weights
+    smooth = sparse.eye(count) - sparse.diags(1.0 / np.maximum(np.asarray(weights.sum(axis=1)).ravel(), 1.0)) @ weights
     edge = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1).mean()
     flat = np.linalg.norm(smooth @ rest, axis=1) < 0.3 * edge
     return sparse.csr_matrix(sparse.diags(flat.astype(float)) @ smooth)

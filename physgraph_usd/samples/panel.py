@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 
 from ..usd.plain import FaceVarying
 
@@ -141,7 +141,7 @@ def _inflate(flat: np.ndarray, quads: np.ndarray, seam: np.ndarray) -> np.ndarra
         np.add.at(right, corner, 0.5 * width * tall)
     free = np.flatnonzero(~seam)
     solution = np.zeros(count)
-    solution[free] = spsolve(sparse.csc_matrix(system.tocsr()[free][:, free]), right[free])
+    solution[free] = splu(sparse.csc_matrix(sparse.csr_matrix(system)[free][:, free])).solve(right[free])
     return np.sqrt(solution.clip(0.0))
 
 

@@ -6,12 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from ..errors import StageError
+from .find import has_schema, traverse
+from .provenance import read_record, root_over
+from .stage import metres_per_unit, pxr_errors, quiet, up_vector
+from .times import garment_times, merge
 
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh that says nothing of its own."""
+
+FALLBACK_RATE = 24.0
+"""Time codes per second of a stage that says nothing usable."""
 
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns Z up into Y up."""
@@ -52,46 +59,38 @@ class DrawnStage:
     def __init__(self, shot: Path, over: Path | None = None) -> None:
         """Compose and open."""
         base = _open_layer(shot)
-        layers = [_open_layer(path).identifier for path in (over, shot) if path is not None]
-        self._root = Sdf.Layer.CreateAnonymous(".usda")
-        for key in ("timeCodesPerSecond", "framesPerSecond", "upAxis", "metersPerUnit", "defaultPrim"):
-            if base.pseudoRoot.HasInfo(key):
-                self._root.pseudoRoot.SetInfo(key, base.pseudoRoot.GetInfo(key))
-        self._root.subLayerPaths = layers
-        self.stage = Usd.Stage.Open(self._root)
-        self.rate = float(self.stage.GetTimeCodesPerSecond())
-        self._scale = float(UsdGeom.GetStageMetersPerUnit(self.stage))
-        self._turn = Z_UP if UsdGeom.GetStageUpAxis(self.stage) == "Z" else np.eye(3)
+        layers = [_open_layer(path) for path in (over, shot) if path is not None]
+        self._root = root_over(base, [layer.identifier for layer in layers])
+        with pxr_errors(f"cannot open {shot}"), quiet():
+            self.stage = Usd.Stage.Open(self._root)
+        rate = float(self.stage.GetTimeCodesPerSecond())
+        self.rate = rate if rate > 0 else FALLBACK_RATE
+        self._scale = metres_per_unit(self.stage)[0]
+        self._turn = Z_UP if up_vector(self.stage)[0][2] == 1.0 else np.eye(3)
 
     def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
-        """Return the time codes at which any of the prims, their ancestors or skeletons have samples."""
-        found: set[float] = set()
-        for prim in [self.stage.GetPrimAtPath(p) for p in paths] + self._animations():
-            for above in prim.GetPath().GetPrefixes():
-                holder = self.stage.GetPrimAtPath(above)
-                for name in _moving(holder):
-                    found.update(holder.GetAttribute(name).GetTimeSamples())
-        return tuple(sorted(found))
-
-    def _animations(self) -> list[Usd.Prim]:
-        """Skeleton animations on the stage."""
-        prims = Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies())
-        return [prim for prim in prims if prim.IsA(UsdSkel.Animation)]
+        """Return the time codes at which prims have points, transforms or skeleton animation, ascending."""
+        found: list[float] = []
+        for prim in traverse(self.stage):
+            if str(prim.GetPath()) in paths:
+                found.extend(garment_times(prim))
+            elif animation := UsdSkel.Animation(prim):
+                for attribute in (animation.GetRotationsAttr(), animation.GetTranslationsAttr()):
+                    found.extend(attribute.GetTimeSamples())
+        return merge(found)
 
     def bake(self, times: tuple[float, ...]) -> None:
         """Skin the skinned meshes for the given times, in the anonymous root."""
-        prims = Usd.PrimRange.Stage(self.stage)
-        if not any(prim.IsA(UsdSkel.Root) for prim in prims):
-            return
-        self.stage.SetEditTarget(self._root)
         span = Gf.Interval(min(times), max(times)) if times else Gf.Interval.GetFullInterval()
-        UsdSkel.BakeSkinning(Usd.PrimRange.Stage(self.stage), span)
+        with quiet():
+            for prim in Usd.PrimRange.Stage(self.stage):
+                if UsdSkel.Root(prim):
+                    UsdSkel.BakeSkinning(UsdSkel.Root(prim), span)
 
     def garments(self) -> tuple[str, ...]:
         """Return the paths of meshes with the garment schema applied, registered or not."""
-        prims = Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies())
-        applied = [p for p in prims if "PhysGraphGarmentAPI" in p.GetPrimTypeInfo().GetAppliedAPISchemas()]
-        return tuple(str(prim.GetPath()) for prim in applied if prim.IsA(UsdGeom.Mesh))
+        applied = [prim for prim in traverse(self.stage) if has_schema(prim, "PhysGraphGarmentAPI")]
+        return tuple(str(prim.GetPath()) for prim in applied if UsdGeom.Mesh(prim))
 
     def meshes(self, time: float | None) -> list[DrawnMesh]:
         """Read every visible mesh of purpose default or render.
@@ -105,7 +104,7 @@ class DrawnStage:
         code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
         transforms = UsdGeom.XformCache(code)
         drawn = []
-        for prim in Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies()):
+        for prim in traverse(self.stage):
             mesh = UsdGeom.Mesh(prim)
             if not mesh or not _is_seen(mesh, code):
                 continue
@@ -127,8 +126,7 @@ def shot_of(layer: Path) -> Path | None:
         The shot's file, or None when the layer does not name one.
     """
     opened = _open_layer(layer)
-    record = opened.customLayerData.get("physgraph", {})
-    shot = record.get("shot") if hasattr(record, "get") else None
+    shot = (read_record(opened) or {}).get("shot")
     return Path(opened.ComputeAbsolutePath(str(shot))) if shot else None
 
 
@@ -136,7 +134,8 @@ def refined_in(layer: Path) -> tuple[str, ...]:
     """Return the paths whose points a layer authors itself."""
     opened, found = _open_layer(layer), []
 
-    def visit(path: Sdf.Path) -> None:
+    def visit(path: Sdf.Path | str) -> None:
+        path = Sdf.Path(str(path))
         if path.IsPropertyPath() and path.name == "points":
             found.append(str(path.GetPrimPath()))
 
@@ -146,20 +145,11 @@ def refined_in(layer: Path) -> tuple[str, ...]:
 
 def _open_layer(path: Path) -> Sdf.Layer:
     """Open a layer or say that it cannot be read."""
-    try:
-        layer = Sdf.Layer.FindOrOpen(str(path))
-    except Tf.ErrorException as error:
-        raise StageError(f"{path}: not a readable USD file") from error
+    with pxr_errors(f"cannot open {path}"), quiet():
+        layer = Sdf.Layer.FindOrOpen(str(path)) if path.is_file() else None
     if not layer:
-        raise StageError(f"{path}: no such USD file")
+        raise StageError(f"cannot open {path}: no such USD file")
     return layer
-
-
-def _moving(prim: Usd.Prim) -> list[str]:
-    """Names of the attributes that move a prim."""
-    ops = [str(name) for name in prim.GetPropertyNames() if str(name).startswith("xformOp:")]
-    named = ("points", "rotations", "translations", "scales", "blendShapeWeights")
-    return ops + [name for name in named if prim.HasAttribute(name)]
 
 
 def _is_seen(mesh: UsdGeom.Mesh, code: Usd.TimeCode) -> bool:
