@@ -28,6 +28,9 @@ from .level import Level, build_levels
 from .mesh.subdivide import Refinement
 from .scene import Garment, GarmentFrame
 
+COARSE_STEPS = 4
+"""Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
+
 
 @dataclass(frozen=True)
 class SolveSettings:
@@ -35,7 +38,7 @@ class SolveSettings:
 
     Attributes:
         method: The integrator and whether it is nested.
-        steps: Most steps at the finest level; each level below may take twice as many, up to eight times.
+        steps: Most steps at the finest level; each level below it may take four times as many.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
         budget_ms: Milliseconds a frame, or None.
         temporal: "tether", "warm" or "off".
@@ -45,7 +48,7 @@ class SolveSettings:
     """
 
     method: Method
-    steps: int = 20
+    steps: int = 12
     tolerance: float = 2e-3
     budget_ms: float | None = None
     temporal: str = "tether"
@@ -142,6 +145,23 @@ class Group:
         points = result.double().cpu().numpy() + origin
         return [points[span] for span in self.levels[-1].spans], carried, telemetry
 
+    def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
+        """The problem of one frame without its solve, for charts and benchmarks.
+
+        Args:
+            frames: The garments at one time code.
+
+        Returns:
+            One system per level, coarsest first, and the recentred coarse positions [m].
+        """
+        coarse = self._tensor(np.concatenate([f.points for f in frames]))
+        coarse = coarse - coarse.mean(dim=0)
+        made = []
+        for level, lasting in zip(self.levels, self._forces_for(frames), strict=True):
+            module = ForceModule((*lasting.elastic, lasting.guide.retarget(coarse)))
+            made.append(System(module, lasting.metric, free=level.free, spacing=level.spacing))
+        return made, coarse
+
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)
 
@@ -215,13 +235,14 @@ class Group:
         return x, reports, module
 
     def _budget(self, index: int, count: int, clock: float) -> Budget:
-        """Coarse levels may take more steps: they are cheap and set the folds."""
+        """Steps and deadline of one level."""
         settings = self._settings
         below = count - 1 - index
         deadline = None
         if settings.budget_ms is not None:
             deadline = clock + 1e-3 * settings.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
-        return Budget(settings.steps * 2 ** min(below, 3), settings.tolerance, deadline)
+        steps = settings.steps * (COARSE_STEPS if below else 1)
+        return Budget(steps, settings.tolerance, deadline)
 
     def _finish(self, x: Tensor, coarse: Tensor, frames: Sequence[GarmentFrame]) -> Tensor:
         """Scale the detail where an artist asked for more or less of it."""

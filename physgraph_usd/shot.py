@@ -65,7 +65,7 @@ class RefineOptions:
     colliders: Sequence[str] = ()
     level: int | None = None
     integrator: str = "quasi-newton"
-    steps: int = 20
+    steps: int = 12
     tolerance: float = 2e-3
     budget_ms: float | None = None
     device: str = "cpu"

@@ -122,18 +122,32 @@ class Bending:
         )
 
     def rest_matrix(self) -> sp.csr_matrix:
-        """The quadratic form of the flat rest shape [N/m]: w_h |grad theta_h . n|^2 (Bergou et al. 2006)."""
+        """The Hessian of the rest shape's pattern, each hinge unfolded flat [N/m]: w row^T row (Bergou et al. 2006).
+
+        A row is the derivative of the angle by the corners' heights above the flat hinge; constants are in its null
+        space, and on a flat rest shape so is every linear function.
+        """
         hinges = self._level.hinges.cpu().numpy()
-        jacobian = hinge_jacobian(self._level.rest.double(), self._level.hinges).cpu().numpy()
-        size = np.linalg.norm(jacobian, axis=2)
-        sign = np.sign(np.einsum("hcd,hd->hc", jacobian, jacobian[:, 2] + jacobian[:, 3]))
-        row = np.where(sign == 0, 0.0, sign) * size
-        # Constants must stay in the null space even where the rest shape is bent.
-        row[:, :2] -= row.sum(axis=1, keepdims=True) / 2.0
+        row = flat_rows(self._level.rest.double().cpu().numpy(), hinges)
         blocks = self.weight.double().cpu().numpy()[:, None, None] * row[:, :, None] * row[:, None, :]
         rows, columns = np.repeat(hinges, 4, axis=1).ravel(), np.tile(hinges, (1, 4)).ravel()
         count = self._level.vertex_count
         return sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
+
+
+def flat_rows(rest: np.ndarray, hinges: np.ndarray) -> np.ndarray:
+    """dtheta/dz of each hinge laid flat [1/m], shape (H, 4); zero where a triangle has no area."""
+    xi, xj, xk, xl = (rest[hinges[:, corner]] for corner in range(4))
+    axis, ik, il = xj - xi, xk - xi, xl - xi
+    square = (axis**2).sum(axis=1)
+    size = square + (ik**2).sum(axis=1) + (il**2).sum(axis=1)
+    square = np.maximum(square, 1e-12 * size + 1e-300)
+    double = np.stack([np.linalg.norm(np.cross(axis, side), axis=1) for side in (ik, il)], axis=1)
+    whole = (double > 1e-12 * size[:, None]).all(axis=1, keepdims=True)
+    inverse_height = np.where(whole, np.sqrt(square)[:, None] / np.where(whole, double, 1.0), 0.0)
+    foot = np.stack([(side * axis).sum(axis=1) / square for side in (ik, il)], axis=1)
+    at_i, at_j = -(inverse_height * (1.0 - foot)).sum(axis=1), -(inverse_height * foot).sum(axis=1)
+    return np.stack([at_i, at_j, inverse_height[:, 0], inverse_height[:, 1]], axis=1)
 
 
 def hinge_jacobian(x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges 4"]) -> Float[Tensor, "hinges 4 3"]:
