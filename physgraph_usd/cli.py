@@ -167,8 +167,9 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
     The options that are left out keep the defaults of physgraph_usd.RefineOptions.
     """
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
-    reports = _one_each(shots, report, "--report", suffix=".json")
-    roots = _one_each(shots, root, "--root", suffix=".usda")
+    none = [None] * len(shots)
+    reports = none if report is None else _one_each(shots, report, "--report", suffix=".json")
+    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda")
     given = {name: value for name, value in options.items() if value is not None}
     codes = {
         _refine_one(shot, layer, given | {"report": report, "root": root}, name=f"{shot}: " if len(shots) > 1 else "")
@@ -258,7 +259,7 @@ def schema_path() -> None:
     click.echo(find())
 
 
-def _refine_one(shot: str, layer: Path | None, options: dict[str, Any], *, name: str) -> int:
+def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -> int:
     from .shot import RefineOptions, refine_shot
 
     try:
@@ -276,16 +277,14 @@ def _refine_one(shot: str, layer: Path | None, options: dict[str, Any], *, name:
 
 
 def _one_each(
-    shots: tuple[str, ...], to: Path | None, option: str, *, suffix: str, accepts: tuple[str, ...] = ()
-) -> list[Path | None]:
+    shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...] = ()
+) -> list[Path]:
     """Name one output per shot: ``to`` itself when it is a file's name, else files in the folder ``to``."""
-    if to is None:
-        return [None] * len(shots)
     if to.suffix in (accepts or (suffix,)) and not to.is_dir():
         if len(shots) > 1:
             raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
         return [to]
-    files: list[Path | None] = [to / (Path(shot).stem + suffix) for shot in shots]
+    files = [to / (Path(shot).stem + suffix) for shot in shots]
     twice = sorted({str(file) for file in files if files.count(file) > 1})
     if twice:
         raise UsageError(f"{option} {to}: two shots would both be written to {twice[0]}; refine them one by one")
