@@ -72,16 +72,30 @@ class Fine:
         return list(self.layer.ListTimeSamplesForPath(self.prim.GetPath().AppendProperty(name)))
 
     @cached_property
-    def mesh(self) -> PolygonMesh:
-        """The topology at the default time."""
-        counts, indices = self.array("faceVertexCounts", None), self.array("faceVertexIndices", None)
-        points = self.array("points", None)
-        none = np.zeros(0, np.int32)
-        return PolygonMesh(
-            none if counts is None else counts,
-            none if indices is None else indices,
-            0 if points is None else len(points),
-        )
+    def sizes(self) -> dict[str, int]:
+        """Number of elements by interpolation, at the default time."""
+        points, counts, indices = (self.entries(name, None) for name in TOGETHER[:3])
+        vertices = len(points)
+        return {
+            "vertex": vertices,
+            "varying": vertices,
+            "uniform": len(counts),
+            "faceVarying": len(indices),
+            "constant": 1,
+        }
+
+    def entries(self, name: str, time: float | None) -> np.ndarray:
+        """An attribute's composed array as numpy; empty where there is none."""
+        array = self.array(name, time)
+        return np.zeros(0, np.int32) if array is None else array
+
+    def topology_fault(self, time: float | None) -> str:
+        """What is wrong with counts, indices and points at one time, or ""."""
+        points, counts, indices = (self.value(name, time) for name in TOGETHER[:3])
+        if points is None or counts is None or indices is None:
+            return "there are no points or no faces"
+        good, reason = UsdGeom.Mesh.ValidateTopology(indices, counts, len(points))  # type: ignore[arg-type]
+        return "" if good else str(reason)
 
     def problem(self, name: str, message: str, time: float | None = None, *, severity: str = "error") -> Problem:
         """Name a problem with one of the prim's properties; ``rule`` is filled in by `validate`."""
@@ -108,21 +122,16 @@ def opinions_together(fine: Fine) -> Iterator[Problem]:
 def topology(fine: Fine) -> Iterator[Problem]:
     """Counts, indices and points fit one another at every time."""
     for time in fine.times:
-        counts, indices = fine.value("faceVertexCounts", time), fine.value("faceVertexIndices", time)
-        points = fine.array("points", time)
-        if points is None or counts is None or indices is None:
-            yield fine.problem("points", "has no value, or the mesh has no faces", time)
-            continue
-        good, reason = UsdGeom.Mesh.ValidateTopology(indices, counts, len(points))
-        if not good:
-            yield fine.problem("faceVertexIndices", f"topology is invalid: {reason}", time)
-        if len(counts) and np.asarray(counts).min() < 3:
+        fault = fine.topology_fault(time)
+        if fault:
+            yield fine.problem("faceVertexIndices", f"topology is invalid: {fault}", time)
+        if fine.entries("faceVertexCounts", time).min(initial=3) < 3:
             yield fine.problem("faceVertexCounts", "has a face with fewer than three corners", time)
 
 
 def points(fine: Fine) -> Iterator[Problem]:
     """Points are finite, of one count, and float32."""
-    expected = fine.mesh.vertex_count
+    expected = fine.sizes["vertex"]
     if fine.prim.GetAttribute("points").GetTypeName() != Sdf.ValueTypeNames.Point3fArray:
         yield fine.problem("points", f"has type {fine.prim.GetAttribute('points').GetTypeName()}, not point3f[]")
     for time in fine.times:
@@ -142,7 +151,7 @@ def normals(fine: Fine) -> Iterator[Problem]:
         yield fine.problem("normals", "has interpolation other than vertex")
     if fine.written("normals") != fine.written("points"):
         yield fine.problem("normals", "is not sampled at the times of points")
-    expected = fine.mesh.vertex_count
+    expected = fine.sizes["vertex"]
     for time in fine.times:
         array = fine.array("normals", time)
         if array is None or len(array) != expected:
@@ -158,21 +167,14 @@ def normals(fine: Fine) -> Iterator[Problem]:
 
 def _normals_outward(fine: Fine, array: np.ndarray, time: float | None) -> Iterator[Problem]:
     """Normals agree with winding and orientation."""
-    positions = fine.array("points", time)
-    mesh = fine.mesh
-    if positions is None or len(positions) != len(array) or not _is_sound(mesh):
+    positions, counts, indices = (fine.entries(name, time) for name in TOGETHER[:3])
+    if len(positions) != len(array) or fine.topology_fault(time):
         return
     left = fine.value("orientation", None) == UsdGeom.Tokens.leftHanded
-    agreement = np.einsum("ij,ij->i", VertexNormals(mesh, left_handed=left)(positions), array)
+    expected = VertexNormals(PolygonMesh(counts, indices, len(positions)), left_handed=left)(positions)
+    agreement = np.einsum("ij,ij->i", expected, array)
     if len(agreement) and np.median(agreement) < 0.5:
         yield fine.problem("normals", "point away from the side that winding and orientation call outside", time)
-
-
-def _is_sound(mesh: PolygonMesh) -> bool:
-    """Whether indices can be used without a check."""
-    indices = mesh.indices
-    fits = int(np.sum(mesh.counts)) == len(indices)
-    return fits and (not len(indices) or (indices.min() >= 0 and indices.max() < mesh.vertex_count))
 
 
 def extent(fine: Fine) -> Iterator[Problem]:
@@ -192,14 +194,7 @@ def extent(fine: Fine) -> Iterator[Problem]:
 
 def primvars(fine: Fine) -> Iterator[Problem]:
     """Every primvar has as many elements as its interpolation needs."""
-    mesh = fine.mesh
-    sizes = {
-        "vertex": mesh.vertex_count,
-        "varying": mesh.vertex_count,
-        "uniform": mesh.face_count,
-        "faceVarying": len(mesh.indices),
-        "constant": 1,
-    }
+    sizes = fine.sizes
     for primvar in UsdGeom.PrimvarsAPI(fine.prim).GetPrimvarsWithAuthoredValues():
         name, interpolation = primvar.GetAttr().GetName(), primvar.GetInterpolation()
         if name in STALE:
@@ -232,8 +227,7 @@ def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) 
 
 def subsets(fine: Fine) -> Iterator[Problem]:
     """Subset indices are in range and distinct, and a partition is one."""
-    mesh = fine.mesh
-    sizes = {"face": mesh.face_count, "point": mesh.vertex_count}
+    sizes = {"face": fine.sizes["uniform"], "point": fine.sizes["vertex"]}
     imageable = UsdGeom.Imageable(fine.prim)
     families: dict[tuple[str, str], list[np.ndarray]] = {}
     for subset in UsdGeom.Subset.GetAllGeomSubsets(imageable):
@@ -264,7 +258,7 @@ def leftovers(fine: Fine) -> Iterator[Problem]:
         yield fine.problem("subdivisionScheme", f"is {fine.value('subdivisionScheme', None)!r}, not 'none'")
     for name in EMPTIED:
         for time in (None, *fine.prim.GetAttribute(name).GetTimeSamples()):
-            if len(fine.array(name, time) if fine.array(name, time) is not None else ()):
+            if len(fine.entries(name, time)):
                 yield fine.problem(name, "still holds the coarse mesh's entries", time)
     if fine.prim.GetAttribute("accelerations").HasAuthoredValue():
         yield fine.problem("accelerations", "still holds the coarse mesh's values")
@@ -283,8 +277,8 @@ def velocities(fine: Fine) -> Iterator[Problem]:
         yield fine.problem("velocities", "is not sampled at the times of points in the refined layer")
     for time in fine.times:
         array = fine.array("velocities", time)
-        if array is not None and len(array) != fine.mesh.vertex_count:
-            yield fine.problem("velocities", f"has {len(array)} entries for {fine.mesh.vertex_count} points", time)
+        if array is not None and len(array) != fine.sizes["vertex"]:
+            yield fine.problem("velocities", f"has {len(array)} entries for {fine.sizes['vertex']} points", time)
 
 
 def skinning(fine: Fine) -> Iterator[Problem]:
@@ -292,7 +286,7 @@ def skinning(fine: Fine) -> Iterator[Problem]:
     if fine.prim.HasAPI(UsdSkel.BindingAPI):
         yield fine.problem("", "SkelBindingAPI is still applied; the mesh would be skinned twice")
     for name in STALE[1:]:
-        if len(fine.array(name, None) if fine.array(name, None) is not None else ()):
+        if len(fine.entries(name, None)):
             yield fine.problem(name, "still holds influences; the mesh would be skinned twice")
 
 
