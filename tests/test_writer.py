@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layers import COAT, TIMES, dress_up, fine_points, make_shot, open_over, refine_all, vec3, write_layer
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 
 from physgraph_usd.errors import LayerError, UsageError
 from physgraph_usd.usd.provenance import file_hashes, read_record, refined_layers, write_root
@@ -435,3 +435,61 @@ def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, timeout=120, text=True)
         peaks.append(int(done.stdout))
     assert peaks[1] < 1.1 * peaks[0], f"peak memory {peaks} KiB"
+
+
+def make_skinned(path: Path, *, inherited: bool) -> None:
+    """The coat on a skeleton of one joint that moves along X, bound on the mesh or on its parent."""
+    stage = make_shot(path, times=())
+    root = UsdSkel.Root.Define(stage, "/World")
+    skeleton = UsdSkel.Skeleton.Define(stage, "/World/skeleton")
+    skeleton.CreateJointsAttr(["joint"])
+    skeleton.CreateBindTransformsAttr([Gf.Matrix4d(1)])
+    skeleton.CreateRestTransformsAttr([Gf.Matrix4d(1)])
+    animation = UsdSkel.Animation.Define(stage, "/World/animation")
+    animation.CreateJointsAttr(["joint"])
+    animation.CreateRotationsAttr([Gf.Quatf(1)])
+    animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)])
+    for time in TIMES:
+        animation.CreateTranslationsAttr().Set([Gf.Vec3f(time, 0, 0)], time)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    mesh = stage.GetPrimAtPath(COAT)
+    UsdSkel.BindingAPI.Apply(mesh)
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetParent() if inherited else mesh)
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateJointIndicesPrimvar(inherited, 1).Set([0] if inherited else [0] * 20)
+    binding.CreateJointWeightsPrimvar(inherited, 1).Set([1.0] if inherited else [1.0] * 20)
+    stage.SetStartTimeCode(TIMES[0])
+    stage.SetEndTimeCode(TIMES[-1])
+    assert root
+    stage.Save()
+
+
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+@pytest.mark.parametrize("inherited", [False, True])
+def test_a_skinned_garment_is_not_skinned_twice(tmp_path: Path, mode: str, inherited: bool) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    make_skinned(path, inherited=inherited)
+    shot = open_shot(str(path), level=1)
+    if not shot.sources[0].skinned:
+        pytest.skip("the reader bakes no skinning yet")
+    steps = refine_all(shot)
+    with LayerWriter(shot, steps, out, mode=mode) as writer:
+        for time in shot.scene.times:
+            writer.write(time, fine_points(shot, steps, time))
+    stage = open_over(path, out)
+    root, cache = UsdSkel.Root(stage.GetPrimAtPath("/World")), UsdSkel.Cache()
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    bindings = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
+    skinned = [str(query.GetPrim().GetPath()) for binding in bindings for query in binding.GetSkinningTargets()]
+    assert [cloth for cloth in skinned if cache.GetSkinningQuery(stage.GetPrimAtPath(cloth)).HasJointInfluences()] == (
+        [] if mode == "over" else [COAT]
+    )
+    if mode == "over":
+        # A rigid bake moves the coarse mesh by its transform, which a sibling shares.
+        stage.SetEditTarget(stage.GetSessionLayer())
+        UsdSkel.BakeSkinning(root, Gf.Interval(*TIMES[::2]))
+    for time in TIMES:
+        found = world_metres(stage, str(writer.targets[0]), time)
+        np.testing.assert_allclose(found, fine_points(shot, steps, time)[0], atol=1e-6)
+        assert found[0, 0] == pytest.approx(0.01 * time)
+    assert errors(out) == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
+from pxr import Sdf, Usd, UsdShade, UsdSkel, Vt
 
 from .carry import FineMap
 from .schema import GARMENT_API
@@ -96,19 +96,17 @@ def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, s
         prim: Coarse mesh as composed.
         skinned: Whether the points came from skinning, perhaps by influences inherited from an ancestor.
     """
-    bound = prim.HasAPI(UsdSkel.BindingAPI)
-    if bound:
-        delete_schema(stream, target, "SkelBindingAPI")
-    for name, type_name in (("skel:joints", _TYPES.TokenArray), ("skel:blendShapes", _TYPES.TokenArray)):
+    for name in ("skel:joints", "skel:blendShapes"):
         if prim.GetAttribute(name).HasAuthoredValue():
-            stream.block(target.AppendProperty(name), type_name)
-    if not skinned:
-        return
-    for name, type_name in (("jointIndices", _TYPES.IntArray), ("jointWeights", _TYPES.FloatArray)):
-        # Empty, not blocked: a block would let an ancestor's influences through.
-        path = target.AppendProperty(f"primvars:skel:{name}")
-        stream.attribute(path, type_name, interpolation=UsdGeom.Tokens.vertex)
-        stream.set(path, type(type_name.defaultValue)())
+            stream.block(target.AppendProperty(name), _TYPES.TokenArray)
+    if skinned and not prim.GetAttribute("primvars:skel:jointIndices").HasAuthoredValue():
+        # Influences of an ancestor reach the mesh whether or not it has the schema; no skeleton stops them.
+        edit_schemas(stream, target, added=["SkelBindingAPI"])
+        spec = stream.prim(target)
+        skeleton = spec.relationships.get("skel:skeleton") or Sdf.RelationshipSpec(spec, "skel:skeleton", False)
+        skeleton.targetPathList.ClearEditsAndMakeExplicit()
+    elif prim.HasAPI(UsdSkel.BindingAPI):
+        delete_schema(stream, target, "SkelBindingAPI")
 
 
 def delete_schema(stream: LayerStream, target: Sdf.Path, name: str) -> None:

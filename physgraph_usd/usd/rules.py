@@ -283,7 +283,9 @@ def velocities(fine: Fine) -> Iterator[Problem]:
 
 def skinning(fine: Fine) -> Iterator[Problem]:
     """The mesh is not skinned a second time."""
-    if fine.prim.HasAPI(UsdSkel.BindingAPI):
+    skeleton = fine.prim.GetRelationship("skel:skeleton")
+    cut_off = skeleton and skeleton.HasAuthoredTargets() and not skeleton.GetTargets()
+    if fine.prim.HasAPI(UsdSkel.BindingAPI) and not cut_off:
         yield fine.problem("", "SkelBindingAPI is still applied; the mesh would be skinned twice")
     for name in STALE[1:]:
         if len(fine.entries(name, None)):
