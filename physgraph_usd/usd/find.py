@@ -1,17 +1,21 @@
-"""Finding the garments and colliders of a stage."""
+"""Finding the garments and colliders of a stage: by applied schema, path, name, glob or collection."""
 
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
-from ..errors import StageError
+from ..errors import GarmentError, StageError
+from .lookup import COLLIDER_ENABLED, is_on
+from .materials import is_collision_prim
+from .schema import COLLIDER_API, GARMENT_API
 from .stage import TRAVERSAL, list_meshes
 
-GARMENT_API = "PhysGraphGarmentAPI"
-COLLIDER_API = "PhysGraphColliderAPI"
+_COLLECTION = ".collection:"
+_COLLIDERS_RELATIONSHIP = "physgraph:colliders"
+_SHOWN = 20
 
 
 def has_schema(prim: Usd.Prim, name: str) -> bool:
@@ -19,17 +23,151 @@ def has_schema(prim: Usd.Prim, name: str) -> bool:
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
 
 
-def find_garments(stage: Usd.Stage, wanted: Sequence[str]) -> list[Usd.Prim]:
-    """Prims to refine, in stage order.
+def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim]:
+    """Find the meshes to refine.
+
+    Args:
+        stage: The stage.
+        wanted: Prim paths (a transform stands for the meshes below it), prim names, globs over paths, or collections
+            (``/Prim.collection:name``); empty: every mesh with PhysGraphGarmentAPI.
+
+    Returns:
+        Mesh prims in stage order, those inside instances included.
 
     Raises:
-        StageError: When nothing is found; lists the meshes that there are.
+        StageError: When an item, or nothing at all, is found; the message lists the meshes that there are.
     """
-    meshes = [prim for prim in Usd.PrimRange.Stage(stage, TRAVERSAL) if prim.IsA(UsdGeom.Mesh)]
-    if not wanted:
-        found = [prim for prim in meshes if has_schema(prim, GARMENT_API)]
-    else:
-        found = [prim for prim in meshes if any(fnmatch.fnmatchcase(str(prim.GetPath()), item) for item in wanted)]
+    if wanted:
+        chosen = {path for item in wanted for path in _match(stage, item, UsdGeom.Mesh)}
+        return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
+    found = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API)]
     if not found:
-        raise StageError(f"no garment found; meshes: {', '.join(list_meshes(stage)) or 'none'}")
+        raise StageError(f"no prim has {GARMENT_API} and no garment was named; {_meshes_said(stage)}")
+    for prim in found:
+        if not prim.IsA(UsdGeom.Mesh):
+            kind = prim.GetTypeName() or "prim without a type"
+            remedy = "apply the schema to the meshes themselves"
+            raise GarmentError(str(prim.GetPath()), f"has {GARMENT_API} but is a {kind}, not a Mesh", remedy=remedy)
     return found
+
+
+def find_colliders(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str] = ()) -> list[Usd.Prim]:
+    """Find the prims that garments may collide with.
+
+    Invisible prims and those of purpose guide or proxy count; inactive ones do not exist.
+
+    Args:
+        stage: The stage.
+        garments: The garments; they are no colliders.
+        wanted: As for ``find_garments``; empty: what the garments' ``physgraph:colliders`` name, and for garments
+            without targets every prim with PhysGraphColliderAPI or UsdPhysics' CollisionAPI.
+
+    Returns:
+        Gprims in stage order.
+
+    Raises:
+        StageError: When a named one is not there.
+    """
+    own = {prim.GetPath() for prim in garments}
+    if wanted:
+        chosen = {path for item in wanted for path in _match(stage, item, UsdGeom.Gprim)}
+        return [prim for prim in traverse(stage) if prim.GetPath() in chosen - own]
+    targets = [_targets(prim) for prim in garments]
+    chosen = {path for item in targets for target in item for path in _match(stage, str(target), UsdGeom.Gprim)}
+    if not all(targets):
+        chosen |= {path for prim in traverse(stage) if _collides(prim) for path in _gprims_below(prim, UsdGeom.Gprim)}
+    return [prim for prim in traverse(stage) if prim.GetPath() in chosen - own]
+
+
+def instance_roots(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
+    """Instances that hold a prim, outermost first: what must become editable before the prim can be overridden."""
+    found = []
+    while prim and not prim.IsPseudoRoot():
+        if prim.IsInstance():
+            found.append(prim.GetPath())
+        prim = prim.GetParent()
+    return tuple(reversed(found))
+
+
+def traverse(stage: Usd.Stage) -> Iterator[Usd.Prim]:
+    """All active, loaded, defined prims, those inside instances included."""
+    return iter(Usd.PrimRange.Stage(stage, TRAVERSAL))
+
+
+def _targets(prim: Usd.Prim) -> list[Sdf.Path]:
+    relationship = prim.GetRelationship(_COLLIDERS_RELATIONSHIP)
+    return relationship.GetForwardedTargets() if relationship else []
+
+
+def _collides(prim: Usd.Prim) -> bool:
+    if has_schema(prim, COLLIDER_API):
+        return is_on(prim, COLLIDER_ENABLED)
+    return is_collision_prim(prim)
+
+
+def _match(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
+    """Paths of the prims of a kind that an item names."""
+    if _COLLECTION in item:
+        roots: Iterable[Usd.Prim] = _collection(stage, item)
+    elif any(letter in item for letter in "*?["):
+        roots = [prim for prim in traverse(stage) if fnmatch.fnmatchcase(str(prim.GetPath()), item)]
+    elif item.startswith("/"):
+        roots = [_at_path(stage, item)]
+    else:
+        roots = [prim for prim in traverse(stage) if prim.GetName() == item]
+    found = [path for root in roots for path in _gprims_below(root, kind)]
+    if not found:
+        raise StageError(f"{item!r} names no {kind.__name__}; {_meshes_said(stage)}")
+    return found
+
+
+def _gprims_below(root: Usd.Prim, kind: type) -> list[Sdf.Path]:
+    """The prim itself when it is of the kind, else those of the kind below it."""
+    if root.IsA(kind):
+        return [root.GetPath()]
+    return [prim.GetPath() for prim in Usd.PrimRange(root, TRAVERSAL) if prim.IsA(kind)]
+
+
+def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
+    """The prim at a path.
+
+    Raises:
+        StageError: When there is none that can be used; says whether it is inactive, undefined or abstract.
+    """
+    if not Sdf.Path.IsValidPathString(item):
+        raise StageError(f"{item!r} is no prim path")
+    prim = stage.GetPrimAtPath(item)
+    if not prim:
+        raise StageError(f"no prim at <{item}>; {_meshes_said(stage)}")
+    states = {
+        "inactive": not prim.IsActive(),
+        "abstract": prim.IsAbstract(),
+        "inside a prototype": prim.IsInPrototype(),
+        "only an over, defined nowhere,": not prim.IsDefined(),
+    }
+    said = [name for name, holds in states.items() if holds]
+    if said:
+        raise StageError(f"<{item}> is {said[0]} and does not exist for refining; {_meshes_said(stage)}")
+    return prim
+
+
+def _collection(stage: Usd.Stage, item: str) -> list[Usd.Prim]:
+    """The prims of a collection.
+
+    Raises:
+        StageError: When there is no such collection; lists those of the prim.
+    """
+    path, name = item.split(_COLLECTION, 1)
+    prim = _at_path(stage, path)
+    collection = Usd.CollectionAPI.Get(prim, name)
+    known = [each.GetName() for each in Usd.CollectionAPI.GetAllCollections(prim)]
+    if name not in known:
+        raise StageError(f"<{path}> has no collection {name!r}; collections: {', '.join(known) or 'none'}")
+    included = collection.ComputeIncludedObjects(collection.ComputeMembershipQuery(), stage, TRAVERSAL)
+    return sorted((each for each in included if isinstance(each, Usd.Prim)), key=lambda each: each.GetPath())
+
+
+def _meshes_said(stage: Usd.Stage) -> str:
+    meshes = list_meshes(stage)
+    more = f" and {len(meshes) - _SHOWN} more" if len(meshes) > _SHOWN else ""
+    return f"meshes: {', '.join(meshes[:_SHOWN]) or 'none'}{more}"

@@ -1,76 +1,103 @@
-"""A shot, opened for reading: scene, frames, and how garments sit on the stage."""
+"""A shot, opened for reading: its scene, its frames, and how its garments sit on the stage.
+
+    with contextlib.closing(open_shot("shot.usda")) as shot:
+        for time in shot.scene.times:
+            frame = shot.frame(time)
+
+Everything handed out is in metres and world space with the stage's own axes. A shot without samples has no times; its
+one frame is ``shot.frame(None)``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd
 
-from ..errors import GarmentError
-from ..fabric import Fabric
-from ..mesh.topology import PolygonMesh
-from ..scene import Frame, Garment, GarmentFrame, Scene
-from .find import find_garments
-from .stage import GarmentSource, Notice, gravity, metres_per_unit, open_stage, up_vector
+from ..errors import StageError, UsageError
+from ..scene import Frame, Scene
+from .find import find_colliders, find_garments, instance_roots
+from .garment import GarmentReader, Request, all_times, is_visible, read_garment
+from .lookup import ENABLED, check_overrides, is_on, parse_overrides
+from .placement import to_metres
+from .schema import GARMENT
+from .skinning import Bake
+from .stage import (
+    GarmentSource,
+    Notice,
+    open_stage,
+    pxr_errors,
+    quiet,
+    read_units,
+    refuse_missing_arcs,
+    root_metadata,
+)
+from .times import merge, within
+
+_LEVEL = GARMENT["refine:level"]
 
 
 class Shot:
     """An opened stage, ready to be asked for frames.
 
     Attributes:
-        stage: The composed stage; never edited on disk.
+        stage: The composed stage, with skinning baked in an anonymous session layer; never edited on disk.
         path: The shot file.
         scene: What stays the same over the shot.
-        sources: How each garment sits on the stage.
+        sources: How each garment sits on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
-        warnings: What the user should know.
+        warnings: What the user should know; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
     """
 
-    def __init__(self, stage: Usd.Stage, path: str, scene: Scene, sources: tuple[GarmentSource, ...]) -> None:
-        """Keep the parts that ``open_shot`` read."""
-        self.stage, self.path, self.scene, self.sources = stage, path, scene, sources
+    def __init__(self, path: str, stage: Usd.Stage, request: Request, *, readers: Sequence[GarmentReader]) -> None:
+        """Put together what ``open_shot`` read."""
+        self.path, self.stage = path, stage
+        self.sources: tuple[GarmentSource, ...] = tuple(reader.source for reader in readers)
         self.colliders: tuple[str, ...] = ()
         self.warnings: list[Notice] = []
-        self.metres_per_unit = metres_per_unit(stage)[0]
+        self.metres_per_unit = request.units.metres
+        times = merge(time for source in self.sources for time in source.times)
+        self.scene = Scene(tuple(reader.garment for reader in readers), request.units.gravity, times)
+        self._readers, self._request = tuple(readers), request
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
-        """Matrix from a garment's local space to world metres, shape (4, 4), for column vectors."""
-        prim = self.stage.GetPrimAtPath(self.sources[index].path)
-        cache = UsdGeom.XformCache(timecode(time))
-        matrix = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64).T
-        matrix[:3] *= self.metres_per_unit
-        return matrix
+        """Matrix from a garment's local space to world metres.
+
+        Args:
+            index: Which garment.
+            time: Time code, or None for the default.
+
+        Returns:
+            Matrix for column vectors, shape (4, 4), float64: ``world = M @ [local; 1]``.
+
+        Raises:
+            GarmentError: When it cannot be inverted.
+        """
+        return to_metres(self.stage.GetPrimAtPath(self.sources[index].path), self.metres_per_unit, time)
 
     def frame(self, time: float | None) -> Frame:
-        """Read one time code; None reads the default values."""
-        return Frame(time, tuple(self._garment(index, time) for index in range(len(self.sources))))
+        """Read one time code; None reads the default values.
+
+        Raises:
+            GarmentError: When a garment is broken at this time.
+            SchemaError: When an animated value cannot be used.
+            StageError: When USD cannot read the files any more.
+        """
+        garments = []
+        with pxr_errors(f"cannot read {self.path}" + ("" if time is None else f" at time code {time:g}")):
+            for index, reader in enumerate(self._readers):
+                garment, notices = reader.frame(self.to_metres(index, time), time)
+                garments.append(garment)
+                self.warnings.extend(notice for notice in notices if notice not in self.warnings)
+        return Frame(time, tuple(garments))
 
     def close(self) -> None:
-        """Let go of the stage."""
-        self.stage = None  # type: ignore[assignment]
-
-    def _garment(self, index: int, time: float | None) -> GarmentFrame:
-        prim = self.stage.GetPrimAtPath(self.sources[index].path)
-        local = read_points(prim, time)
-        matrix = self.to_metres(index, time)
-        return GarmentFrame(local @ matrix[:3, :3].T + matrix[:3, 3], Fabric())
-
-
-def timecode(time: float | None) -> Usd.TimeCode:
-    """USD's time code for ours: None is the default value."""
-    return Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-
-
-def read_points(prim: Usd.Prim, time: float | None) -> np.ndarray:
-    """Local points, shape (V, 3), float64."""
-    value = UsdGeom.Mesh(prim).GetPointsAttr().Get(timecode(time))
-    if value is None:
-        value = UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.EarliestTime())
-    if value is None:
-        raise GarmentError(str(prim.GetPath()), "has no points", time=time)
-    return np.asarray(value, dtype=np.float64)
+        """Let go of the stage; nothing can be read afterwards."""
+        self._readers = ()
+        del self.stage, self._request
 
 
 def open_shot(
@@ -84,41 +111,95 @@ def open_shot(
     rest_frame: float | None = None,
     skip_invisible: bool = False,
 ) -> Shot:
-    """Open a shot for refining."""
-    stage = open_stage(str(path))
-    metres, notices = metres_per_unit(stage)
-    up, more = up_vector(stage)
-    parts = [_read_garment(prim, metres, level) for prim in find_garments(stage, garments)]
-    times = sorted({time for _, source in parts for time in source.times})
-    if frames is not None:
-        times = [time for time in times if frames[0] <= time <= frames[1]]
-    scene = Scene(tuple(garment for garment, _ in parts), gravity(stage, up, metres), tuple(times))
-    shot = Shot(stage, str(path), scene, tuple(source for _, source in parts))
-    shot.warnings.extend(notices + more)
+    """Open a shot for refining.
+
+    Args:
+        path: The shot file, any that USD opens.
+        garments: Prim paths, prim names, globs over paths or collections (``/Prim.collection:name``); empty: the
+            meshes with PhysGraphGarmentAPI.
+        colliders: The same for colliders; empty: what the garments name, else every prim with PhysGraphColliderAPI
+            or UsdPhysics' CollisionAPI.
+        frames: First and last time code in composed stage time; None: every authored one.
+        level: Number of subdivisions, -1 for auto; None: what each garment's schema says.
+        overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
+        rest_frame: Time code whose points are the rest shape of every garment; it goes before authored rest shapes.
+        skip_invisible: Leave out garments that are invisible at all their time codes.
+
+    Returns:
+        The shot; its ``warnings`` tell what was assumed, left out or repaired.
+
+    Raises:
+        UsageError: When an option cannot be used.
+        StageError: When the stage cannot be read, or has no such garment or collider.
+        GarmentError: When a garment is broken.
+        SchemaError: When an attribute cannot be used.
+    """
+    asked = parse_overrides(overrides)
+    _check_options(frames, level, rest_frame)
+    stage, notices = open_stage(str(path))
+    with pxr_errors(f"cannot read {path}"), quiet():
+        prims = _find(stage, garments, notices)
+        check_overrides(asked, [prim.GetPath() for prim in prims])
+        found = find_colliders(stage, prims, colliders)
+        for prim in (*prims, *found):
+            refuse_missing_arcs(prim, notices)
+        units, odd = read_units(stage)
+        assumed = root_metadata(stage, "metersPerUnit") is None
+        prims = [
+            prim for prim in prims if is_on(prim, ENABLED, asked) or notices.append(_left_out(prim, "is disabled"))
+        ]
+        request = Request(units, Bake(stage), frames, level, asked, rest_frame, assumed)
+        readers = _read(stage, prims, request, notices=notices, skip_invisible=skip_invisible)
+        shot = Shot(str(path), stage, request, readers=readers)
+    shot.colliders = tuple(str(prim.GetPath()) for prim in found)
+    read_notices = [notice for reader in readers for notice in reader.notices]
+    shot.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
     return shot
 
 
-def _read_garment(prim: Usd.Prim, metres: float, level: int | None) -> tuple[Garment, GarmentSource]:
-    mesh = UsdGeom.Mesh(prim)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int32)
-    indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int32)
-    rest = read_points(prim, None)
-    times = tuple(mesh.GetPointsAttr().GetTimeSamples())
-    size = len(rest)
-    ones = np.ones(size)
-    matrix = np.array(UsdGeom.XformCache(timecode(times[0] if times else None)).GetLocalToWorldTransform(prim)).T
-    flipped = (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded) != (np.linalg.det(matrix[:3, :3]) < 0)
-    garment = Garment(
-        path=str(prim.GetPath()),
-        mesh=PolygonMesh(counts, indices, size),
-        rest=(rest @ matrix[:3, :3].T + matrix[:3, 3]) * metres,
-        level=2 if level is None else level,
-        flipped=bool(flipped),
-        bent_rest=False,
-        stretch_scale=ones,
-        bend_scale=ones,
-        guide_scale=ones,
-        detail_scale=ones,
-        pin=np.zeros(size),
-    )
-    return garment, GarmentSource(prim.GetPath(), np.arange(len(counts), dtype=np.int32), False, (), times, {})
+def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | None) -> None:
+    """Refuse options that no stage could satisfy."""
+    if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
+        raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
+    if level is not None and not _LEVEL.minimum <= level <= _LEVEL.maximum:
+        raise UsageError(f"level {level} is outside {_LEVEL.minimum}..{_LEVEL.maximum} (-1 chooses it)")
+    if rest_frame is not None and not math.isfinite(rest_frame):
+        raise UsageError(f"rest frame {rest_frame} is no time code")
+
+
+def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) -> list[Usd.Prim]:
+    """Find the garments; when that fails, also tell what is missing from the stage."""
+    try:
+        return find_garments(stage, garments)
+    except StageError as error:
+        if not notices:
+            raise
+        raise StageError(f"{error}; missing: {'; '.join(notice.message for notice in notices)}") from error
+
+
+def _read(
+    stage: Usd.Stage, prims: Sequence[Usd.Prim], request: Request, *, notices: list[Notice], skip_invisible: bool
+) -> list[GarmentReader]:
+    """Bake skinning and read every garment that is not left out."""
+    roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in prims}
+    notices += request.bake.add(list(roots), request.frames if request.rest_frame is None else None)
+    readers, every = [], []
+    for path, held in roots.items():
+        prim = stage.GetPrimAtPath(path)
+        times = all_times(prim, request.bake)
+        every += times
+        if times and not within(times, request.frames):
+            span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}"
+            notices.append(_left_out(prim, f"has no sample in the frame range; {span}"))
+        elif skip_invisible and not is_visible(prim, within(times, request.frames)):
+            notices.append(_left_out(prim, "is invisible"))
+        else:
+            readers.append(read_garment(prim, held, request))
+    if not readers:
+        reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
+        raise StageError(f"no garment is left to refine: {reasons}")
+    return readers
+
+
+def _left_out(prim: Usd.Prim, why: str) -> Notice:
+    return Notice(str(prim.GetPath()), None, f"left out: it {why}")

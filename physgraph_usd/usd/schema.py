@@ -1,8 +1,7 @@
 """The codeless schemas: one table of every attribute, and where their files are.
 
-Everything reads attributes by the names in this table, so it also works in a host where the schemas are not
-registered. ``schemas/`` is written from it by ``python -m physgraph_usd.usd.schema_files``. This module imports pxr only
-to register.
+Everything reads attributes by the names in this table, so it also works where the schemas are not registered.
+``schemas/`` is written from it by ``python -m physgraph_usd.usd.schema_files``. pxr is imported only to register.
 """
 
 from __future__ import annotations
@@ -148,7 +147,7 @@ def schema_path() -> Path:
 
 def register() -> None:
     """Make USD know the schemas; has no effect once any typed prim definition was read, or when they are known."""
-    from pxr import Plug  # the table must be readable where pxr is missing
+    from pxr import Plug  # noqa: PLC0415  the table must be readable where pxr is missing
 
     registry = Plug.Registry()
     if not registry.GetPluginWithName("physgraph"):

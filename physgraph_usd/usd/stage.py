@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from ..errors import StageError
 
@@ -111,6 +112,37 @@ def metres_per_unit(stage: Usd.Stage) -> tuple[float, list[Notice]]:
     return float(f"{value:.7g}"), []
 
 
+@dataclass(frozen=True, eq=False)
+class Units:
+    """What the stage's numbers mean.
+
+    Attributes:
+        metres: Length of one stage unit [m].
+        kilograms: Mass of one stage unit [kg].
+        up: Unit vector that points up, shape (3,).
+        gravity: Gravity [m/s^2], shape (3,).
+    """
+
+    metres: float
+    kilograms: float
+    up: np.ndarray
+    gravity: np.ndarray
+
+
+def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
+    """Units, up axis and gravity of a stage, and what is odd about them; never raises."""
+    metres, notices = metres_per_unit(stage)
+    mass = root_metadata(stage, "kilogramsPerUnit")
+    kilograms = float(mass) if isinstance(mass, int | float) and math.isfinite(mass) and mass > 0 else 1.0
+    if mass is not None and kilograms != mass:
+        notices.append(Notice("", None, f"kilogramsPerUnit is {mass!r}, which is no mass; 1 assumed"))
+    rate = root_metadata(stage, "timeCodesPerSecond")
+    if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
+        notices.append(Notice("", None, f"timeCodesPerSecond is {rate!r}; time codes are kept, speeds mean nothing"))
+    up, odd = up_vector(stage)
+    return Units(metres, kilograms, up, gravity(stage, up, metres)), notices + odd
+
+
 def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
     """Unit vector that points up, shape (3,), and what is odd about it; never raises."""
     authored = root_metadata(stage, "upAxis")
@@ -141,14 +173,82 @@ def list_meshes(stage: Usd.Stage) -> tuple[str, ...]:
     return tuple(str(prim.GetPath()) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL) if prim.IsA(UsdGeom.Mesh))
 
 
-def open_stage(path: str) -> Usd.Stage:
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep USD's own warnings off the terminal; what matters in them becomes notices."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
+
+
+def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     """Open a stage with all payloads, for reading.
 
+    Args:
+        path: The shot file.
+
+    Returns:
+        The stage, and a notice for each layer, reference or payload that is missing.
+
     Raises:
-        StageError: When the file cannot be opened.
+        StageError: When the file or a layer that it needs cannot be read, or references run in a circle.
     """
-    with pxr_errors(f"cannot open {path}"):
+    with pxr_errors(f"cannot open {path}"), quiet():
         stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
-    if not stage:
-        raise StageError(f"cannot open {path}")
-    return stage
+        if not stage:
+            raise StageError(f"cannot open {path}")
+        problems = composition_problems(stage)
+    broken = [problem for problem in problems if not problem.missing]
+    if broken:
+        raise StageError(f"cannot compose {path}: {broken[0].message}" + _others(len(broken) - 1))
+    return stage, [Notice(problem.path, None, problem.message) for problem in problems]
+
+
+@dataclass(frozen=True)
+class CompositionProblem:
+    """One arc that USD could not follow.
+
+    Attributes:
+        path: Prim that has it.
+        message: What USD said, in one line.
+        missing: Whether its file or prim is just not there; False for circles and files that cannot be read.
+    """
+
+    path: str
+    message: str
+    missing: bool
+
+
+def composition_problems(stage: Usd.Stage) -> list[CompositionProblem]:
+    """Everything that USD could not compose, the same thing once."""
+    found = {}
+    for error in stage.GetCompositionErrors():
+        message = " ".join(str(error).split()).removesuffix(" .")
+        asset = re.search(r"@([^@]+)@", message)
+        exists = asset is not None and bool(Ar.GetResolver().Resolve(asset.group(1)))
+        kind = error.errorType.name
+        unreadable = kind.endswith(("InvalidSublayerPath", "InvalidAssetPath", "CorruptAsset")) and exists
+        path = str(error.rootSite.path) if error.rootSite else "/"
+        found[message] = CompositionProblem(path, message, not (unreadable or "Cycle" in kind))
+    return list(found.values())
+
+
+def refuse_missing_arcs(prim: Usd.Prim, notices: Sequence[Notice]) -> None:
+    """Refuse a prim that a missing payload or reference would have given opinions to.
+
+    Args:
+        prim: A garment or collider.
+        notices: What ``open_stage`` gave.
+
+    Raises:
+        StageError: With what is missing.
+    """
+    for notice in notices:
+        if notice.path not in {"", "/"} and prim.GetPath().HasPrefix(Sdf.Path(notice.path)):
+            raise StageError(f"<{prim.GetPath()}> is incomplete: {notice.message}")
+
+
+def _others(count: int) -> str:
+    return f" (and {count} more)" if count else ""

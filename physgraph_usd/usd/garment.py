@@ -1,0 +1,184 @@
+"""One garment, read from its mesh prim."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
+
+from ..scene import Garment, GarmentFrame
+from .cage import read_cage
+from .lookup import Override, find_value
+from .materials import Values, find_values
+from .painted import read_painted
+from .placement import check_matrix, check_placement, is_flipped, place, to_metres
+from .points import PointReader
+from .rest import Rest, checked, read_rest, rests_bent
+from .schema import GARMENT
+from .skinning import Bake
+from .stage import GarmentSource, Notice, Units
+from .times import garment_times, merge, transform_times, within
+
+_SMALL, _LARGE = 0.01, 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What was asked for, and what the garments of one stage share.
+
+    Attributes:
+        units: What the stage's numbers mean.
+        bake: Baked skinning.
+        frames: First and last time code, or None.
+        level: Number of subdivisions for all, -1 for auto, or None.
+        overrides: What ``--set`` gave.
+        rest_frame: Time code whose points are the rest shape, or None.
+        assumed_units: Whether metersPerUnit is not authored.
+    """
+
+    units: Units
+    bake: Bake
+    frames: tuple[float, float] | None = None
+    level: int | None = None
+    overrides: tuple[Override, ...] = ()
+    rest_frame: float | None = None
+    assumed_units: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentReader:
+    """A garment with what is needed to read its frames.
+
+    Attributes:
+        garment: Its constant data.
+        source: How it sits on the stage.
+        values: Sources of its animated values.
+        points: Its points.
+        edges: Its edges, shape (E, 2).
+        notices: What was found while reading.
+    """
+
+    garment: Garment
+    source: GarmentSource
+    values: Values
+    points: PointReader
+    edges: np.ndarray
+    notices: list[Notice] = field(default_factory=list)
+
+    def frame(self, matrix: np.ndarray, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
+        """Read one time code.
+
+        Args:
+            matrix: From local space to world metres, shape (4, 4).
+            time: Time code, or None for the default.
+
+        Returns:
+            The frame, and what was repaired in it.
+        """
+        local, notices = self.points.read(time, self.edges)
+        guide, detail = (self.values.number(name, time) for name in ("guide:stiffness", "refine:detail"))
+        return GarmentFrame(place(local, matrix), self.values.fabric(time), guide, detail), notices
+
+
+def all_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
+    """Every authored time code of a garment: of a skinned one, its skeleton's; baking adds samples that do not count."""
+    skinned = bake.skinned.get(prim.GetPath())
+    return merge([*skinned.times, *transform_times(prim)]) if skinned else garment_times(prim)
+
+
+def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) -> GarmentReader:
+    """Read a garment.
+
+    Args:
+        prim: Its mesh prim.
+        roots: The instances that hold it on the stage as opened.
+        request: What was asked for.
+
+    Raises:
+        GarmentError: When the garment is broken.
+        SchemaError: When one of its values cannot be used.
+    """
+    every = all_times(prim, request.bake)
+    times, first = within(every, request.frames), every[0] if every else None
+    points = PointReader(prim, times[0] if times else None)
+    cage = read_cage(prim, points.count, times)
+    edges = cage.mesh.half_edges.edges
+    notices = [*cage.notices, *check_placement(prim, request.units.metres, times)]
+    matrix = to_metres(prim, request.units.metres, first)
+    start = place(points.read(first, edges)[0], matrix)
+    rest = _rest_at(prim, points, request, edges=edges, start=start) if request.rest_frame is not None else None
+    rest = rest or _rest_on_stage(prim, matrix, request, edges=edges, start=start, first=first)
+    values = find_values(prim, request.units, request.overrides)
+    level, level_source = _level(prim, request)
+    garment = Garment(
+        path=str(prim.GetPath()),
+        mesh=cage.mesh,
+        rest=rest.points,
+        level=level,
+        flipped=is_flipped(prim, matrix),
+        bent_rest=rests_bent(prim),
+        **_painted(prim, points.count, notices),
+    )
+    notices += [*rest.notices, *_size_notices(garment.path, start, request)]
+    skinned = prim.GetPath() in request.bake.skinned
+    named = {**values.sources, "refine:level": level_source, "rest": rest.source}
+    place_on_stage = (prim.GetPath(), cage.kept_faces, skinned, tuple(roots), times)
+    return GarmentReader(
+        garment, GarmentSource(*place_on_stage, named, values.animated), values, points, edges, notices
+    )
+
+
+def _rest_at(prim: Usd.Prim, points: PointReader, request: Request, *, edges: np.ndarray, start: np.ndarray) -> Rest:
+    """Rest shape: the points at the time code that the user asked for."""
+    time = request.rest_frame
+    local, notices = points.read(time, edges)
+    placed = place(local, to_metres(prim, request.units.metres, time))
+    return checked(prim, edges, Rest(placed, f"points at time code {time:g} (--rest)", notices), first=start)
+
+
+def _rest_on_stage(
+    prim: Usd.Prim, matrix: np.ndarray, request: Request, *, edges: np.ndarray, start: np.ndarray, first: float | None
+) -> Rest:
+    """Rest shape that the stage gives; a skinned one is placed by its bind transform, not by the mesh's own."""
+    bound = matrix
+    if prim.GetPath() in request.bake.skinned:
+        rows = request.bake.rest_transform(prim.GetPath(), first)
+        bound = check_matrix(prim, rows, request.units.metres, time=first)
+    return read_rest(prim, edges, start, place=lambda local: place(local, bound), baked=request.bake.layer)
+
+
+def _level(prim: Usd.Prim, request: Request) -> tuple[int, str]:
+    found = find_value(prim, GARMENT["refine:level"], request.overrides)
+    if request.level is not None and found.source != "--set":
+        return request.level, "--level"
+    return round(found.at(None) or 0.0), found.source
+
+
+def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, np.ndarray]:
+    """The painted arrays of a garment by field name; adds to the notices."""
+    names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
+    names |= {"detail_scale": "detailScale", "pin": "pin"}
+    arrays = {}
+    for name, short in names.items():
+        arrays[name], odd = read_painted(prim, short, count)
+        notices.extend(odd)
+    return arrays
+
+
+def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:
+    """Tell the garment's size in metres when units were assumed or the size is no garment's."""
+    size = np.ptp(points, axis=0)
+    largest = float(size.max())
+    if not request.assumed_units and _SMALL <= largest <= _LARGE:
+        return []
+    said = " x ".join(f"{length:.3g}" for length in size)
+    return [Notice(path, None, f"measures {said} m with {request.units.metres:g} m per unit; check metersPerUnit")]
+
+
+def is_visible(prim: Usd.Prim, times: Sequence[float]) -> bool:
+    """Whether a prim is visible at any of the time codes, or by default when there are none."""
+    imageable = UsdGeom.Imageable(prim)
+    codes = [Usd.TimeCode(time) for time in times] or [Usd.TimeCode.Default()]
+    return any(imageable.ComputeVisibility(code) != UsdGeom.Tokens.invisible for code in codes)

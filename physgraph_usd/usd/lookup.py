@@ -1,0 +1,209 @@
+"""Looking a value up: ``--set``, the prim, its ancestors, the bound material, the fallback.
+
+Any numeric type is accepted, and Blender's ``userProperties:`` namespace, because a trip through a host program changes
+both and moves the attribute to the parent transform.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from pxr import Sdf, Usd, UsdShade
+
+from ..errors import SchemaError, UsageError
+from .schema import COLLIDER_API, GARMENT, MATERIAL, Property, find_property
+
+_OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
+_WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0, "auto": -1.0}
+USER_PROPERTIES = "userProperties:"
+"""Namespace in which Blender exports custom properties."""
+
+
+@dataclass(frozen=True)
+class Override:
+    """One ``--set``.
+
+    Attributes:
+        prim: Prim path at or above the garments it is for; "/" means every garment.
+        row: The attribute.
+        value: Its value.
+    """
+
+    prim: Sdf.Path
+    row: Property
+    value: float
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where a value comes from.
+
+    Attributes:
+        row: The attribute.
+        source: Who gives it, for the report.
+        attribute: The authored attribute, or None for a constant.
+        constant: The value when there is no attribute; None when nothing gives one.
+        scale: Factor from the stage's number to SI.
+    """
+
+    row: Property
+    source: str
+    attribute: Usd.Attribute | None = None
+    constant: float | None = None
+    scale: float = 1.0
+
+    @property
+    def animated(self) -> bool:
+        """Whether the source has more than one sample."""
+        return self.attribute is not None and self.attribute.ValueMightBeTimeVarying()
+
+    def at(self, time: float | None) -> float | None:
+        """Value in SI at a time code; None when nothing gives one.
+
+        Raises:
+            SchemaError: When the value is no number or outside its limits.
+        """
+        if self.attribute is None:
+            return self.constant
+        return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
+
+
+def parse_overrides(texts: Sequence[str]) -> tuple[Override, ...]:
+    """Read ``</prim>.attribute=value`` or ``attribute=value`` texts.
+
+    Raises:
+        UsageError: When one cannot be read, names an unknown attribute or is out of limits.
+    """
+    return tuple(_parse_override(text) for text in texts)
+
+
+def _parse_override(text: str) -> Override:
+    match = _OVERRIDE.match(text.strip())
+    if match is None:
+        raise UsageError(f"cannot read {text!r}; write </prim>.attribute=value or attribute=value")
+    row, word = find_property(match["name"]), match["value"].strip().lower()
+    if row.type == "rel" or row.interpolation:
+        raise UsageError(f"{row.name} is not a single number; author it on the prim")
+    try:
+        value = _WORDS[word] if word in _WORDS else float(word)
+        return Override(Sdf.Path(match["prim"] or "/"), row, check_limits(row, value, text))
+    except (ValueError, SchemaError) as error:
+        raise UsageError(f"cannot use {text!r}: {error}") from error
+
+
+def check_overrides(overrides: Sequence[Override], garments: Sequence[Sdf.Path]) -> None:
+    """Refuse an override that is for no garment.
+
+    Raises:
+        UsageError: Naming it and the garments there are.
+    """
+    for override in overrides:
+        if not any(path.HasPrefix(override.prim) for path in garments):
+            known = ", ".join(str(path) for path in garments)
+            raise UsageError(f"--set {override.prim}.{override.row.name}: no such garment; garments: {known}")
+
+
+def with_ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:
+    """Iterate over a prim and its ancestors, nearest first, without the pseudo-root."""
+    while prim and not prim.IsPseudoRoot():
+        yield prim
+        prim = prim.GetParent()
+
+
+def authored(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
+    """Return the attribute of this prim that authors a value under a name, or under Blender's name for it."""
+    for full in (name, USER_PROPERTIES + name):
+        attribute = prim.GetAttribute(full)
+        if attribute and attribute.HasAuthoredValue():
+            return attribute
+    return None
+
+
+def nearest(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
+    """Return the authored attribute on the prim or its nearest ancestor that has one."""
+    return next((found for each in with_ancestors(prim) if (found := authored(each, name))), None)
+
+
+def bound_materials(prim: Usd.Prim) -> tuple[Usd.Prim, ...]:
+    """Materials bound to a prim, the physics purpose first, without repeats."""
+    binding = UsdShade.MaterialBindingAPI(prim)
+    found: list[Usd.Prim] = []
+    for purpose in ("physics", UsdShade.Tokens.allPurpose):
+        material = binding.ComputeBoundMaterial(purpose)[0]
+        if material and material.GetPrim() not in found:
+            found.append(material.GetPrim())
+    return tuple(found)
+
+
+def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> Found:
+    """Find who gives a value; the bound material counts for ``physgraph:material:`` values only.
+
+    Args:
+        prim: The garment, or a collider.
+        row: The attribute.
+        overrides: What ``--set`` gave.
+
+    Returns:
+        The source; its ``constant`` is the fallback when nothing authors a value.
+    """
+    mine = [item for item in overrides if item.row.name == row.name and prim.GetPath().HasPrefix(item.prim)]
+    if mine:
+        winner = max(enumerate(mine), key=lambda pair: (pair[1].prim.pathElementCount, pair[0]))[1]
+        return Found(row, "--set", None, winner.value)
+    attribute = nearest(prim, row.name)
+    if attribute is None and row.name.startswith(MATERIAL):
+        materials = bound_materials(prim)
+        attribute = next((found for each in materials if (found := authored(each, row.name))), None)
+    if attribute is not None:
+        return Found(row, source_name(attribute), attribute)
+    return Found(row, "fallback", None, None if row.fallback is None else float(row.fallback))
+
+
+def source_name(attribute: Usd.Attribute) -> str:
+    """How reports write an attribute: ``</prim>.name``."""
+    return f"<{attribute.GetPrim().GetPath()}>.{attribute.GetName()}"
+
+
+def read_number(attribute: Usd.Attribute, time: float | None) -> float:
+    """Read an attribute of any numeric type.
+
+    Raises:
+        SchemaError: When it holds something else.
+    """
+    value = attribute.Get(Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
+    if value is None:
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    if not isinstance(value, bool | int | float):
+        kind = attribute.GetTypeName()
+        raise SchemaError(f"{source_name(attribute)} is {value!r} of type {kind}; a single number is needed")
+    return float(value)
+
+
+def check_limits(row: Property, value: float, source: str) -> float:
+    """Return the value when it is finite and inside its limits.
+
+    Raises:
+        SchemaError: With the value, the source and the limits.
+    """
+    low = -math.inf if row.minimum is None else row.minimum
+    high = math.inf if row.maximum is None else row.maximum
+    if not (math.isfinite(value) and low <= value <= high):
+        allowed = f"[{low:g}, {high:g}]" + (f" {row.unit}" if row.unit else "")
+        raise SchemaError(f"{source}: {row.name} is {value:g}; it must be finite and in {allowed}")
+    if row.type == "int" and value != round(value):
+        raise SchemaError(f"{source}: {row.name} is {value:g}; it must be a whole number")
+    return value
+
+
+def is_on(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> bool:
+    """Value of a boolean attribute."""
+    return bool(find_value(prim, row, overrides).at(None))
+
+
+ENABLED = GARMENT["enabled"]
+"""Whether a garment is refined."""
+COLLIDER_ENABLED = Property(COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None, "", True)
+"""Whether a collider counts."""

@@ -1,0 +1,52 @@
+"""Painted multipliers and pins: one float per vertex, or one for all."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ..errors import SchemaError
+from .schema import GARMENT
+from .stage import Notice
+
+_PER_VERTEX = {UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying}
+
+
+def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tuple[Notice, ...]]:
+    """Read one of the ``primvars:physgraph:*`` values; constant ones are inherited from ancestors as USD does.
+
+    Args:
+        prim: Mesh prim.
+        short: Short name of the row, such as ``bendScale``.
+        count: Number of points.
+
+    Returns:
+        Values, shape (count,), float64, and what was odd about them.
+
+    Raises:
+        SchemaError: When the interpolation, type, number or sign of the values cannot be used.
+    """
+    row = GARMENT[short]
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(row.name.removeprefix("primvars:"))
+    flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()) if primvar and primvar.HasAuthoredValue() else None
+    if flat is None:
+        return np.full(count, float(row.fallback or 0.0)), ()
+    values = np.atleast_1d(np.asarray(flat))
+    where = f"<{prim.GetPath()}>.{row.name}"
+    if values.ndim != 1 or not (np.issubdtype(values.dtype, np.number) or values.dtype == bool):
+        raise SchemaError(f"{where} is {type(flat).__name__}; author float[]")
+    values = values.astype(np.float64)
+    interpolation = primvar.GetInterpolation()
+    if len(values) == 1 and (interpolation not in _PER_VERTEX or count == 1):
+        values = np.full(count, values[0])
+    elif interpolation not in _PER_VERTEX or len(values) != count:
+        said = f"{len(values)} values with {interpolation} interpolation on {count} points"
+        raise SchemaError(f"{where} has {said}; author one value per point (vertex) or one for all (constant)")
+    broken = ~np.isfinite(values) | (values < 0)
+    if broken.any():
+        index = int(broken.argmax())
+        raise SchemaError(f"{where}[{index}] is {values[index]:g}; it must be finite and not negative")
+    if row.maximum is not None and (values > row.maximum).any():
+        said = f"{row.name} goes up to {values.max():g}; values over {row.maximum:g} are taken as {row.maximum:g}"
+        return np.minimum(values, row.maximum), (Notice(str(prim.GetPath()), None, said),)
+    return values, ()

@@ -1,0 +1,52 @@
+"""Which time codes a garment has, in composed stage time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pxr import Usd, UsdGeom
+
+from .lookup import with_ancestors
+
+SAME_TIME = 1e-6
+"""Time codes closer than this are one: layer offsets leave rounding behind."""
+
+
+def transform_chain(prim: Usd.Prim) -> list[UsdGeom.Xformable]:
+    """Return the transforms that place a prim, nearest first, up to one that resets the stack."""
+    chain = []
+    for each in with_ancestors(prim):
+        if each.IsA(UsdGeom.Xformable):
+            chain.append(UsdGeom.Xformable(each))
+            if chain[-1].GetResetXformStack():
+                break
+    return chain
+
+
+def garment_times(prim: Usd.Prim) -> tuple[float, ...]:
+    """Every authored time code of the points and of the transforms that place the prim, ascending."""
+    return merge([*UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples(), *transform_times(prim)])
+
+
+def transform_times(prim: Usd.Prim) -> list[float]:
+    """Every authored time code of the transforms that place a prim, in no order."""
+    return [time for transform in transform_chain(prim) for time in transform.GetTimeSamples()]
+
+
+def merge(times: Iterable[float]) -> tuple[float, ...]:
+    """Sort time codes and drop those that repeat an earlier given one up to rounding."""
+    ranked = sorted((time, rank) for rank, time in enumerate(times))
+    kept: list[tuple[float, int]] = []
+    for time, rank in ranked:
+        if kept and time - kept[-1][0] <= SAME_TIME:
+            kept[-1] = min(kept[-1], (time, rank), key=lambda pair: pair[1])
+        else:
+            kept.append((time, rank))
+    return tuple(time for time, _ in kept)
+
+
+def within(times: Iterable[float], frames: tuple[float, float] | None) -> tuple[float, ...]:
+    """Time codes inside a closed range, up to rounding; all of them when there is none."""
+    if frames is None:
+        return tuple(times)
+    return tuple(time for time in times if frames[0] - SAME_TIME <= time <= frames[1] + SAME_TIME)
