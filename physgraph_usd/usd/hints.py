@@ -56,11 +56,11 @@ class ModelHints:
     def _grow(self, model: Usd.Prim, time: float | None, corners: np.ndarray) -> None:
         """Author the union of a hint and eight corners, at a time where the hint is animated, else as default."""
         attribute = model.GetAttribute(ATTRIBUTE)
-        animated = time is not None and attribute.GetNumTimeSamples() > 0
+        time = time if attribute.GetNumTimeSamples() > 0 else None
         path = model.GetPath().AppendProperty(ATTRIBUTE)
-        code = Usd.TimeCode(time) if animated else Usd.TimeCode.Default()
+        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
         spec = self._stream.attribute(path, Sdf.ValueTypeNames.Float3Array)
-        ours = self._stream.layer.QueryTimeSample(path, time) if animated else spec.default
+        ours = self._stream.layer.QueryTimeSample(path, time) if time is not None else spec.default
         value = attribute.Get(code) if ours is None else ours
         rows = np.array(value if value is not None else [], np.float32).reshape(-1, 3)
         empty = np.tile(np.array([[np.finfo(np.float32).max], [-np.finfo(np.float32).max]], np.float32), (1, 3))
@@ -70,4 +70,4 @@ class ModelHints:
         grown = rows.copy()
         grown[self._row] = np.minimum(low, corners.min(axis=0))
         grown[self._row + 1] = np.maximum(high, corners.max(axis=0))
-        self._stream.set(path, Vt.Vec3fArray.FromNumpy(grown), time=time if animated else None)
+        self._stream.set(path, Vt.Vec3fArray.FromNumpy(grown), time=time)

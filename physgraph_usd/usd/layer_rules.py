@@ -35,10 +35,10 @@ def time_scale(layer: Sdf.Layer) -> Iterator[Problem]:
 
 def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:
     """The layer brings no other layer and authors in no variant."""
-    if list(layer.subLayerPaths):
-        yield _error(f"has sublayers {list(layer.subLayerPaths)}; a refined layer stands over the shot, not on it")
+    if len(layer.subLayerPaths):
+        yield _error(f"has sublayers {layer.subLayerPaths}; a refined layer stands over the shot, not on it")
     found: list[Sdf.Path] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, found.append)
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(Sdf.Path(path)))
     for path in found:
         if path.IsPrimVariantSelectionPath():
             yield _error("authors inside a variant of an asset", str(path))
@@ -64,7 +64,7 @@ def is_mesh(path: str, composed: Usd.Stage) -> str:
         return "is not on the stage: the layer is not over the shot that it was made from"
     if prim.IsInstanceProxy():
         return "lies in an instance, where overs are ignored; its instance root must be instanceable = false"
-    return "" if prim.IsA(UsdGeom.Mesh) else f"is of type {prim.GetTypeName() or 'none'}, not Mesh"
+    return "" if UsdGeom.Mesh(prim) else f"is of type {prim.GetTypeName() or 'none'}, not Mesh"
 
 
 def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:
@@ -90,7 +90,7 @@ def _times(prim: Usd.Prim) -> set[float]:
     """Authored times of a mesh's points and of every transform above it."""
     times = set(UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples())
     while prim and not prim.IsPseudoRoot():
-        if prim.IsA(UsdGeom.Xformable):
+        if UsdGeom.Xformable(prim):
             times.update(UsdGeom.Xformable(prim).GetTimeSamples())
         prim = prim.GetParent()
     return times
@@ -99,7 +99,7 @@ def _times(prim: Usd.Prim) -> set[float]:
 def _is_skinned(prim: Usd.Prim) -> bool:
     """Whether a skeleton may move the coarse mesh; then its own points are a bind pose."""
     while prim and not prim.IsPseudoRoot():
-        if prim.IsA(UsdSkel.Root):
+        if UsdSkel.Root(prim):
             return True
         prim = prim.GetParent()
     return False

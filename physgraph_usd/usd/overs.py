@@ -105,7 +105,7 @@ def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, s
         spec = stream.prim(target)
         skeleton = spec.relationships.get("skel:skeleton") or Sdf.RelationshipSpec(spec, "skel:skeleton", False)
         skeleton.targetPathList.ClearEditsAndMakeExplicit()
-    elif prim.HasAPI(UsdSkel.BindingAPI):
+    elif UsdSkel.BindingAPI(prim):
         delete_schema(stream, target, "SkelBindingAPI")
 
 

@@ -155,7 +155,8 @@ def root_over(source: Sdf.Layer, below: list[str]) -> Sdf.Layer:
         if key not in _NOT_FOR_ROOT and "elocates" not in key:
             root.pseudoRoot.SetInfo(key, source.pseudoRoot.GetInfo(key))
     root.timeCodesPerSecond = source.timeCodesPerSecond
-    root.subLayerPaths = below
+    for identifier in below:
+        root.subLayerPaths.append(identifier)
     return root
 
 

@@ -285,7 +285,7 @@ def skinning(fine: Fine) -> Iterator[Problem]:
     """The mesh is not skinned a second time."""
     skeleton = fine.prim.GetRelationship("skel:skeleton")
     cut_off = skeleton and skeleton.HasAuthoredTargets() and not skeleton.GetTargets()
-    if fine.prim.HasAPI(UsdSkel.BindingAPI) and not cut_off:
+    if UsdSkel.BindingAPI(fine.prim) and not cut_off:
         yield fine.problem("", "SkelBindingAPI is still applied; the mesh would be skinned twice")
     for name in STALE[1:]:
         if len(fine.entries(name, None)):

@@ -73,7 +73,7 @@ def _check_editable(prim: Usd.Prim) -> None:
             f"<{prim.GetPath()}> lies in an instance, where a layer over the shot cannot reach; tag the prim in the "
             "asset, or name it when refining"
         )
-    if not prim.IsA(UsdGeom.Gprim):
+    if not UsdGeom.Gprim(prim):
         raise StageError(f"<{prim.GetPath()}> is a {prim.GetTypeName() or 'prim without a type'}; it has no surface")
 
 

@@ -96,12 +96,9 @@ def _garments(layer: Sdf.Layer) -> Sequence[str]:
     named = (read_record(layer) or {}).get("garments")
     if named:
         return [str(path) for path in named]
-    found: list[str] = []
-    layer.Traverse(
-        Sdf.Path.absoluteRootPath,
-        lambda path: found.append(str(path.GetPrimPath())) if path.name == "points" else None,
-    )
-    return sorted(found)
+    found: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(Sdf.Path(path)))
+    return sorted(str(path.GetPrimPath()) for path in found if path.name == "points")
 
 
 def _coarse(shot: Usd.Stage, layer: Sdf.Layer, path: str) -> Usd.Prim:
@@ -134,7 +131,7 @@ def _recorded_shot(layer: Sdf.Layer) -> Path | None:
 def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
     """Run USD's validators; what the shot itself already has is left out."""
     try:
-        from pxr import UsdValidation  # noqa: PLC0415 - not in every host
+        from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
     except ImportError:
         return []
     if not hasattr(UsdValidation, "ValidationContext"):
