@@ -44,7 +44,7 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
     if not found:
         raise StageError(f"no prim has {GARMENT_API} and no garment was named; {_meshes_said(stage)}")
     for prim in found:
-        if not prim.IsA(UsdGeom.Mesh):
+        if not UsdGeom.Mesh(prim):
             kind = prim.GetTypeName() or "prim without a type"
             remedy = "apply the schema to the meshes themselves"
             raise GarmentError(str(prim.GetPath()), f"has {GARMENT_API} but is a {kind}, not a Mesh", remedy=remedy)
@@ -123,9 +123,9 @@ def _match(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
 
 def _gprims_below(root: Usd.Prim, kind: type) -> list[Sdf.Path]:
     """The prim itself when it is of the kind, else those of the kind below it."""
-    if root.IsA(kind):
+    if kind(root):
         return [root.GetPath()]
-    return [prim.GetPath() for prim in Usd.PrimRange(root, TRAVERSAL) if prim.IsA(kind)]
+    return [prim.GetPath() for prim in Usd.PrimRange(root, TRAVERSAL) if kind(prim)]
 
 
 def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:

@@ -83,7 +83,7 @@ class GarmentReader:
 
 
 def all_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
-    """Every authored time code of a garment: of a skinned one, its skeleton's; baking adds samples that do not count."""
+    """Every authored time code of a garment; a skinned one has its skeleton's, samples added by baking do not count."""
     skinned = bake.skinned.get(prim.GetPath())
     return merge([*skinned.times, *transform_times(prim)]) if skinned else garment_times(prim)
 

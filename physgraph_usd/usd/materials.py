@@ -18,13 +18,6 @@ from .lookup import Found, Override, authored, bound_materials, find_value, read
 from .schema import GARMENT, MATERIAL, Property
 from .stage import Units
 
-_FABRIC_FIELDS = {
-    "stretch": "stretchStiffness",
-    "bend": "bendStiffness",
-    "density": "density",
-    "thickness": "thickness",
-    "shear": "shearStiffness",
-}
 _PROPOSAL = {
     "stretchStiffness": "physics:surfaceStretchStiffness",
     "shearStiffness": "physics:surfaceShearStiffness",
@@ -32,7 +25,7 @@ _PROPOSAL = {
     "density": "physics:density",
     "thickness": "physics:surfaceThickness",
 }
-_FRAME_VALUES = (*_FABRIC_FIELDS.values(), "guide:stiffness", "refine:detail")
+_FRAME_VALUES = (*_PROPOSAL, "guide:stiffness", "refine:detail")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +56,11 @@ class Values:
         Raises:
             SchemaError: When a value cannot be used.
         """
-        values = {field: self.found[name].at(time) for field, name in _FABRIC_FIELDS.items()}
-        if self.volumetric:
-            values["density"] = self.found["density"].at(time) * values["thickness"]
-        return Fabric(**values)
+        stretch, bend, thickness, density = (
+            self.number(name, time) for name in ("stretchStiffness", "bendStiffness", "thickness", "density")
+        )
+        density *= thickness if self.volumetric else 1.0
+        return Fabric(stretch, bend, density, thickness, self.found["shearStiffness"].at(time))
 
     def number(self, name: str, time: float | None) -> float:
         """Any other value at a time code, by short name."""
@@ -99,6 +93,5 @@ def _from_proposal(materials: Sequence[Usd.Prim], row: Property, units: Units) -
 
 def is_collision_prim(prim: Usd.Prim) -> bool:
     """Whether UsdPhysics makes a prim collide."""
-    if not prim.HasAPI(UsdPhysics.CollisionAPI) or not prim.IsA(UsdGeom.Imageable):
-        return False
-    return UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get() is not False
+    collision = UsdPhysics.CollisionAPI(prim)
+    return bool(collision) and bool(UsdGeom.Imageable(prim)) and collision.GetCollisionEnabledAttr().Get() is not False

@@ -118,7 +118,7 @@ def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) 
     out = points.copy()
     both = np.concatenate([edges, edges[:, ::-1]]).astype(np.int64) if len(edges) else np.zeros((0, 2), np.int64)
     while True:
-        finite = np.isfinite(out).all(axis=1)
+        finite: np.ndarray = np.isfinite(out).all(axis=1)
         use = both[~finite[both[:, 0]] & finite[both[:, 1]]]
         if len(use) == 0:
             break
@@ -127,7 +127,7 @@ def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) 
         np.add.at(count, use[:, 0], 1.0)
         some = count > 0
         out[some] = base[some] + total[some] / count[some, None]
-    left = ~np.isfinite(out).all(axis=1)
+    left = np.flatnonzero(~np.isfinite(out).all(axis=1))
     if reference is not None:
         out[left] = reference[left]
     return out

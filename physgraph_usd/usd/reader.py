@@ -16,11 +16,11 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Sdf, Usd
 
-from ..errors import StageError, UsageError
+from ..errors import SchemaError, StageError, UsageError
 from ..scene import Frame, Scene
 from .find import find_colliders, find_garments, instance_roots
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
-from .lookup import ENABLED, check_overrides, is_on, parse_overrides
+from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .placement import to_metres
 from .schema import GARMENT
 from .skinning import Bake
@@ -35,8 +35,6 @@ from .stage import (
     root_metadata,
 )
 from .times import merge, within
-
-_LEVEL = GARMENT["refine:level"]
 
 
 class Shot:
@@ -161,8 +159,11 @@ def _check_options(frames: tuple[float, float] | None, level: int | None, rest_f
     """Refuse options that no stage could satisfy."""
     if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
         raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
-    if level is not None and not _LEVEL.minimum <= level <= _LEVEL.maximum:
-        raise UsageError(f"level {level} is outside {_LEVEL.minimum}..{_LEVEL.maximum} (-1 chooses it)")
+    if level is not None:
+        try:
+            check_limits(GARMENT["refine:level"], level, "--level")
+        except SchemaError as error:
+            raise UsageError(str(error)) from error
     if rest_frame is not None and not math.isfinite(rest_frame):
         raise UsageError(f"rest frame {rest_frame} is no time code")
 

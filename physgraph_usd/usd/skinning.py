@@ -91,7 +91,7 @@ class Bake:
 
 def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
     """Return the skel root above a prim; None when there is none and UsdSkel leaves the prim alone."""
-    return next((each for each in with_ancestors(prim) if each.IsA(UsdSkel.Root)), None)
+    return next((each for each in with_ancestors(prim) if UsdSkel.Root(each)), None)
 
 
 def make_editable(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
@@ -178,8 +178,8 @@ def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
     codes = [Usd.TimeCode.Default() if time is None else Usd.TimeCode(time) for time in times]
     baked = [UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()) for code in codes]
     spec = layer.GetPrimAtPath(path)
-    for name in [each.name for each in spec.properties if each.name.startswith("xformOp")]:
-        del spec.properties[name]
+    for each in [each for each in spec.properties if each.name.startswith("xformOp")]:
+        spec.RemoveProperty(each)
     with Usd.EditContext(stage, layer):
         for code, matrix in zip(codes, baked, strict=True):
             own = UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim())

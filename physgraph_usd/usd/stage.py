@@ -16,6 +16,7 @@ from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from ..errors import StageError
 
+_WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 STANDARD_GRAVITY = 9.81
 """Magnitude of gravity when no physics scene gives one [m/s^2]."""
 FALLBACK_METRES_PER_UNIT = 0.01
@@ -157,9 +158,9 @@ def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> np.ndarray:
     UsdPhysics: a zero direction means down, a negative infinite magnitude means earth's; units are stage lengths.
     """
     direction, magnitude = -up, STANDARD_GRAVITY
-    scene = next((prim for prim in Usd.PrimRange.Stage(stage, TRAVERSAL) if prim.IsA(UsdPhysics.Scene)), None)
-    if scene is not None:
-        physics = UsdPhysics.Scene(scene)
+    scenes = (UsdPhysics.Scene(prim) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL))
+    physics = next((scene for scene in scenes if scene), None)
+    if physics is not None:
         authored = np.array(physics.GetGravityDirectionAttr().Get() or Gf.Vec3f(0.0), dtype=np.float64)
         length = float(np.linalg.norm(authored))
         direction = authored / length if math.isfinite(length) and length > 0 else direction
@@ -170,15 +171,15 @@ def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> np.ndarray:
 
 def list_meshes(stage: Usd.Stage) -> tuple[str, ...]:
     """Paths of all meshes on the stage, those inside instances included."""
-    return tuple(str(prim.GetPath()) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL) if prim.IsA(UsdGeom.Mesh))
+    return tuple(str(prim.GetPath()) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL) if UsdGeom.Mesh(prim))
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
     """Keep USD's own warnings off the terminal; what matters in them becomes notices."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        yield
+        yield delegate
     finally:
         delegate.TakeUncoalescedDiagnostics()
 
@@ -195,11 +196,12 @@ def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     Raises:
         StageError: When the file or a layer that it needs cannot be read, or references run in a circle.
     """
-    with pxr_errors(f"cannot open {path}"), quiet():
+    with pxr_errors(f"cannot open {path}"), quiet() as diagnostics:
         stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
         if not stage:
             raise StageError(f"cannot open {path}")
-        problems = composition_problems(stage)
+        said = [item.commentary for item in diagnostics.TakeUncoalescedDiagnostics()]
+        problems = composition_problems(stage, said)
     broken = [problem for problem in problems if not problem.missing]
     if broken:
         raise StageError(f"cannot compose {path}: {broken[0].message}" + _others(len(broken) - 1))
@@ -221,17 +223,24 @@ class CompositionProblem:
     missing: bool
 
 
-def composition_problems(stage: Usd.Stage) -> list[CompositionProblem]:
-    """Everything that USD could not compose, the same thing once."""
+def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[CompositionProblem]:
+    """Everything that USD could not compose, the same thing once.
+
+    Args:
+        stage: The stage.
+        warnings: What USD said while opening it; read where USD is too old to list its composition errors.
+    """
+    errors = getattr(stage, "GetCompositionErrors", None)
+    if errors is None:
+        told = [match.groups() for text in warnings if (match := _WARNED.match(" ".join(text.split())))]
+    else:
+        told = [(str(error.rootSite.path) if error.rootSite else "/", str(error)) for error in errors()]
     found = {}
-    for error in stage.GetCompositionErrors():
-        message = " ".join(str(error).split()).removesuffix(" .")
-        asset = re.search(r"@([^@]+)@", message)
+    for path, text in told:
+        message = " ".join(text.split()).removesuffix(" .")
+        asset = re.search(r"(?:load sublayer|open asset) @([^@]+)@", message)
         exists = asset is not None and bool(Ar.GetResolver().Resolve(asset.group(1)))
-        kind = error.errorType.name
-        unreadable = kind.endswith(("InvalidSublayerPath", "InvalidAssetPath", "CorruptAsset")) and exists
-        path = str(error.rootSite.path) if error.rootSite else "/"
-        found[message] = CompositionProblem(path, message, not (unreadable or "Cycle" in kind))
+        found[message] = CompositionProblem(path or "/", message, not (exists or "ycle" in message))
     return list(found.values())
 
 

@@ -16,9 +16,10 @@ def transform_chain(prim: Usd.Prim) -> list[UsdGeom.Xformable]:
     """Return the transforms that place a prim, nearest first, up to one that resets the stack."""
     chain = []
     for each in with_ancestors(prim):
-        if each.IsA(UsdGeom.Xformable):
-            chain.append(UsdGeom.Xformable(each))
-            if chain[-1].GetResetXformStack():
+        transform = UsdGeom.Xformable(each)
+        if transform:
+            chain.append(transform)
+            if transform.GetResetXformStack():
                 break
     return chain
 
