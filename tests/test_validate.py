@@ -246,6 +246,7 @@ def test_an_over_inside_an_instance_is_caught(tmp_path: Path) -> None:
 
 
 def test_usd_validators_run_and_the_shots_own_faults_are_left_out(tmp_path: Path) -> None:
+    pytest.importorskip("pxr.UsdValidation", reason="this version of USD has no validators of its own")
     stage = make_shot(tmp_path / "shot.usda")
     stage.GetRootLayer().ClearDefaultPrim()
     stage.Save()

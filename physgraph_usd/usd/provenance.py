@@ -16,6 +16,7 @@ from pxr import Sdf, Tf, Usd, Vt
 
 from ..errors import LayerError
 from .atomic import prepare_target, publish, temporary_path
+from .stage import reason_of
 
 RECORD = "physgraph"
 _COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
@@ -172,7 +173,7 @@ def export_layer(layer: Sdf.Layer, path: Path) -> Path:
             raise LayerError(f"cannot write {path}")
         publish(temporary, path)
     except Tf.ErrorException as error:
-        raise LayerError(f"cannot write {path}: {error}") from error
+        raise LayerError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
         temporary.unlink(missing_ok=True)
     loaded = Sdf.Layer.Find(str(path))

@@ -14,6 +14,7 @@ from pxr import Sdf, Tf
 
 from ..errors import LayerError, UsageError
 from .atomic import prepare_target, publish, temporary_path
+from .stage import reason_of
 
 FLUSH_BYTES = 16_000_000
 """Pending array bytes at which the layer is saved; each save rewrites a few kilobytes of tables."""
@@ -172,7 +173,9 @@ class LayerStream:
 
     def _failure(self, error: Tf.ErrorException) -> LayerError:
         """Say in one line what stopped a save."""
-        reason = str(error.args[0].commentary) if error.args and hasattr(error.args[0], "commentary") else str(error)
+        reasons = reason_of(error).split("; ")
+        # Some versions report unrelated trouble first, such as a plugin that failed to load.
+        reason = next((each for each in reasons if "writ" in each.lower()), reasons[0])
         return LayerError(f"cannot write {self.target}: {reason}; nothing was left under that name")
 
     def __enter__(self) -> LayerStream:

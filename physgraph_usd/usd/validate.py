@@ -13,6 +13,7 @@ from ..errors import LayerError
 from . import layer_rules
 from .provenance import read_record, root_over
 from .rules import RULES, Fine, Problem
+from .stage import reason_of
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
 
@@ -113,7 +114,7 @@ def _open(path: Path) -> Sdf.Layer:
     try:
         layer = Sdf.Layer.FindOrOpen(str(path))
     except Tf.ErrorException as error:
-        raise LayerError(f"cannot read {path}: {error}") from error
+        raise LayerError(f"cannot read {path}: {reason_of(error)}") from error
     if not layer:
         raise LayerError(f"cannot read {path}")
     return layer
