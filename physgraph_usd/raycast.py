@@ -210,7 +210,7 @@ def _color(world: _World, face: np.ndarray, weights: np.ndarray, to_eye: np.ndar
     key = np.einsum("hc,hc->h", weights, world.light.key[corners])
     color = _shade(world, normal, to_eye, ambient, key) * world.colors[face]
     color[inside] *= 0.72
-    sheen = 0.10 * ambient * (1.0 - np.einsum("hk,hk->h", normal, to_eye)).clip(0, 1) ** 3
+    sheen = 0.05 * ambient * (1.0 - np.einsum("hk,hk->h", normal, to_eye)).clip(0, 1) ** 3
     color += sheen[:, None]
     return color * (1.0 - 0.38 * _line(world, face, weights, pixel)[:, None])
 

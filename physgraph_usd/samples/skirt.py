@@ -12,7 +12,7 @@ from .grid import ease, grid_uv, quad_grid
 ROWS, AROUND, FOLDS = 23, 76, 8
 """Rows from waist to hem, columns around, and folds at the hem."""
 
-WAIST, HEM, LENGTH = (0.145, 0.115), 0.36, 0.52
+WAIST, HEM, LENGTH = (0.146, 0.116), 0.36, 0.52
 """Half axes of the waist, radius of the hem at rest and length down the side [m]."""
 
 FRAMES, WARM_UP, STEPS = 48, 40, 2
@@ -118,10 +118,10 @@ def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
 
 
 def _push_out(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Move points that are inside the hips to 6 mm outside, horizontally."""
+    """Move points that are inside the hips to 15 mm outside, horizontally."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    across = np.interp(-local[:, 1], -PROFILE[:, 0], PROFILE[:, 1]) + 0.006
-    deep = np.interp(-local[:, 1], -PROFILE[:, 0], PROFILE[:, 2]) + 0.006
+    across = np.interp(-local[:, 1], -PROFILE[:, 0], PROFILE[:, 1]) + 0.015
+    deep = np.interp(-local[:, 1], -PROFILE[:, 0], PROFILE[:, 2]) + 0.015
     reach = np.hypot(local[:, 0] / across, local[:, 2] / deep)
     grow = np.where((reach < 1.0) & (local[:, 1] > PROFILE[-1, 0]), 1.0 / np.maximum(reach, 1e-3), 1.0)
     return (local * np.stack([grow, np.ones_like(grow), grow], axis=1)) @ pose[:3, :3].T + pose[:3, 3]
@@ -135,7 +135,7 @@ def _hip_mesh(poses: np.ndarray) -> PlainMesh:
     deep = np.interp(-height, -PROFILE[:, 0], PROFILE[:, 2])
     a = 2 * np.pi * np.arange(around) / around
     ring = np.stack(np.broadcast_arrays(across[:, None] * np.cos(a), height[:, None], deep[:, None] * np.sin(a)), -1)
-    ends = np.array([[0.0, PROFILE[0, 0] + 0.02, 0.0], [0.0, PROFILE[-1, 0] - 0.02, 0.0]])
+    ends = np.array([[0.0, PROFILE[0, 0] + 0.001, 0.0], [0.0, PROFILE[-1, 0] - 0.02, 0.0]])
     points = np.concatenate([ring.reshape(-1, 3), ends])
     quads = quad_grid(rows, around, closed=True)[:, ::-1]
     step = (np.arange(around) + 1) % around

@@ -19,6 +19,9 @@ SLOPE = np.radians(28.0)
 SHOULDER = (0.150, 0.505)
 """Where an arm turns: distance from the middle and height [m]."""
 
+SPINE = 0.17
+"""Height at which the chest bends on the hips [m]."""
+
 FRAMES = 36
 
 
@@ -43,7 +46,7 @@ def build() -> PlainStage:
         skin=_weights(shirt.points),
         scheme="catmullClark",
     )
-    doc = "A T-shirt whose arms are raised and lowered by linear-blend skinning"
+    doc = "A T-shirt whose arms are raised and lowered, and whose chest turns, by linear-blend skinning"
     return PlainStage("TshirtShot", doc, (garment, _form()), times, _skeleton(times))
 
 
@@ -66,7 +69,7 @@ def _form() -> PlainMesh:
     level = np.concatenate([points, np.stack(np.broadcast_arrays(*ring), axis=-1).reshape(-1, 3)])
     cap = np.arange(20)[::-1] + len(points)
     weights = _weights(level)
-    weights.weights[len(points) :] = 1.0, 0.0
+    weights.weights[len(points) :] = 0.0, 1.0, 0.0
     return PlainMesh(
         name="Form",
         counts=np.concatenate([np.full(len(body.quads) + len(neck), 4), [20]]),
@@ -103,7 +106,7 @@ def _dress(shirt: Pillow) -> np.ndarray:
     """Shape the neckline and the shoulders, then lower the sleeves."""
     points = shirt.points.copy()
     x, y = points[:, 0], points[:, 1]
-    near = ease((y - 0.30) / (SHIRT.shoulder - 0.30)) * ease(1.0 - np.abs(x) / (1.35 * SHIRT.neck))
+    near = ease((y - 0.30) / (SHIRT.shoulder - 0.30)) * np.sqrt((1.0 - (x / (1.15 * SHIRT.neck)) ** 2).clip(0.0))
     front = points[:, 2] > 0
     points[:, 1] -= np.where(front, 0.060, 0.020) * near
     points[:, 1] += 0.030 * ease((y - 0.35) / 0.22) * (1.0 - np.abs(x) / 0.2).clip(0.0)
@@ -122,29 +125,33 @@ def _trim(shirt: Pillow) -> np.ndarray:
 
 
 def _weights(points: np.ndarray) -> Skin:
-    """Weights of torso, left and right arm from the distance to the middle, with level arms."""
+    """Weights of hips, chest and one arm; points are those with level arms."""
     arm = ease((np.abs(points[:, 0]) - 0.10) / 0.15) * _above(points)
-    joints = np.column_stack([np.zeros(len(points), int), np.where(points[:, 0] > 0, 1, 2)])
-    return Skin(joints, np.column_stack([1.0 - arm, arm]))
+    chest = ease((points[:, 1] - SPINE + 0.14) / 0.28)
+    count = len(points)
+    joints = np.column_stack([np.zeros(count, int), np.ones(count, int), np.where(points[:, 0] > 0, 2, 3)])
+    return Skin(joints, np.column_stack([(1.0 - chest) * (1.0 - arm), chest * (1.0 - arm), arm]))
 
 
 def _skeleton(times: np.ndarray) -> Skeleton:
-    """The left arm rises and the right one falls, then they change places; the torso follows a little."""
-    bind = np.tile(np.eye(4), (3, 1, 1))
-    bind[1, :2, 3] = SHOULDER
-    bind[2, :2, 3] = -SHOULDER[0], SHOULDER[1]
+    """One arm rises, the other falls and the chest leans and turns; then all change sides."""
+    bind = np.tile(np.eye(4), (4, 1, 1))
+    bind[1, 1, 3] = SPINE
+    bind[2, :2, 3] = SHOULDER
+    bind[3, :2, 3] = -SHOULDER[0], SHOULDER[1]
     t = (times - times[0]) / (times[-1] - times[0])
     up = ease(t / 0.45) - 2.0 * ease((t - 0.5) / 0.45)  # 1: left raised, right lowered; -1: the reverse
-    left = np.radians(np.where(up > 0, 75.0, 48.0) * up)
-    right = np.radians(np.where(up > 0, 48.0, 75.0) * up)
     zero = np.zeros_like(up)
-    rotations = np.stack(
-        [
-            np.stack([np.cos(0.06 * up), zero, np.sin(0.06 * up), zero], axis=1),
-            np.stack([np.cos(left / 2), zero, zero, np.sin(left / 2)], axis=1),
-            np.stack([np.cos(right / 2), zero, zero, np.sin(right / 2)], axis=1),
-        ],
-        axis=1,
-    )
-    translations = np.broadcast_to(bind[:, :3, 3], (len(times), 3, 3))
-    return Skeleton(("torso", "torso/arm_left", "torso/arm_right"), bind, rotations, translations)
+    left = np.where(up > 0, 64.0, 44.0) * up
+    right = np.where(up > 0, 44.0, 64.0) * up
+    turns = [[zero, -6.0 * up, zero], [zero, -22.0 * up, 17.0 * up], [zero, zero, left], [zero, zero, right]]
+    rotations = _quaternions(np.radians(np.moveaxis(np.array(turns), 2, 0)))
+    local = bind[:, :3, 3] - bind[[0, 0, 1, 1], :3, 3]
+    joints = ("hips", "hips/chest", "hips/chest/arm_left", "hips/chest/arm_right")
+    return Skeleton(joints, bind, rotations, np.broadcast_to(local, (len(times), 4, 3)))
+
+
+def _quaternions(vectors: np.ndarray) -> np.ndarray:
+    """Quaternions (w, x, y, z) of rotation vectors [rad], shape (..., 4)."""
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(0.5 * angle), vectors * 0.5 * np.sinc(0.5 * angle / np.pi)], axis=-1)
