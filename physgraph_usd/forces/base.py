@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,6 +16,7 @@ from ..mesh.stencil import SCALAR, VECTOR, vectors
 from ..mesh.topology import incidence
 
 
+@runtime_checkable
 class Force(Protocol):
     """One term of the potential.
 
@@ -48,9 +49,7 @@ class ForceModule:
         """Keep the terms in order; the order fixes the rounding of their sum."""
         self.forces = tuple(forces)
 
-    def energy_and_force(
-        self, x: Float[Tensor, "vertices 3"]
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
+    def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
         force = torch.zeros_like(x)
         energy = torch.zeros((), dtype=torch.float64, device=x.device)
@@ -127,7 +126,8 @@ class Elements:
         self._starts = wp.array(rows.starts, dtype=wp.int32, device=self.device)
         self._slots = wp.array(slots, dtype=wp.int32, device=self.device)
         packed = wp.types.vector(length=width, dtype=wp.int32)
-        self._corners = corners.contiguous()
+        # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
+        self._corners = corners.clone(memory_format=torch.contiguous_format)
         self.corners = wp.from_torch(self._corners, dtype=packed)
         self.energy = torch.zeros(self.count, dtype=dtype, device=self.device)
         self.corner_force = torch.zeros((self.count * width, 3), dtype=dtype, device=self.device)

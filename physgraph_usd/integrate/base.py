@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +12,7 @@ from torch import Tensor
 from .metric import Metric
 
 
+@runtime_checkable
 class ForceField(Protocol):
     """The only face of the physics that an integrator meets."""
 
@@ -97,6 +98,7 @@ class Carry:
         return replace(self, mover=mover)
 
 
+@runtime_checkable
 class Integrator(Protocol):
     """Turns forces into displacements."""
 

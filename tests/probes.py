@@ -1,0 +1,261 @@
+"""Calibration probes: the elastic constants that a mesh really has, and hanging strips against closed formulas.
+
+The in-plane probe strains the rim of a sheet by each of the three uniform strains, lets the inside relax, and reads the
+stiffness matrix C from the energies: so C is what the sheet shows to an experiment, not what its elements were given.
+The bending probe does the same with the three uniform curvatures. The strips are solved to rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.integrate import solve_bvp
+from scipy.optimize import brentq
+from sheets import level_of
+
+from physgraph_usd.fabric import Fabric
+from physgraph_usd.forces.base import Force, ForceModule
+from physgraph_usd.forces.bending import Bending
+from physgraph_usd.forces.gravity import Gravity
+from physgraph_usd.forces.membrane import in_plane_terms
+from physgraph_usd.integrate.base import System
+from physgraph_usd.integrate.metric import Metric
+from physgraph_usd.integrate.newton import Newton
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.level import Level
+
+G = 9.81
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A constant over all directions in the sheet."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def hessian(force: Force, x: torch.Tensor, axes: Sequence[int]) -> np.ndarray:
+    """Central differences of a force [N/m], shape (n V, n V) for n axes; degrees of freedom vertex by vertex.
+
+    Vertices that share no neighbour move at once: no row feels two of them.
+    """
+    step, count, n = 1e-6 * float(x.std()), len(x), len(axes)
+    near = pattern(force)
+    out = np.zeros((count, n, count, n))
+    for together in colours(near):
+        rows, which = np.nonzero(near[:, together])
+        for column, axis in enumerate(axes):
+            sides = []
+            for sign in (1.0, -1.0):
+                moved, f = x.clone(), torch.zeros_like(x)
+                moved[torch.as_tensor(together), axis] += sign * step
+                force.add_force(moved, f)
+                sides.append(f[:, axes].numpy())
+            out[rows, :, together[which], column] = ((sides[1] - sides[0]) / (2 * step))[rows]
+    flat = out.reshape(count * n, count * n)
+    return 0.5 * (flat + flat.T)
+
+
+def pattern(force: Force) -> np.ndarray:
+    """Which vertices feel which, shape (V, V)."""
+    matrix = force.rest_matrix()
+    assert matrix is not None
+    near = np.zeros(matrix.shape, bool)
+    near[np.repeat(np.arange(len(near)), np.diff(matrix.indptr)), matrix.indices] = True
+    return near
+
+
+def colours(near: np.ndarray) -> list[np.ndarray]:
+    """Groups of vertices that share no neighbour, greedily."""
+    shares = near.astype(np.float32) @ near.astype(np.float32) > 0
+    left, groups = np.ones(len(near), bool), []
+    while left.any():
+        group: list[int] = []
+        blocked = ~left
+        while not blocked.all():
+            vertex = int(np.flatnonzero(~blocked)[0])
+            group.append(vertex)
+            blocked |= shares[vertex]
+            blocked[vertex] = True
+        left[group] = False
+        groups.append(np.array(group))
+    return groups
+
+
+def relaxed(stiffness: np.ndarray, modes: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Modes whose free entries minimise the quadratic energy, shape (N, modes)."""
+    free = ~held
+    result = modes.copy()
+    load = -stiffness[np.ix_(free, held)] @ modes[held]
+    result[free] = np.linalg.lstsq(stiffness[np.ix_(free, free)], load, rcond=1e-10)[0]
+    return result
+
+
+def rim(level: Level, depth: float) -> np.ndarray:
+    """True at vertices within a depth of the sheet's bounding box sides."""
+    p = level.rest[:, :2].numpy()
+    return ((p < p.min(axis=0) + depth) | (p > p.max(axis=0) - depth)).any(axis=1)
+
+
+def plane_stiffness(level: Level, forces: Sequence[Force]) -> np.ndarray:
+    """C [N/m] of the sheet, shape (3, 3), for strains (e11, e22, 2 e12)."""
+    p = level.rest.numpy()
+    none = np.zeros(len(p))
+    modes = [(p[:, 0], none), (none, p[:, 1]), (0.5 * p[:, 1], 0.5 * p[:, 0])]
+    modes = np.stack([np.stack(mode, axis=1).reshape(-1) for mode in modes], axis=1)
+    stiffness = sum(hessian(force, level.rest, [0, 1]) for force in forces)
+    held = np.repeat(rim(level, 1.2 * float(level.spacing.mean())), 2)
+    u = relaxed(stiffness, modes, held)
+    return u.T @ stiffness @ u / float(level.triangle_area.sum())
+
+
+def bending_stiffness(level: Level, rigidity: float) -> np.ndarray:
+    """Bending stiffness [N m], shape (3, 3), for curvatures (k11, k22, 2 k12).
+
+    Only triangles away from the rim count, each with its share of its three hinges.
+    """
+    p, edge = level.rest.numpy(), float(level.spacing.mean())
+    modes = 0.5 * np.stack([p[:, 0] ** 2, p[:, 1] ** 2, p[:, 0] * p[:, 1]], axis=1)
+    bending = Bending(level, torch.tensor([rigidity]))
+    u = relaxed(hessian(bending, level.rest, [2]), modes, rim(level, 2.2 * edge))
+    centre = p[level.triangles.numpy()].mean(axis=1)[:, :2]
+    inside = ((centre > p.min(axis=0)[:2] + 3.2 * edge) & (centre < p.max(axis=0)[:2] - 3.2 * edge)).all(axis=1)
+    area = level.triangle_area.numpy()
+    first, second = hinge_triangles(level)
+    share = (area[first] * inside[first] + area[second] * inside[second]) / (area[first] + area[second])
+    bending.weight.mul_(torch.as_tensor(share))
+    return u.T @ hessian(bending, level.rest, [2]) @ u / float((area * inside).sum())
+
+
+def hinge_triangles(level: Level) -> tuple[np.ndarray, np.ndarray]:
+    """The two triangles of each hinge."""
+    number = {frozenset(t): n for n, t in enumerate(level.triangles.tolist())}
+    pairs = [(number[frozenset((i, j, k))], number[frozenset((i, j, m))]) for i, j, k, m in level.hinges.tolist()]
+    return tuple(np.array(pairs).T)
+
+
+def turned(stiffness: np.ndarray, angle: float) -> np.ndarray:
+    """A stiffness matrix for axes turned by an angle [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    strain = np.array([[c * c, s * s, -c * s], [s * s, c * c, c * s], [2 * c * s, -2 * c * s, c * c - s * s]])
+    return strain.T @ stiffness @ strain
+
+
+def over_directions(measure: object) -> Spread:
+    """Mean and extremes of a function of direction over half a turn."""
+    values = np.array([measure(angle) for angle in np.linspace(0, np.pi, 73)[:-1]])
+    return Spread(float(values.mean()), float(values.min()), float(values.max()))
+
+
+def plane_constants(stiffness: np.ndarray) -> dict[str, Spread]:
+    """Young's modulus Y, Poisson's ratio nu and shear stiffness G over all directions."""
+
+    def compliance(angle: float) -> np.ndarray:
+        return np.linalg.inv(turned(stiffness, angle))
+
+    return {
+        "Y": over_directions(lambda a: 1.0 / compliance(a)[0, 0]),
+        "nu": over_directions(lambda a: -compliance(a)[1, 0] / compliance(a)[0, 0]),
+        "G": over_directions(lambda a: 1.0 / compliance(a)[2, 2]),
+    }
+
+
+def bending_constants(stiffness: np.ndarray) -> dict[str, Spread]:
+    """D of a cylinder of any direction, and the ratio of its two moments."""
+    return {
+        "D": over_directions(lambda a: turned(stiffness, a)[0, 0]),
+        "nu": over_directions(lambda a: turned(stiffness, a)[1, 0] / turned(stiffness, a)[0, 0]),
+    }
+
+
+def tensile_test(level: Level, forces: Sequence[Force]) -> tuple[float, float]:
+    """Young's modulus [N/m] and Poisson's ratio along x: short sides pulled, everything else free."""
+    p, strain = level.rest.numpy(), 1.0
+    stiffness = sum(hessian(force, level.rest, [0, 1]) for force in forces)
+    edge = float(level.spacing.mean())
+    ends = (p[:, 0] < p[:, 0].min() + 0.6 * edge) | (p[:, 0] > p[:, 0].max() - 0.6 * edge)
+    held = np.stack([ends, np.arange(len(p)) == int(np.flatnonzero(ends)[0])], axis=1)
+    modes = np.stack([strain * p[:, 0], 0 * p[:, 0]], axis=1)
+    u = relaxed(stiffness, modes.reshape(-1, 1), held.reshape(-1))[:, 0]
+    inside = np.abs(p[:, 0] - p[:, 0].mean()) < 0.3 * np.ptp(p[:, 0])
+    fit = np.column_stack([p[inside, 0], p[inside, 1], np.ones(inside.sum())])
+    slope = np.linalg.lstsq(fit, u.reshape(-1, 2)[inside], rcond=None)[0]
+    pulled = u @ stiffness @ u / (float(level.triangle_area.sum()) * float(slope[0, 0]) * strain)
+    return pulled, -slope[1, 1] / slope[0, 0]
+
+
+def cylinder_rigidity(level: Level, radius: float, angle: float) -> float:
+    """D over the hinges' D, from the energy of the sheet rolled onto a cylinder, every vertex on it."""
+    bending = Bending(level, torch.ones(1))
+    p = level.rest.numpy()
+    along = p[:, 0] * np.cos(angle) + p[:, 1] * np.sin(angle)
+    across = p[:, 1] * np.cos(angle) - p[:, 0] * np.sin(angle)
+    rolled = np.stack([radius * np.sin(along / radius), across, radius * np.cos(along / radius)], axis=1)
+    energy = float(bending.add_force(torch.as_tensor(rolled), torch.zeros_like(level.rest)))
+    return 2 * energy * radius**2 / float(level.hinge_area.sum())
+
+
+def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int = 400) -> torch.Tensor:
+    """The positions at rest: quasi-Newton first, Newton to polish."""
+    module = ForceModule(forces)
+    system = System(
+        module, Metric(module.rest_matrix(), free=level.free, dtype=level.dtype), free=level.free, spacing=level.spacing
+    )
+    for integrator, count in ((QuasiNewton(), steps), (Newton(), 60)):
+        x, _ = solve_level(system, integrator, x, level=0, budget=Budget(count, 1e-7))
+    return x
+
+
+def hang(
+    points: np.ndarray, triangles: np.ndarray, pinned: np.ndarray, start: np.ndarray, fabric: Fabric
+) -> np.ndarray:
+    """Rest positions of a pinned sheet under its own weight, z up."""
+    level = level_of(points, triangles, pin=pinned.astype(float))
+    weight = Gravity(level, torch.tensor([fabric.density]), np.array([0.0, 0.0, -G]))
+    forces = (*in_plane_terms(level, [fabric]), Bending(level, torch.tensor([fabric.bend])), weight)
+    return relax(level, forces, torch.as_tensor(start)).numpy()
+
+
+def cantilever(points: np.ndarray, triangles: np.ndarray, length: float, fabric: Fabric) -> float:
+    """Angle of the chord below the horizontal [rad] of a strip clamped where x <= 0, free at x = length."""
+    start = points.copy()
+    out = np.maximum(points[:, 0], 0.0)
+    start[:, 0] = np.minimum(points[:, 0], 0.0) + length * np.sin(out / length)
+    start[:, 2] = -length * (1.0 - np.cos(out / length))
+    settled = hang(points, triangles, points[:, 0] < 1e-9, start, fabric)
+    tip = settled[points[:, 0] > length * (1 - 1e-3)].mean(axis=0)
+    return float(np.arctan2(-tip[2], tip[0]))
+
+
+def elastica(length: float, rigidity: float, density: float) -> float:
+    """The same angle of the heavy elastica: rigidity t'' = -density G (length - s) cos t, t(0) = t'(length) = 0."""
+    load = density * G * length**3 / rigidity
+    s = np.linspace(0, 1, 201)
+    guess = np.stack([s, 1 - s])
+    found = solve_bvp(
+        lambda s, t: np.stack([t[1], -load * (1 - s) * np.cos(t[0])]),
+        lambda a, b: np.array([a[0], b[1]]),
+        s,
+        guess,
+        tol=1e-8,
+    )
+    s = np.linspace(0, 1, 2001)
+    t = found.sol(s)[0]
+    return float(np.arctan2(np.trapezoid(np.sin(t), s), np.trapezoid(np.cos(t), s)))
+
+
+def peirce(angle: float, length: float, density: float) -> float:
+    """Peirce's D [N m] from the chord's angle: density G c^3, c = length (cos(angle / 2) / (8 tan angle))^(1/3)."""
+    return density * G * length**3 * np.cos(angle / 2) / (8 * np.tan(angle))
+
+
+def catenary_sag(length: float, span: float) -> float:
+    """Sag [m] of an inextensible chain between two points at equal height."""
+    a = brentq(lambda a: 2 * a * np.sinh(span / (2 * a)) - length, 1e-3 * length, 1e3 * length)
+    return float(a * (np.cosh(span / (2 * a)) - 1))

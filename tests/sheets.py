@@ -1,0 +1,121 @@
+"""Flat sheets of several mesh kinds, and single levels built from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from meshes import grid
+from scipy.spatial import Delaunay
+
+from physgraph_usd.level import Level, build_levels
+from physgraph_usd.mesh.subdivide import subdivide
+from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.scene import Garment
+
+Sheet = tuple[np.ndarray, np.ndarray]
+"""Points in the xy plane, shape (V, 3), and counter-clockwise triangles, shape (T, 3)."""
+
+
+def triangle_mesh(triangles: np.ndarray, vertex_count: int) -> PolygonMesh:
+    """A polygon mesh of triangles."""
+    return PolygonMesh(np.full(len(triangles), 3), triangles.ravel(), vertex_count)
+
+
+def garment_of(mesh: PolygonMesh, rest: np.ndarray, *, bent: bool = False, **painted: np.ndarray) -> Garment:
+    """A garment with unit paint and no pins unless given."""
+    one = np.ones(mesh.vertex_count)
+    paint = {"stretch_scale": one, "bend_scale": one, "guide_scale": one, "detail_scale": one, "pin": 0 * one}
+    return Garment("/World/Sheet", mesh, rest, 0, False, bent, **(paint | painted))
+
+
+def level_of(
+    rest: np.ndarray,
+    triangles: np.ndarray,
+    *,
+    dtype: torch.dtype = torch.float64,
+    bent: bool = False,
+    **painted: np.ndarray,
+) -> Level:
+    """The cage level of one garment of triangles."""
+    mesh = triangle_mesh(np.asarray(triangles), len(rest))
+    return build_levels([garment_of(mesh, np.asarray(rest), bent=bent, **painted)], [()], dtype=dtype)[0]
+
+
+def equilateral(length: float, width: float, edge: float) -> Sheet:
+    """Equilateral triangles, rows along x; the short sides are jagged by half an edge."""
+    columns, rows = round(length / edge), max(1, round(width / (edge * np.sqrt(0.75))))
+    points = np.array(
+        [
+            [edge * (c + 0.5 * (r % 2)), edge * np.sqrt(0.75) * r, 0.0]
+            for r in range(rows + 1)
+            for c in range(columns + 1)
+        ]
+    )
+    faces = []
+    for r in range(rows):
+        for c in range(columns):
+            a, d = r * (columns + 1) + c, (r + 1) * (columns + 1) + c
+            faces += [[a, a + 1, d], [a + 1, d + 1, d]] if r % 2 == 0 else [[a, d + 1, d], [a, a + 1, d + 1]]
+    return points, np.array(faces)
+
+
+def irregular(length: float, width: float, edge: float) -> Sheet:
+    """Delaunay triangles of a jittered equilateral lattice in a rectangle; every quality is over 0.3."""
+    rng = np.random.default_rng(7)
+    columns, rows = round(length / edge), max(1, round(width / (edge * np.sqrt(0.75))))
+    inner = [
+        [(c + 0.5 * (r % 2)) / columns * length, r / rows * width]
+        for r in range(1, rows)
+        for c in range(columns + 1)
+        if 0.4 < c + 0.5 * (r % 2) < columns - 0.4
+    ]
+    points = np.array(inner).reshape(-1, 2)
+    points = points + rng.uniform(-0.22, 0.22, points.shape) * edge
+    along, across = np.linspace(0, length, columns + 1), np.linspace(0, width, rows + 1)[1:-1]
+    rim = [[x, y] for x in along for y in (0.0, width)] + [[x, y] for y in across for x in (0.0, length)]
+    points = np.concatenate([points, rim])
+    faces = Delaunay(points).simplices.astype(np.int64)
+    flat = quality(points, faces) > 1e-6
+    return np.column_stack([points, np.zeros(len(points))]), faces[flat]
+
+
+def quads_refined(length: float, width: float, edge: float) -> Sheet:
+    """Squares as one subdivision of a quad cage gives them: diagonals alternate."""
+    cage, points = grid(max(1, round(length / (2 * edge))), max(1, round(width / (2 * edge))))
+    refinement = subdivide(cage)
+    points = refinement.linear @ points
+    scale = np.array([length, width, 0.0]) / np.maximum(np.ptp(points, axis=0), 1e-300)
+    return points * scale, refinement.mesh.triangulate().triangles.astype(np.int64)
+
+
+def quads_one_way(length: float, width: float, edge: float) -> Sheet:
+    """Squares whose diagonals all run one way."""
+    mesh, points = grid(round(length / edge), max(1, round(width / edge)), "triangles")
+    scale = np.array([length, width, 0.0]) / np.maximum(np.ptp(points, axis=0), 1e-300)
+    return points * scale, mesh.indices.reshape(-1, 3).astype(np.int64)
+
+
+KINDS: dict[str, Callable[[float, float, float], Sheet]] = {
+    "equilateral": equilateral,
+    "irregular": irregular,
+    "quads, alternating": quads_refined,
+    "quads, one way": quads_one_way,
+}
+"""Sheets of a length, a width and an edge length, by the name of their mesh kind."""
+
+
+def quality(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """4 sqrt(3) area / sum of squared sides: 1 for equilateral triangles, 0 for collapsed ones."""
+    a, b, c = (points[triangles[:, corner], :2] for corner in range(3))
+    double = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    squares = sum(((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a)))
+    return 2 * np.sqrt(3) * double / squares
+
+
+def rotation(seed: int) -> np.ndarray:
+    """A random rotation, shape (3, 3)."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.sign(np.linalg.det(q))

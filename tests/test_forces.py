@@ -1,0 +1,246 @@
+"""Every force against its energy: finite differences, autograd of an independent energy, and the laws they keep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from energies import (
+    apart,
+    autograd_force,
+    bending_energy,
+    difference_force,
+    evaluate,
+    fold,
+    membrane_energy,
+    stretch_energy,
+)
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from meshes import planar_mesh
+from sheets import equilateral, level_of, quality, rotation
+from torch import Tensor
+
+from physgraph_usd.forces.base import Force, ForceModule
+from physgraph_usd.forces.bending import Bending
+from physgraph_usd.forces.gravity import Gravity
+from physgraph_usd.forces.guide import Guide, GuideMap
+from physgraph_usd.forces.membrane import Membrane
+from physgraph_usd.forces.stretch import Stretch
+from physgraph_usd.forces.tether import Tether
+from physgraph_usd.level import Level
+
+DOWN = np.array([0.0, 0.0, -9.81])
+POTENTIALS = ("continuum", "paper")
+INTERNAL = ("stretch", "membrane", "bending")
+ELASTIC = (*INTERNAL, "gravity")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A sheet and what was done to it. Levels are built in the tests: the shape checker draws random numbers."""
+
+    rest: np.ndarray
+    triangles: np.ndarray
+    bent: bool
+    noise: float
+    seed: int
+
+    def build(self, *, scale: float = 1.0, dtype: torch.dtype = torch.float64) -> Level:
+        return level_of(scale * self.rest, self.triangles, bent=self.bent, dtype=dtype)
+
+    @property
+    def x(self) -> Tensor:
+        return crumple(self.rest, self.noise, self.seed)
+
+
+def force_of(name: str, level: Level, *, potential: str = "continuum", scale: float = 1.0) -> Force:
+    """A term with constants of everyday size; `scale` multiplies its stiffness or weight."""
+
+    def of(value: float) -> Tensor:
+        return torch.full((len(level.spans),), scale * value, dtype=torch.float64)
+
+    makers: dict[str, Callable[[], Force]] = {
+        "stretch": lambda: Stretch(level, of(30.0), potential=potential),
+        "membrane": lambda: Membrane(level, of(30.0), of(7.0), potential=potential),
+        "bending": lambda: Bending(level, of(0.05), potential=potential),
+        "gravity": lambda: Gravity(level, of(0.2), DOWN, potential=potential),
+        "guide": lambda: guide_of(level, scale),
+        "tether": lambda: Tether(level, of(0.2), 400.0, level.rest * 1.1),
+    }
+    return makers[name]()
+
+
+def guide_of(level: Level, scale: float = 1.0) -> Guide:
+    stiffness = torch.full((level.from_coarse.shape[1],), 2000.0 * scale)
+    return Guide(level, GuideMap(level), stiffness).retarget(1.1 * level.rest)
+
+
+def crumple(rest: np.ndarray, amount: float, seed: int) -> Tensor:
+    """The rest shape with noise, turned and moved."""
+    rng = np.random.default_rng(seed)
+    x = rest + rng.normal(scale=amount, size=rest.shape)
+    return torch.as_tensor(x @ rotation(seed).T + rng.normal(size=3))
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    """A crumpled sheet of jittered triangles with holes, on a bent rest shape in any position."""
+    mesh, rest = draw(planar_mesh())
+    triangles = mesh.triangulate(rest).triangles
+    assume(len(triangles) > 0 and quality(rest, triangles).min() > 0.15)
+    seed = draw(st.integers(0, 2**16))
+    rest[:, 2] = 0.3 * np.sin(rest[:, 0] + seed)
+    rest = rest @ rotation(seed + 1).T
+    return Case(rest, triangles, draw(st.booleans()), draw(st.sampled_from([0.02, 0.2])), seed)
+
+
+def away_from_kinks(level: Level, x: Tensor) -> bool:
+    """No hinge near half a turn from its rest angle, no edge near collapse."""
+    bent = fold(x, level.hinges.long()) - level.rest_angle
+    bent = bent - 2 * torch.pi * torch.round(bent / (2 * torch.pi))
+    ends = level.edges.long()
+    length = (x[ends[:, 0]] - x[ends[:, 1]]).norm(dim=1)
+    flat = quality_in_space(x, level.triangles.long())
+    return bool((bent.abs() < 3.0).all() and (length > 0.2).all() and (flat > 0.1).all())
+
+
+def quality_in_space(x: Tensor, triangles: Tensor) -> Tensor:
+    a, b, c = (x[triangles[:, n]] for n in range(3))
+    squares = (b - a).square().sum(1) + (c - b).square().sum(1) + (a - c).square().sum(1)
+    return 2 * 3**0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1) / squares
+
+
+@pytest.mark.parametrize("potential", POTENTIALS)
+@pytest.mark.parametrize("name", ELASTIC)
+@settings(max_examples=12)
+@given(case=cases())
+def test_force_is_minus_the_difference_quotient(name: str, potential: str, case: Case):
+    level, x = case.build(), case.x
+    assume(away_from_kinks(level, x))
+    force = force_of(name, level, potential=potential)
+    f = evaluate(force, x)[1]
+    some = range(0, len(x), 3)
+    expected = difference_force(force, x, 1e-3, some)
+    kept = torch.zeros_like(x)
+    kept[list(some)] = f[list(some)]
+    assert (kept - expected).abs().max() < 1e-6 * f.abs().max()
+
+
+@pytest.mark.parametrize("name", ["guide", "tether"])
+@settings(max_examples=10)
+@given(case=cases())
+def test_tie_is_minus_the_difference_quotient(name: str, case: Case):
+    level, x = case.build(), case.x
+    force = force_of(name, level)
+    assert apart(evaluate(force, x)[1], difference_force(force, x, 1e-2)) < 1e-6
+
+
+@settings(max_examples=60)
+@given(case=cases(), paper=st.booleans())
+def test_forces_match_autograd_of_an_independent_energy(case: Case, paper: bool):
+    level, x, bent = case.build(), case.x, case.bent
+    rest, triangles = level.rest, case.triangles
+    energies = {
+        "stretch": stretch_energy(rest, triangles, 30.0, paper=paper),
+        "membrane": membrane_energy(rest, triangles, 30.0, 7.0, paper=paper),
+        "bending": bending_energy(rest, triangles, 0.05, paper=paper, bent=bent),
+    }
+    for name, energy in energies.items():
+        if name == "bending" and not len(level.hinges):
+            continue
+        found, f = evaluate(force_of(name, level, potential=POTENTIALS[paper]), x)
+        expected, g = autograd_force(energy, x)
+        assert found == pytest.approx(expected, rel=1e-9)
+        assert apart(f, g) < 1e-8, name
+
+
+@settings(max_examples=25)
+@given(case=cases(), potential=st.sampled_from(POTENTIALS), seed=st.integers(0, 99))
+def test_internal_forces_balance_and_turn_with_the_mesh(case: Case, potential: str, seed: int):
+    level, x = case.build(), case.x
+    turn, shift = torch.as_tensor(rotation(seed)), torch.tensor([0.3, -2.0, 1.0])
+    for name in INTERNAL:
+        force = force_of(name, level, potential=potential)
+        energy, f = evaluate(force, x)
+        size = f.abs().sum() + 1e-30
+        assert f.sum(dim=0).abs().max() < 1e-12 * size
+        assert torch.linalg.cross(x, f).sum(dim=0).abs().max() < 1e-11 * size * x.abs().max()
+        turned_energy, turned = evaluate(force, x @ turn.T + shift)
+        assert turned_energy == pytest.approx(energy, rel=1e-9, abs=1e-15)
+        assert (turned - f @ turn.T).abs().max() < 1e-9 * size
+
+
+@pytest.mark.parametrize("potential", POTENTIALS)
+@settings(max_examples=10)
+@given(case=cases())
+def test_scaling_lengths_and_stiffness(potential: str, case: Case):
+    """Energies scale as Y length^2, D, density length^3, guide length^4 and tether density length^4."""
+    level, x = case.build(), case.x
+    larger = case.build(scale=7.0)
+    powers = {"stretch": 2, "membrane": 2, "bending": 0, "gravity": 3, "guide": 4, "tether": 4}
+    for name, power in powers.items():
+        energy, f = evaluate(force_of(name, level, potential=potential), x)
+        scaled, g = evaluate(force_of(name, larger, potential=potential, scale=3.0), 7.0 * x)
+        assert scaled == pytest.approx(3.0 * 7.0**power * energy, rel=1e-9, abs=1e-15)
+        assert apart(g, 3.0 * 7.0 ** (power - 1) * f) < 1e-9 or not bool(f.any())
+
+
+@settings(max_examples=15)
+@given(case=cases())
+def test_float32_agrees_with_float64_and_repeats_bit_for_bit(case: Case):
+    level, x = case.build(), case.x
+    single = case.build(dtype=torch.float32)
+    for name in (*ELASTIC, "guide", "tether"):
+        energy, f = evaluate(force_of(name, level), x)
+        found, g = evaluate(force_of(name, single), x.float())
+        again, h = evaluate(force_of(name, single), x.float())
+        stiffness = float(force_of(name, level).diagonal(x).max()) * float(level.spacing.mean())
+        size = max(float(f.abs().max()), stiffness)
+        assert found == again
+        assert torch.equal(g, h)
+        assert abs(found - energy) < 1e-5 * max(abs(energy), size)
+        assert (g - f).abs().max() < 3e-5 * size
+
+
+def test_no_elements_have_no_energy():
+    level = level_of(np.zeros((3, 3)), np.zeros((0, 3), np.int64))
+    for name in INTERNAL:
+        energy, f = evaluate(force_of(name, level), level.rest + 1.0)
+        assert energy == 0.0
+        assert not f.any()
+        assert force_of(name, level).rest_matrix().nnz == 0
+
+
+def test_module_sums_its_terms():
+    rest, triangles = equilateral(0.5, 0.4, 0.1)
+    level = level_of(rest, triangles)
+    x = crumple(rest, 0.02, 3)
+    terms = [force_of(name, level) for name in (*ELASTIC, "guide")]
+    module = ForceModule(terms)
+    energy, f = module.energy_and_force(x)
+    parts = [evaluate(term, x) for term in terms]
+    assert float(energy) == pytest.approx(sum(part for part, _ in parts))
+    assert apart(f, sum((g for _, g in parts), torch.zeros_like(x))) < 1e-12
+    assert module.energies(x) == {term.name: part for term, (part, _) in zip(terms, parts, strict=True)}
+    assert apart(module.diagonal(x), sum((t.diagonal(x) for t in terms), torch.zeros(len(x)))) < 1e-12
+    total = sum(matrix.toarray() for term in terms if (matrix := term.rest_matrix()) is not None)
+    assert np.allclose(module.rest_matrix().toarray(), total)
+
+
+def test_gravity_is_the_weight_of_the_sheet():
+    rest, triangles = equilateral(0.5, 0.4, 0.1)
+    level = level_of(rest, triangles)
+    weight = evaluate(force_of("gravity", level), level.rest)[1].sum(dim=0)
+    assert weight.numpy() == pytest.approx(0.2 * float(level.triangle_area.sum()) * DOWN)
+
+
+def test_a_collapsed_edge_pulls_nowhere():
+    rest, triangles = equilateral(0.2, 0.1, 0.1)
+    level = level_of(rest, triangles)
+    energy, f = evaluate(force_of("stretch", level), torch.zeros_like(level.rest))
+    assert energy > 0
+    assert not f.any()
