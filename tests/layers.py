@@ -12,10 +12,13 @@ from physgraph_usd.mesh.attributes import vertex_values
 from physgraph_usd.mesh.subdivide import Refinement, subdivide_times
 from physgraph_usd.usd.provenance import root_over
 from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.validate import validate_layer
 from physgraph_usd.usd.writer import LayerWriter
 
 COAT = "/World/rig/coat"
 TIMES = (1.0, 2.5, 4.0)
+MIRROR = Gf.Matrix4d().SetScale(Gf.Vec3d(-2, 1, 0.5)) * Gf.Matrix4d().SetTranslate(Gf.Vec3d(1e4, -3, 7))
+"""A parent that mirrors, scales unevenly and lies far from the origin."""
 
 
 def grid(columns: int = 4, rows: int = 3, *, quads: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -143,3 +146,17 @@ def open_over(path: Path, out: Path) -> Usd.Stage:
     """The layer composed over its shot."""
     shot = Sdf.Layer.FindOrOpen(str(path))
     return Usd.Stage.Open(root_over(shot, [str(out), str(path)]))
+
+
+def errors(out: Path, shot: Path | None = None) -> list[str]:
+    """What the validator calls errors."""
+    return [str(problem) for problem in validate_layer(out, shot) if problem.severity == "error"]
+
+
+def world_metres(stage: Usd.Stage, path: str, time: float | None) -> np.ndarray:
+    """Points of a mesh in world metres."""
+    code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+    matrix = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()))
+    points = np.asarray(mesh.GetPointsAttr().Get(code), np.float64)
+    return (points @ matrix[:3, :3] + matrix[3, :3]) * UsdGeom.GetStageMetersPerUnit(stage)

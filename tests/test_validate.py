@@ -56,7 +56,7 @@ def drop(name: str) -> Mutation:
 
     def mutate(layer: Sdf.Layer) -> None:
         prim = layer.GetPrimAtPath(COAT)
-        del prim.properties[name]
+        prim.RemoveProperty(prim.properties[name])
 
     return mutate
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Sdf, Usd, UsdShade, UsdSkel, Vt
 
+from ..errors import LayerError
 from .carry import FineMap
 from .schema import GARMENT_API
 from .stage import GarmentSource, Notice
@@ -153,9 +154,14 @@ def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
 
     Returns:
         Path of the sibling, ``<name>_refined``.
+
+    Raises:
+        LayerError: There is such a prim already.
     """
     coarse = prim.GetPath()
     path = coarse.ReplaceName(f"{coarse.name}_refined")
+    if prim.GetStage().GetPrimAtPath(path):
+        raise LayerError(f"<{path}> is already on the stage; refine the shot without it, or use mode 'over'")
     spec = stream.prim(path)
     spec.specifier, spec.typeName = Sdf.SpecifierDef, "Mesh"
     spec.referenceList.Prepend(Sdf.Reference(primPath=coarse))

@@ -5,7 +5,6 @@ Author through ``Sdf``, not through a stage: nothing is composed, so a time samp
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -115,12 +114,6 @@ class LayerStream:
     def block(self, path: Sdf.Path, type_name: Sdf.ValueTypeName) -> None:
         """Hide every weaker value of an attribute, its samples included."""
         self.attribute(path, type_name).default = Sdf.ValueBlock()
-
-    def merge_custom_data(self, values: Mapping[str, Any]) -> None:
-        """Replace entries of the layer's ``customLayerData``."""
-        data = dict(self.layer.customLayerData)
-        data.update(values)
-        self.layer.customLayerData = data
 
     def flush(self) -> None:
         """Save what is pending and let go of its memory.

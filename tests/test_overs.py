@@ -1,0 +1,254 @@
+"""How refined garments compose over shots of many kinds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layers import (
+    COAT,
+    MIRROR,
+    TIMES,
+    dress_up,
+    errors,
+    fine_points,
+    make_shot,
+    open_over,
+    refine_all,
+    world_metres,
+    write_layer,
+)
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+
+from physgraph_usd.errors import LayerError
+from physgraph_usd.usd.provenance import write_root
+from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.writer import LayerWriter
+
+
+@pytest.fixture
+def dressed(tmp_path: Path) -> Path:
+    path = tmp_path / "shot.usda"
+    dress_up(make_shot(path, matrix=MIRROR))
+    return path
+
+
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+def test_bindings_and_partition_survive(dressed: Path, tmp_path: Path, mode: str) -> None:
+    out = write_layer(dressed, tmp_path / "out.usdc", mode=mode)
+    stage, path = open_over(dressed, out), COAT if mode == "over" else f"{COAT}_refined"
+    prim = stage.GetPrimAtPath(path)
+    api = UsdShade.MaterialBindingAPI
+    assert api(prim).ComputeBoundMaterial()[0].GetPath() == "/World/Looks/red"
+    subsets = api(prim).GetMaterialBindSubsets()
+    assert [api(subset.GetPrim()).ComputeBoundMaterial()[0].GetPath() for subset in subsets] == ["/World/Looks/red"] * 2
+    named = np.concatenate([np.asarray(subset.GetIndicesAttr().Get()) for subset in subsets])
+    np.testing.assert_array_equal(np.sort(named), np.arange(48))
+
+
+def test_a_sibling_renders_and_the_coarse_mesh_is_its_proxy(dressed: Path, tmp_path: Path) -> None:
+    out = write_layer(dressed, tmp_path / "out.usdc", mode="sibling")
+    stage = open_over(dressed, out)
+    coarse, fine = (UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in (COAT, f"{COAT}_refined"))
+    assert coarse.ComputePurpose() == "proxy"
+    assert fine.ComputePurpose() == "render"
+    assert len(coarse.GetPointsAttr().Get(1.0)) == 20
+    assert len(fine.GetPointsAttr().Get(1.0)) == 63
+    assert fine.ComputeProxyPrim()[0].GetPath() == COAT
+    # Only the coarse mesh is a garment: the sibling must not be refined again.
+    assert fine.GetPrim().GetPrimTypeInfo().GetAppliedAPISchemas().count("PhysGraphGarmentAPI") == 0
+    assert coarse.GetPrim().GetPrimTypeInfo().GetAppliedAPISchemas().count("PhysGraphGarmentAPI") == 1
+
+
+def test_a_material_bound_by_collection_reaches_the_sibling(tmp_path: Path) -> None:
+    path = tmp_path / "shot.usda"
+    stage = make_shot(path)
+    material = UsdShade.Material.Define(stage, "/World/Looks/blue")
+    world = stage.GetPrimAtPath("/World")
+    collection = Usd.CollectionAPI.Apply(world, "cloth")
+    collection.IncludePath(COAT)
+    UsdShade.MaterialBindingAPI.Apply(world).Bind(collection, material, "cloth")
+    stage.Save()
+    out = write_layer(path, tmp_path / "out.usdc", mode="sibling")
+    stage = open_over(path, out)
+    fine = stage.GetPrimAtPath(f"{COAT}_refined")
+    assert UsdShade.MaterialBindingAPI(fine).ComputeBoundMaterial()[0].GetPath() == "/World/Looks/blue"
+
+
+def test_a_sibling_that_is_there_already_is_not_written_over(tmp_path: Path) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    make_shot(path)
+    write_layer(path, out, mode="sibling")
+    root = write_root(tmp_path / "root.usda", layer=out, shot=path)
+    shot = open_shot(str(root), level=1, garments=[COAT])
+    with pytest.raises(LayerError, match=r"coat_refined> is already on the stage"):
+        LayerWriter(shot, refine_all(shot), tmp_path / "again.usdc", mode="sibling")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["out.usdc", "root.usda", "shot.usda"]
+
+
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+def test_a_garment_in_an_instance(tmp_path: Path, mode: str) -> None:
+    dress_up(make_shot(tmp_path / "asset.usda"))
+    path = tmp_path / "shot.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+    stage.SetTimeCodesPerSecond(30.0)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    for name in ("one", "two"):
+        prim = stage.DefinePrim(f"/Set/{name}")
+        prim.GetReferences().AddReference("asset.usda")
+        prim.SetInstanceable(True)
+    stage.Save()
+    shot = open_shot(str(path), level=1, garments=["/Set/one/rig/coat"])
+    if not shot.sources[0].instance_roots:
+        pytest.skip("the reader names no instance roots yet")
+    steps = refine_all(shot)
+    with LayerWriter(shot, steps, tmp_path / "out.usdc", mode=mode) as writer:
+        for time in shot.scene.times:
+            writer.write(time, fine_points(shot, steps, time))
+    assert any("instanceable" in str(notice) for notice in writer.notices)
+    composed = open_over(path, tmp_path / "out.usdc")
+    name = "coat" if mode == "over" else "coat_refined"
+    assert len(UsdGeom.Mesh(composed.GetPrimAtPath(f"/Set/one/rig/{name}")).GetPointsAttr().Get(1.0)) == 63
+    assert composed.GetPrimAtPath("/Set/two").IsInstance()
+    assert errors(tmp_path / "out.usdc") == []
+
+
+def test_a_shot_with_a_layer_offset(tmp_path: Path) -> None:
+    make_shot(tmp_path / "anim.usda")
+    path = tmp_path / "shot.usda"
+    root = Sdf.Layer.CreateNew(str(path))
+    root.timeCodesPerSecond = 60.0
+    root.subLayerPaths.append("./anim.usda")
+    root.subLayerOffsets[0] = Sdf.LayerOffset(100.0)
+    root.pseudoRoot.SetInfo("metersPerUnit", 0.01)
+    root.Save()
+    out = write_layer(path, tmp_path / "out.usdc")
+    stage = open_over(path, out)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(COAT))
+    # 30 codes a second under 60, then 100 later.
+    assert mesh.GetPointsAttr().GetTimeSamples() == [102.0, 105.0, 108.0]
+    assert len(mesh.GetPointsAttr().Get(102.0)) == 63
+    assert errors(out) == []
+
+
+def test_samples_from_value_clips_are_replaced(tmp_path: Path) -> None:
+    make_shot(tmp_path / "clip.usda")
+    manifest = Usd.Stage.CreateNew(str(tmp_path / "manifest.usda"))
+    manifest.OverridePrim(COAT).CreateAttribute("points", Sdf.ValueTypeNames.Point3fArray, False)
+    manifest.Save()
+    path = tmp_path / "shot.usda"
+    stage = make_shot(path, times=())
+    clips = Usd.ClipsAPI(stage.GetPrimAtPath(COAT))
+    clips.SetClipPrimPath(COAT)
+    clips.SetClipAssetPaths([Sdf.AssetPath("./clip.usda")])
+    clips.SetClipManifestAssetPath(Sdf.AssetPath("./manifest.usda"))
+    clips.SetClipActive([(0, 0)])
+    clips.SetClipTimes([(0, 0), (10, 10)])
+    stage.Save()
+    shot = open_shot(str(path), level=1)
+    steps = refine_all(shot)
+    with LayerWriter(shot, steps, tmp_path / "out.usdc") as writer:
+        for time in TIMES:
+            writer.write(time, fine_points(shot, steps, time))
+    composed = open_over(path, tmp_path / "out.usdc")
+    points = UsdGeom.Mesh(composed.GetPrimAtPath(COAT)).GetPointsAttr()
+    for time in (None, *TIMES):
+        assert len(points.Get(Usd.TimeCode.Default() if time is None else time)) == 63
+    np.testing.assert_allclose(world_metres(composed, COAT, 4.0), fine_points(shot, steps, 4.0)[0], atol=1e-6)
+
+
+def make_skinned(path: Path, *, inherited: bool) -> None:
+    """The coat on a skeleton of one joint that moves along X, bound on the mesh or on its parent."""
+    stage = make_shot(path, times=())
+    root = UsdSkel.Root.Define(stage, "/World")
+    skeleton = UsdSkel.Skeleton.Define(stage, "/World/skeleton")
+    skeleton.CreateJointsAttr(["joint"])
+    skeleton.CreateBindTransformsAttr([Gf.Matrix4d(1)])
+    skeleton.CreateRestTransformsAttr([Gf.Matrix4d(1)])
+    animation = UsdSkel.Animation.Define(stage, "/World/animation")
+    animation.CreateJointsAttr(["joint"])
+    animation.CreateRotationsAttr([Gf.Quatf(1)])
+    animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)])
+    for time in TIMES:
+        animation.CreateTranslationsAttr().Set([Gf.Vec3f(time, 0, 0)], time)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    mesh = stage.GetPrimAtPath(COAT)
+    UsdSkel.BindingAPI.Apply(mesh)
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetParent() if inherited else mesh)
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateJointIndicesPrimvar(inherited, 1).Set([0] if inherited else [0] * 20)
+    binding.CreateJointWeightsPrimvar(inherited, 1).Set([1.0] if inherited else [1.0] * 20)
+    stage.SetStartTimeCode(TIMES[0])
+    stage.SetEndTimeCode(TIMES[-1])
+    assert root
+    stage.Save()
+
+
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+@pytest.mark.parametrize("inherited", [False, True])
+def test_a_skinned_garment_is_not_skinned_twice(tmp_path: Path, mode: str, inherited: bool) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    make_skinned(path, inherited=inherited)
+    shot = open_shot(str(path), level=1)
+    if not shot.sources[0].skinned:
+        pytest.skip("the reader bakes no skinning yet")
+    steps = refine_all(shot)
+    with LayerWriter(shot, steps, out, mode=mode) as writer:
+        for time in shot.scene.times:
+            writer.write(time, fine_points(shot, steps, time))
+    stage = open_over(path, out)
+    root, cache = UsdSkel.Root(stage.GetPrimAtPath("/World")), UsdSkel.Cache()
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    bindings = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
+    skinned = [str(query.GetPrim().GetPath()) for binding in bindings for query in binding.GetSkinningTargets()]
+    assert [cloth for cloth in skinned if cache.GetSkinningQuery(stage.GetPrimAtPath(cloth)).HasJointInfluences()] == (
+        [] if mode == "over" else [COAT]
+    )
+    if mode == "over":
+        # A rigid bake moves the coarse mesh by its transform, which a sibling shares.
+        stage.SetEditTarget(stage.GetSessionLayer())
+        UsdSkel.BakeSkinning(root, Gf.Interval(*TIMES[::2]))
+    for time in TIMES:
+        found = world_metres(stage, str(writer.targets[0]), time)
+        np.testing.assert_allclose(found, fine_points(shot, steps, time)[0], atol=1e-6)
+        assert found[0, 0] == pytest.approx(0.01 * time)
+    assert errors(out) == []
+
+
+def test_a_hole_is_left_out(dressed: Path, tmp_path: Path) -> None:
+    stage = Usd.Stage.Open(str(dressed))
+    UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).CreateHoleIndicesAttr([5])
+    stage.Save()
+    out = write_layer(dressed, tmp_path / "out.usdc")
+    composed = open_over(dressed, out)
+    mesh = UsdGeom.Mesh(composed.GetPrimAtPath(COAT))
+    if len(open_shot(str(dressed)).sources[0].kept_faces) == 12:
+        pytest.skip("the reader keeps holes")
+    assert len(mesh.GetFaceVertexCountsAttr().Get()) == 44
+    assert len(mesh.GetHoleIndicesAttr().Get()) == 0
+    words = UsdGeom.PrimvarsAPI(mesh.GetPrim()).GetPrimvar("label").ComputeFlattened()
+    assert "f5" not in list(words)
+    assert errors(out) == []
+
+
+def test_animated_subsets_and_deformable_rest_shapes(dressed: Path, tmp_path: Path) -> None:
+    stage = Usd.Stage.Open(str(dressed))
+    prim = stage.GetPrimAtPath(COAT)
+    front = UsdGeom.Subset(stage.GetPrimAtPath(f"{COAT}/front")).GetIndicesAttr()
+    front.Set([0], 1.0)
+    front.Set([0, 1], 4.0)
+    rest = prim.CreateAttribute("physics:restShapePoints", Sdf.ValueTypeNames.Point3fArray, False)
+    rest.Set(UsdGeom.Mesh(prim).GetPointsAttr().Get())
+    prim.CreateAttribute("studio:mask", Sdf.ValueTypeNames.FloatArray).Set([0.0] * 20)
+    stage.Save()
+    shot = open_shot(str(dressed), level=1)
+    steps = refine_all(shot)
+    with LayerWriter(shot, steps, tmp_path / "out.usdc") as writer:
+        for time in shot.scene.times:
+            writer.write(time, fine_points(shot, steps, time))
+    composed = open_over(dressed, tmp_path / "out.usdc")
+    indices = UsdGeom.Subset(composed.GetPrimAtPath(f"{COAT}/front")).GetIndicesAttr()
+    assert [len(indices.Get(time)) for time in (1.0, 4.0)] == [4, 8]
+    assert len(composed.GetPrimAtPath(COAT).GetAttribute("physics:restShapePoints").Get()) == 63
+    assert any("studio:mask has one entry per vertex" in str(notice) for notice in writer.notices)

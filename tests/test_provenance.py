@@ -1,0 +1,68 @@
+"""Where a layer comes from, and the root that shows it."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from layers import COAT, MIRROR, dress_up, errors, fine_points, make_shot, open_over, refine_all, write_layer
+from pxr import Sdf, Usd, UsdGeom, UsdUtils
+
+from physgraph_usd.errors import UsageError
+from physgraph_usd.usd.provenance import file_hashes, read_record, refined_layers, write_root
+from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.writer import LayerWriter
+
+
+@pytest.fixture
+def dressed(tmp_path: Path) -> Path:
+    path = tmp_path / "shot.usda"
+    dress_up(make_shot(path, matrix=MIRROR))
+    return path
+
+
+def test_a_usdz_shot_and_its_root(dressed: Path, tmp_path: Path) -> None:
+    package = tmp_path / "shot.usdz"
+    assert UsdUtils.CreateNewUsdzPackage(str(dressed), str(package))
+    out = write_layer(package, tmp_path / "layers" / "out.usdc")
+    root = write_root(tmp_path / "root.usda", layer=out, shot=package)
+    stage = Usd.Stage.Open(str(root))
+    assert len(UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetPointsAttr().Get(2.5)) == 63
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    assert stage.GetRootLayer().subLayerPaths == ["./layers/out.usdc", "./shot.usdz"]
+    assert errors(out) == []
+
+
+def test_the_root_repeats_what_only_a_root_says(dressed: Path, tmp_path: Path) -> None:
+    layer = Sdf.Layer.FindOrOpen(str(dressed))
+    layer.expressionVariables = {"SHOW": "x"}
+    layer.Save()
+    out = write_layer(dressed, tmp_path / "out.usdc")
+    stage = Usd.Stage.Open(str(write_root(tmp_path / "root.usda", layer=out, shot=dressed)))
+    assert stage.GetTimeCodesPerSecond() == 30.0
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1.0, 4.0)
+    assert dict(stage.GetRootLayer().expressionVariables) == {"SHOW": "x"}
+    with pytest.raises(UsageError, match="exists"):
+        write_root(tmp_path / "root.usda", layer=out, shot=dressed)
+
+
+def test_the_record_says_where_it_comes_from(dressed: Path, tmp_path: Path) -> None:
+    shot = open_shot(str(dressed), level=1)
+    hashes = file_hashes(shot.stage, tmp_path)
+    assert hashes == {"./shot.usda": hashlib.sha256(dressed.read_bytes()).hexdigest()}
+    given = {"version": "1", "inputs": hashes, "numbers": (1, 2), "mixed": [1.5, 2], "none": None, "flag": True}
+    steps = refine_all(shot)
+    with LayerWriter(shot, steps, tmp_path / "out.usdc", provenance=given) as writer:
+        writer.write(1.0, fine_points(shot, steps, 1.0))
+    record = read_record(Sdf.Layer.FindOrOpen(str(tmp_path / "out.usdc")))
+    assert record is not None
+    assert record["shot"] == "./shot.usda"
+    assert list(record["garments"]) == [COAT]
+    assert dict(record["inputs"]) == hashes
+    assert list(record["numbers"]) == [1, 2]
+    assert "none" not in record
+    stage = open_over(dressed, tmp_path / "out.usdc")
+    found = refined_layers(stage)
+    assert [Path(layer.realPath).name for layer in found] == ["out.usdc"]
