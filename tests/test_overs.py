@@ -61,6 +61,18 @@ def test_a_sibling_renders_and_the_coarse_mesh_is_its_proxy(dressed: Path, tmp_p
     assert coarse.GetPrim().GetPrimTypeInfo().GetAppliedAPISchemas().count("PhysGraphGarmentAPI") == 1
 
 
+def test_what_lies_below_the_coarse_mesh_is_not_doubled(dressed: Path, tmp_path: Path) -> None:
+    stage = Usd.Stage.Open(str(dressed))
+    UsdGeom.Mesh.Define(stage, f"{COAT}/button")
+    UsdGeom.Scope.Define(stage, f"{COAT}/Looks")
+    stage.Save()
+    out = write_layer(dressed, tmp_path / "out.usdc", mode="sibling")
+    composed = open_over(dressed, out)
+    assert not composed.GetPrimAtPath(f"{COAT}_refined/button").IsActive()
+    for child in ("front", "back", "Looks"):
+        assert composed.GetPrimAtPath(f"{COAT}_refined/{child}").IsActive()
+
+
 def test_a_material_bound_by_collection_reaches_the_sibling(tmp_path: Path) -> None:
     path = tmp_path / "shot.usda"
     stage = make_shot(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Sdf, Usd, UsdShade, UsdSkel, Vt
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from ..errors import LayerError
 from .carry import FineMap
@@ -171,6 +171,10 @@ def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
     relationship = Sdf.RelationshipSpec(spec, "proxyPrim", False)
     relationship.targetPathList.explicitItems = [coarse]
     delete_schema(stream, path, GARMENT_API)
+    for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
+        if UsdGeom.Xformable(child) or UsdSkel.BlendShape(child):
+            # Only subsets and looks belong to both; a nested mesh would be drawn twice.
+            stream.prim(path.AppendChild(child.GetName())).SetInfo("active", False)
     _copy_collection_binding(stream, path, prim)
     return path
 

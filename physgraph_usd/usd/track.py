@@ -161,7 +161,7 @@ class PointTrack:
         """Author the velocity at one time by finite differences [units/s]."""
         path = self._paths["velocities"]
         self._stream.attribute(path, Sdf.ValueTypeNames.Vector3fArray)
-        seconds = (after.time - before.time) / (self._rate or 1.0)
+        seconds = (after.time - before.time) / (self._rate or 24.0)
         moved = after.points.astype(np.float64) - before.points
         velocity = moved / seconds if seconds else np.zeros_like(moved)
         self._stream.set(path, Vt.Vec3fArray.FromNumpy(velocity.astype(np.float32)), time=at.time)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,8 +62,10 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
     if shot is None:
         return problems
     paths = _garments(layer)
-    composed = Usd.Stage.Open(root_over(shot, [layer.identifier, shot.identifier]))
-    alone = Usd.Stage.Open(shot)
+    # Only the garments are composed: a set around them may be large.
+    mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
+    composed = Usd.Stage.OpenMasked(root_over(shot, [layer.identifier, shot.identifier]), mask)
+    alone = Usd.Stage.OpenMasked(shot, mask)
     problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
     for path in paths:
         fault = layer_rules.is_mesh(path, composed)
@@ -71,7 +73,7 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
             problems.append(Problem("error", path, None, fault, "composition"))
             continue
         problems += _check_garment(composed.GetPrimAtPath(path), layer, samples)
-        coarse = _coarse(alone, layer, path)
+        coarse = alone.GetPrimAtPath(_coarse_path(layer, path))
         if coarse:
             problems += _named("against_shot", layer_rules.against_shot(layer, coarse, Sdf.Path(path)))
     return problems
@@ -102,11 +104,11 @@ def _garments(layer: Sdf.Layer) -> Sequence[str]:
     return sorted(str(path.GetPrimPath()) for path in found if path.name == "points")
 
 
-def _coarse(shot: Usd.Stage, layer: Sdf.Layer, path: str) -> Usd.Prim:
+def _coarse_path(layer: Sdf.Layer, path: str) -> str:
     """The coarse mesh of a fine one: the prim itself, or the sibling's reference."""
     spec = layer.GetPrimAtPath(path)
     references = list(spec.referenceList.prependedItems) if spec else []
-    return shot.GetPrimAtPath(references[0].primPath if references else path)
+    return str(references[0].primPath) if references else path
 
 
 def _open(path: Path) -> Sdf.Layer:
@@ -142,11 +144,19 @@ def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
     before = _findings(UsdValidation, validators, Usd.Stage.Open(root_over(shot, [shot.identifier])))
     composed = Usd.Stage.Open(root_over(shot, [layer.identifier, shot.identifier]))
     after = _findings(UsdValidation, validators, composed)
-    fine = set(_garments(layer))
-    return [problem for key, problem in after.items() if key not in before and not _is_meant(problem, fine)]
+    fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
+    new = [problem for key, problem in after.items() if _on_coarse(key, fine) not in before]
+    return [problem for problem in new if not _is_meant(problem, fine)]
 
 
-def _is_meant(problem: Problem, fine: set[str]) -> bool:
+def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]:
+    """A finding on a sibling as it would read on its coarse mesh, whose faults it repeats."""
+    for path, coarse in fine.items():
+        key = tuple(part.replace(path, coarse) for part in key)
+    return key
+
+
+def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
     """Whether a finding is what we did on purpose: skinning is taken off, its coarse properties stay below."""
     return problem.path in fine and problem.rule.endswith("MissingSkelBindingAPI")
 

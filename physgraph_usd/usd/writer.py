@@ -73,7 +73,7 @@ class LayerWriter:
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
         _check_not_input(shot.stage, out)
         self._shot, self._mode, self._time = shot, mode, -np.inf
-        self._rate = shot.stage.GetTimeCodesPerSecond() if velocities else None
+        self._rate = _rate(shot.stage) if velocities else None
         self._open = True
         self._record = dict(provenance or {})
         self.notices: list[Notice] = []
@@ -200,6 +200,12 @@ class LayerWriter:
         finally:
             self._open = False
             self._cleanup.close()
+
+
+def _rate(stage: Usd.Stage) -> float:
+    """Time codes per second; USD's fallback of 24 where the stage's cannot be a rate."""
+    rate = stage.GetTimeCodesPerSecond()
+    return rate if rate > 0 else 24.0
 
 
 def _check_not_input(stage: Usd.Stage, out: Path) -> None:
