@@ -1,0 +1,113 @@
+"""S3: needle triangles of aspect 1e4. Finite, exact, and no step beyond an edge."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from energies import apart, autograd_force, bending_energy, difference_force, evaluate, membrane_energy, stretch_energy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sheets import equilateral, level_of, rotation
+from test_forces import force_of
+
+from physgraph_usd.fabric import Fabric
+from physgraph_usd.forces.base import ForceModule
+from physgraph_usd.forces.bending import Bending
+from physgraph_usd.forces.membrane import in_plane_terms
+from physgraph_usd.integrate.base import System
+from physgraph_usd.integrate.metric import Metric
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.integrate.solve import Budget, solve_level
+
+INTERNAL = ("stretch", "membrane", "bending")
+
+
+def needle_sheet(aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Equilateral triangles, the middle row squeezed into needles."""
+    points, triangles = equilateral(0.4, 0.4, 0.1)
+    height = np.sqrt(0.75) * 0.1
+    row = np.rint(points[:, 1] / height)
+    middle = row.max() // 2
+    points[:, 1] -= np.where(row > middle, height - 0.1 / aspect, 0.0)
+    return points, triangles
+
+
+def crumpled(points: np.ndarray, aspect: float, seed: int) -> np.ndarray:
+    """Bent smoothly and shaken by a twentieth of the shortest height, so that the needles stay proper triangles."""
+    rng = np.random.default_rng(seed)
+    bent = points + np.stack([0 * points[:, 0], 0 * points[:, 0], 0.1 * np.sin(9 * points[:, 0])], axis=1)
+    return (bent + rng.uniform(-1, 1, points.shape) * 0.005 / aspect) @ rotation(seed).T
+
+
+@settings(max_examples=15)
+@given(aspect=st.floats(10, 1e4), seed=st.integers(0, 999), paper=st.booleans())
+def test_s3_needle_forces_are_exact(aspect: float, seed: int, paper: bool):
+    points, triangles = needle_sheet(aspect)
+    level = level_of(points, triangles)
+    x = torch.as_tensor(crumpled(points, aspect, seed))
+    energies = {
+        "stretch": stretch_energy(level.rest, triangles, 30.0, paper=paper),
+        "membrane": membrane_energy(level.rest, triangles, 30.0, 7.0, paper=paper),
+        "bending": bending_energy(level.rest, triangles, 0.05, paper=paper),
+    }
+    for name, energy in energies.items():
+        found, f = evaluate(force_of(name, level, potential="paper" if paper else "continuum"), x)
+        expected, g = autograd_force(energy, x)
+        assert found == pytest.approx(expected, rel=1e-6), name
+        assert apart(f, g) < 1e-6, name
+
+
+@pytest.mark.parametrize("aspect", [1e2, 1e4])
+@pytest.mark.parametrize("name", INTERNAL)
+def test_s3_needle_forces_are_difference_quotients(name: str, aspect: float):
+    points, triangles = needle_sheet(aspect)
+    level = level_of(points, triangles)
+    x = torch.as_tensor(crumpled(points, aspect, 1))
+    force = force_of(name, level)
+    some = list(range(0, len(x), 4))
+    expected = difference_force(force, x, 2e-3 * 0.1 / aspect, some)
+    assert (evaluate(force, x)[1][some] - expected[some]).abs().max() < 1e-6 * expected.abs().max()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shear", [None, 10.0])
+@pytest.mark.parametrize("aspect", [1e2, 1e4])
+def test_s3_needle_sheet_is_solved_without_wild_steps(aspect: float, shear: float | None, dtype: torch.dtype):
+    points, triangles = needle_sheet(aspect)
+    pin = (points[:, 0] < 0.02).astype(float)
+    level = level_of(points, triangles, dtype=dtype, pin=pin)
+    terms = [*in_plane_terms(level, [Fabric(30.0, shear=shear)]), Bending(level, torch.tensor([5e-6]))]
+    module = ForceModule(terms)
+    metric = Metric(module.rest_matrix(), free=level.free, dtype=dtype)
+    system = System(module, metric, free=level.free, spacing=level.spacing)
+    start = points * [0.95, 1.0, 1.0]
+    start[:, 2] = 0.01 * np.sin(20 * points[:, 0])
+    visited: list[torch.Tensor] = []
+    x = torch.as_tensor(start, dtype=dtype)
+    out, report = solve_level(
+        system, QuasiNewton(), x, level=0, budget=Budget(30), observe=lambda carry: visited.append(carry.x)
+    )
+    moves = torch.stack([(b - a).norm(dim=1) for a, b in zip(visited, visited[1:], strict=False)])
+    assert bool(out.isfinite().all())
+    assert report.energy_after < report.energy_before
+    assert float(moves.max()) < 0.1
+    assert torch.equal(out[~level.free.squeeze(1)], x[~level.free.squeeze(1)])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", INTERNAL)
+def test_s3_collapsed_triangles_stay_finite(name: str, dtype: torch.dtype):
+    """Rest triangles with no area, present triangles with no area, points on one spot."""
+    points, triangles = needle_sheet(1e4)
+    gone = points * [1.0, 0.0, 1.0]
+    for rest in (points, gone, np.where(points > 0.2, 0.2, points)):
+        level = level_of(rest, triangles, dtype=dtype)
+        force = force_of(name, level)
+        for x in (points, gone, 0 * points):
+            energy, f = evaluate(force, torch.as_tensor(x, dtype=dtype))
+            assert np.isfinite(energy)
+            assert bool(f.isfinite().all())
+            assert bool(force.diagonal(torch.as_tensor(x, dtype=dtype)).isfinite().all())
+        matrix = force.rest_matrix()
+        assert np.isfinite(matrix.data).all()

@@ -1,0 +1,50 @@
+"""Sparse maps on vertex arrays against scipy's product."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from physgraph_usd.mesh.stencil import Stencil
+
+
+@given(rows=st.integers(1, 8), columns=st.integers(1, 8), density=st.floats(0, 1), seed=st.integers(0, 2**16))
+def test_apply_is_the_product_and_transposed_its_transpose(rows: int, columns: int, density: float, seed: int):
+    rng = np.random.default_rng(seed)
+    matrix = sp.random(rows, columns, density, format="csr", random_state=rng)
+    x, y = rng.normal(size=(columns, 3)), rng.normal(size=(rows, 3))
+    for dtype, tolerance in ((torch.float64, 1e-13), (torch.float32, 1e-5)):
+        stencil = Stencil(matrix, dtype=dtype, device="cpu")
+        assert stencil.shape == (rows, columns)
+        image = stencil.apply(torch.as_tensor(x, dtype=dtype))
+        assert np.allclose(image.numpy(), matrix @ x, atol=tolerance)
+        assert image.dtype == dtype
+        back = stencil.transposed().apply(torch.as_tensor(y, dtype=dtype))
+        assert np.allclose(back.numpy(), matrix.T @ y, atol=tolerance)
+        assert torch.equal(image, stencil.apply(torch.as_tensor(x, dtype=dtype)))
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0)])
+def test_empty_maps(shape: tuple[int, int]):
+    image = Stencil(sp.csr_matrix(shape), dtype=torch.float32, device="cpu").apply(torch.ones((shape[1], 3)))
+    assert image.shape == (shape[0], 3)
+    assert not image.any()
+
+
+def test_unsorted_rows_are_summed_in_one_order():
+    matrix = sp.csr_matrix((np.array([1.0, 2.0, 4.0]), np.array([2, 0, 1]), np.array([0, 3])), shape=(1, 3))
+    x = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    assert Stencil(matrix, dtype=torch.float32, device="cpu").apply(x).tolist() == [[2.0, 4.0, 1.0]]
+
+
+@pytest.mark.gpu
+def test_cuda_gives_the_same():
+    matrix = sp.random(50, 40, 0.2, format="csr", random_state=np.random.default_rng(1))
+    x = torch.randn((40, 3), dtype=torch.float64)
+    here = Stencil(matrix, dtype=torch.float64, device="cpu").apply(x)
+    there = Stencil(matrix, dtype=torch.float64, device="cuda").apply(x.cuda())
+    assert torch.allclose(here, there.cpu(), rtol=1e-13)
