@@ -67,6 +67,15 @@ def test_an_error_keeps_the_file_that_was_there(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out.usdc"]
 
 
+def test_two_writers_of_one_layer_do_not_meet(tmp_path: Path) -> None:
+    with LayerStream(tmp_path / "out.usdc") as stream:
+        with pytest.raises(LayerError, match="being written by this process already"):
+            LayerStream(tmp_path / "out.usdc")
+        fill(stream, 2)
+        stream.commit()
+    assert names(tmp_path) == ["out.usdc"]
+
+
 def test_a_closed_layer_takes_nothing_more(tmp_path: Path) -> None:
     with LayerStream(tmp_path / "out.usdc") as stream:
         fill(stream, 1)

@@ -10,7 +10,7 @@ from layers import COAT, MIRROR, dress_up, errors, fine_points, make_shot, open_
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.usd.provenance import file_hashes, read_record, refined_layers, write_root
+from physgraph_usd.usd.provenance import file_hashes, mute_refined, read_record, refined_layers, write_root
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.writer import LayerWriter
 
@@ -66,3 +66,18 @@ def test_the_record_says_where_it_comes_from(dressed: Path, tmp_path: Path) -> N
     stage = open_over(dressed, tmp_path / "out.usdc")
     found = refined_layers(stage)
     assert [Path(layer.realPath).name for layer in found] == ["out.usdc"]
+
+
+def test_a_refined_garment_is_refined_again_from_its_coarse_mesh(dressed: Path, tmp_path: Path) -> None:
+    out = write_layer(dressed, tmp_path / "out.usdc")
+    root = write_root(tmp_path / "root.usda", layer=out, shot=dressed)
+    with pytest.raises(UsageError, match=rf"<{COAT}> is refined already, by out\.usdc; .*: \./shot\.usda"):
+        write_layer(root, tmp_path / "again.usdc")
+    assert not (tmp_path / "again.usdc").exists()
+    # An artist's change in the root outlives hiding the refined layer.
+    stage = Usd.Stage.Open(str(root))
+    stage.GetPrimAtPath(COAT).GetAttribute("physgraph:material:bendStiffness").Set(0.5)
+    assert [Path(name).name for name in mute_refined(stage)] == ["out.usdc"]
+    prim = stage.GetPrimAtPath(COAT)
+    assert len(UsdGeom.Mesh(prim).GetPointsAttr().Get(1.0)) == 20
+    assert prim.GetAttribute("physgraph:material:bendStiffness").Get() == 0.5

@@ -64,6 +64,23 @@ def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
     return sorted(found, key=lambda layer: layer.identifier)
 
 
+def mute_refined(stage: Usd.Stage) -> list[str]:
+    """Hide on a stage every layer that holds refined garments, so that what artists changed above them counts.
+
+    Only this stage is affected; nothing is written.
+
+    Args:
+        stage: A stage that may show a shot through a refined layer, as `write_root` makes it.
+
+    Returns:
+        Identifiers of the layers hidden.
+    """
+    identifiers = [layer.identifier for layer in refined_layers(stage)]
+    for identifier in identifiers:
+        stage.MuteLayer(identifier)
+    return identifiers
+
+
 def file_hashes(stage: Usd.Stage, folder: Path) -> dict[str, str]:
     """SHA-256 of every file that a stage is composed from.
 

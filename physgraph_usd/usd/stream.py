@@ -35,10 +35,12 @@ class LayerStream:
 
         Raises:
             UsageError: The extension is not a layer's, or the target exists and may not be replaced.
-            LayerError: The folder cannot be written.
+            LayerError: The folder cannot be written, or this process is writing the same layer already.
         """
         if target.suffix not in {".usdc", ".usda", ".usd"}:
             raise UsageError(f"cannot write {target}: the extension must be .usdc, .usda or .usd")
+        if Sdf.Layer.Find(str(temporary_path(target))):
+            raise LayerError(f"{target} is being written by this process already")
         prepare_target(target, overwrite=overwrite)
         self.target = target
         self.temporary = temporary_path(target)

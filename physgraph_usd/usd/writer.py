@@ -64,7 +64,8 @@ class LayerWriter:
             overwrite: Whether an existing file may be replaced.
 
         Raises:
-            UsageError: The mode is unknown, the file exists, or it is one that the shot is made of.
+            UsageError: The mode is unknown, the file exists or is one that the shot is made of, or a garment is refined
+                already.
             LayerError: The layer cannot be written.
         """
         if mode not in MODES:
@@ -72,6 +73,7 @@ class LayerWriter:
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
         _check_not_input(shot.stage, out)
+        _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._rate = _rate(shot.stage) if velocities else None
         self._open = True
@@ -214,6 +216,16 @@ def _check_not_input(stage: Usd.Stage, out: Path) -> None:
     for layer in stage.GetUsedLayers():
         if layer.realPath and Path(layer.realPath).resolve() == target:
             raise UsageError(f"{out} is part of the shot; the input is never edited, choose another name")
+
+
+def _check_not_refined(shot: Shot) -> None:
+    """Refuse garments whose coarse mesh is hidden by an earlier refinement."""
+    paths = {str(source.path) for source in shot.sources}
+    for layer in provenance.refined_layers(shot.stage):
+        record = provenance.read_record(layer) or {}
+        for path in paths.intersection(str(garment) for garment in record["garments"]):
+            name = Path(layer.identifier).name
+            raise UsageError(f"<{path}> is refined already, by {name}; refine the shot below it: {record.get('shot')}")
 
 
 def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:
