@@ -83,8 +83,7 @@ def _panels(layer: Path, shot: Path | None) -> list[_Panel]:
         return [_Panel("", stage, stage.garments(), True)]
     coarse, fine = DrawnStage(shot), DrawnStage(shot, layer)
     refined = refined_in(layer)
-    known = {mesh.path for mesh in coarse.meshes(None)} | set(coarse.garments())
-    source = tuple(path for path in refined if path in known) or coarse.garments()
+    source = tuple(path for path in refined if path in coarse.paths()) or coarse.garments()
     return [_Panel("Coarse input", coarse, source, True), _Panel("Refined", fine, refined, False)]
 
 

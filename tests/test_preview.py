@@ -201,6 +201,18 @@ def test_wrong_requests_are_named(sample: Callable[[str], Path], tmp_path: Path)
         preview(tmp_path / "absent.usdc", tmp_path / "a.png")
 
 
+def test_shot_of_untagged_meshes_without_default_points_is_drawn(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "bare.usda"))
+    mesh = UsdGeom.Mesh.Define(stage, "/Sheet")
+    mesh.CreateFaceVertexCountsAttr([4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    mesh.CreatePointsAttr().Set([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], 5.0)
+    mesh.CreateDisplayColorAttr([(0.5, 0.02, 0.02)])
+    stage.Save()
+    picture = pixels(preview(tmp_path / "bare.usda", tmp_path / "a.png", size=SIZE))
+    assert covered(picture).sum() > 1500
+
+
 def test_stage_without_meshes_says_so(tmp_path: Path) -> None:
     stage = Usd.Stage.CreateNew(str(tmp_path / "empty.usda"))
     UsdGeom.Xform.Define(stage, "/Nothing")

@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from ..errors import StageError
 from .find import has_schema, traverse
 from .provenance import read_record, root_over
-from .stage import metres_per_unit, pxr_errors, quiet, up_vector
+from .stage import list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
 from .times import garment_times, merge
 
 NEUTRAL = (0.55, 0.54, 0.52)
@@ -69,10 +69,10 @@ class DrawnStage:
         self._turn = Z_UP if up_vector(self.stage)[0][2] == 1.0 else np.eye(3)
 
     def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
-        """Return the time codes at which prims have points, transforms or skeleton animation, ascending."""
+        """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons."""
         found: list[float] = []
         for prim in traverse(self.stage):
-            if str(prim.GetPath()) in paths:
+            if (UsdGeom.Mesh(prim) and not paths) or str(prim.GetPath()) in paths:
                 found.extend(garment_times(prim))
             elif animation := UsdSkel.Animation(prim):
                 for attribute in (animation.GetRotationsAttr(), animation.GetTranslationsAttr()):
@@ -86,6 +86,10 @@ class DrawnStage:
             for prim in Usd.PrimRange.Stage(self.stage):
                 if UsdSkel.Root(prim):
                     UsdSkel.BakeSkinning(UsdSkel.Root(prim), span)
+
+    def paths(self) -> tuple[str, ...]:
+        """Return the paths of all meshes, drawn or not."""
+        return list_meshes(self.stage)
 
     def garments(self) -> tuple[str, ...]:
         """Return the paths of meshes with the garment schema applied, registered or not."""
