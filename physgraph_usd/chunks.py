@@ -1,7 +1,7 @@
 """Splits a shot's time codes over processes, and hands the states back in order.
 
-Each process opens the shot for itself and begins a few frames before its chunk (the run-up), so that warm starts have settled
-when the chunk begins. Results travel as files in a temporary folder, so memory does not grow with the number of frames.
+Each process opens the shot for itself and begins a few frames before its chunk (the run-up), so that warm starts have
+settled when the chunk begins. Results travel as files in a temporary folder, so memory does not grow with the frames.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +52,7 @@ Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 def chunks_of(times: Sequence[float | None], workers: int) -> list[tuple[int, int]]:
     """Contiguous index ranges of nearly equal length, at most one per worker."""
     bounds = np.linspace(0, len(times), min(workers, max(len(times), 1)) + 1).round().astype(int)
-    return [(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b > a]
+    return [(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
 
 
 def solve_in_chunks(
@@ -96,8 +98,9 @@ def _solve_chunk(solver: Solver, times: list[float | None], skip: int, folder: P
             continue
         index = first + position - skip
         partial = folder / f"{index}.part.npz"
-        arrays = {f"points{k}": points for k, points in enumerate(outcome.points)}
-        np.savez(partial, record=json.dumps(outcome.record), reused=np.array(outcome.reused, dtype=bool), **arrays)
+        arrays: dict[str, Any] = {f"points{k}": points for k, points in enumerate(outcome.points)}
+        arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
+        np.savez(partial, **arrays)
         partial.rename(folder / f"{index}.npz")
 
 

@@ -1,8 +1,8 @@
 """Carries the detail of one frame to the next in the moving frames of the coarse surface, and tells when not to.
 
-Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame made of its normal and of
-a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface. Interpolated to the
-fine vertices, they take the detail along.
+Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame made of its normal
+and of a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface.
+Interpolated to the fine vertices, they take the detail along.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from .forces.stretch import PAPER_SPRING, garment_area
 from .forces.tether import Tether
 from .integrate import Method
 from .integrate.base import System
-from .integrate.metric import Metric
+from .integrate.metric import Metric, kept_to_edges
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .mesh.subdivide import Refinement
@@ -54,7 +54,7 @@ class SolveSettings:
     temporal: str = "tether"
     tether: float = 400.0
     potential: str = "continuum"
-    reset: Reset = Reset()
+    reset: Reset = field(default_factory=Reset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +194,7 @@ class Group:
             Gravity(level, each("density"), self._gravity, potential=potential),
         )
         guide = Guide(level, guide_map, torch.as_tensor(guide_stiffness), relative_weight=relative)
-        matrix = ForceModule((*elastic, guide)).rest_matrix()
+        matrix = kept_to_edges(ForceModule((*elastic, guide)).rest_matrix(), level.edges.cpu().numpy())
         return _LevelForces(elastic, guide, Metric(matrix, free=level.free, dtype=level.dtype))
 
     def _predict(self, kept: Carried | None, coarse: Tensor, world: Tensor) -> tuple[Tensor | None, str]:

@@ -13,13 +13,21 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .mesh.diagonals import quad_edges
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, smooth, subdivide_times
-from .mesh.topology import PolygonMesh, edges_of, hinges_of
+from .mesh.topology import PolygonMesh, edges_of, find_edges, hinges_of
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
 """Cap of l0^2 / (A1 + A2): 1.15 on equilateral triangles, unbounded on slivers (STABILITY.md S3)."""
+
+QUAD_SPRING = (0.75, 1.5)
+"""Factors of the springs along a quad's sides and diagonal: with them squares whose diagonals alternate, as subdivision
+splits them, are isotropic with nu = 1/3; without, Y varies from 0.75 to 1.2 with direction (docs/calibration.md)."""
+
+QUAD_HINGE = (1.28, 0.64)
+"""The same for hinges: D is then 1 in all directions instead of 0.86 to 1.36."""
 
 PIN_MARGIN = 1e-6
 """A pin within this of 1 is exact."""
@@ -38,7 +46,9 @@ class Level:
         hinges: Edge i-j, then the opposite vertices k and l, shape (H, 4).
         rest_length: [m], shape (E,).
         edge_area: A third of the adjacent triangles' areas [m^2], shape (E,).
+        edge_factor: `QUAD_SPRING` on edges of quads, 1 on edges of triangles, shape (E,).
         hinge_shape: l0^2 / (A1 + A2), clamped, shape (H,).
+        hinge_factor: `QUAD_HINGE` on edges of quads, 1 on edges of triangles, shape (H,).
         hinge_area: A third of the two triangles' areas [m^2], shape (H,).
         rest_angle: [rad], shape (H,).
         vertex_area: A third of the incident triangles' areas [m^2], shape (V,).
@@ -64,7 +74,9 @@ class Level:
     hinges: Int[Tensor, "hinges 4"]
     rest_length: Float[Tensor, " edges"]
     edge_area: Float[Tensor, " edges"]
+    edge_factor: Float[Tensor, " edges"]
     hinge_shape: Float[Tensor, " hinges"]
+    hinge_factor: Float[Tensor, " hinges"]
     hinge_area: Float[Tensor, " hinges"]
     rest_angle: Float[Tensor, " hinges"]
     vertex_area: Float[Tensor, " vertices"]
@@ -171,6 +183,8 @@ class _GarmentLevel:
     triangles: np.ndarray
     edges: np.ndarray
     hinges: np.ndarray
+    edge_factor: np.ndarray
+    hinge_factor: np.ndarray
     bent_rest: bool
     vertex_values: dict[str, np.ndarray]
     linear: sp.csr_matrix
@@ -187,14 +201,20 @@ def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLev
         linear = sp.csr_matrix(refinement.linear @ linear)
         mesh = refinement.mesh
     rest = linear @ np.asarray(garment.rest, dtype=np.float64)
-    triangles = mesh.triangulate(rest if not chain else None).triangles
+    split = mesh.triangulate(rest if not chain else None)
+    triangles, hinges = split.triangles, hinges_of(split.triangles)
+    edges = edges_of(triangles, mesh.vertex_count).vertices
+    from_quad, diagonal = quad_edges(split, mesh.counts, edges)
+    edge_factor, at_edge = (1.0 + from_quad * (np.where(diagonal, f[1], f[0]) - 1.0) for f in (QUAD_SPRING, QUAD_HINGE))
     names = ("stretch_scale", "bend_scale", "pin")
     return _GarmentLevel(
         vertex_count=mesh.vertex_count,
         rest=rest,
         triangles=triangles,
-        edges=edges_of(triangles, mesh.vertex_count).vertices,
-        hinges=hinges_of(triangles),
+        edges=edges,
+        hinges=hinges,
+        edge_factor=edge_factor,
+        hinge_factor=at_edge[find_edges(edges, hinges[:, :2])],
         bent_rest=garment.bent_rest,
         vertex_values={name: linear @ np.asarray(getattr(garment, name), dtype=np.float64) for name in names},
         linear=linear,
@@ -238,6 +258,8 @@ def _join(
         edges=whole(edges),
         hinges=whole(hinges),
         **{name: real(value) for name, value in shape.items()},
+        edge_factor=real(np.concatenate([part.edge_factor for part in parts])),
+        hinge_factor=real(np.concatenate([part.hinge_factor for part in parts])),
         triangle_area=real(triangle_area),
         triangle_inverse=real(triangle_inverse),
         edge_garment=whole(owner("edges")),

@@ -29,8 +29,8 @@ class LevelChoice:
 def choose_levels(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[LevelChoice]:
     """Take each garment's own level, or for `AUTO` the least that resolves its wrinkles.
 
-    The buckling wavelength is 2 pi sqrt(D / (Y strain)) with the compression of the cage's edges, 90th percentile over a
-    few frames; a level resolves it when its mean edge is under a fifth of it.
+    The buckling wavelength is 2 pi sqrt(D / (Y strain)) with the compression of the cage's edges, 90th percentile over
+    a few frames; a level resolves it when its mean edge is under a fifth of it.
 
     Args:
         scene: The scene.

@@ -224,7 +224,7 @@ def prepare_device(device: str) -> None:
     Raises:
         UsageError: CUDA was asked for and is not there.
     """
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     wp.init()
     torch.set_num_threads(1)
     if device.startswith("cuda") and not torch.cuda.is_available():

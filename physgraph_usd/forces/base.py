@@ -1,5 +1,7 @@
 """What a force is, and the sum of forces that an integrator sees."""
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from collections.abc import Sequence

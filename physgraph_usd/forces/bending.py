@@ -1,13 +1,14 @@
 """Bending: dihedral angles at the edges.
 
-    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D l0^2 / (A1 + A2)   (potential="continuum", DESIGN 4.1)
-                                                w_h = k_b a_h / A          (potential="paper", P7)
+    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D c_h l0^2 / (A1 + A2)   (potential="continuum", DESIGN 4.1)
+                                                w_h = k_b a_h / A              (potential="paper", P7)
 
 | symbol | here | meaning |
 |---|---|---|
 | D | ``rigidity`` | bending stiffness [N m] |
 | theta | atan2(n1 x n2 . e, n1 . n2) | signed angle between the triangles' normals [rad] |
 | l0^2 / (A1 + A2) | ``level.hinge_shape`` | clamped on slivers |
+| c_h | ``level.hinge_factor`` | 1 on triangles; makes alternately split quads isotropic |
 | k_b | 3.46 D | the paper's constant [N m] for the same D on an equilateral lattice (docs/fabrics.md) |
 
 theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is continuous wherever a hinge turns: a hem
@@ -15,6 +16,8 @@ pressed to theta0 = 3 may pass pi. Its force changes sign half a turn from theta
 Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 import math
@@ -104,7 +107,7 @@ class Bending:
         if potential == "paper":
             self.weight = PAPER_HINGE * scaled * level.hinge_area / garment_area(level)[owner]
         else:
-            self.weight = scaled * level.hinge_shape
+            self.weight = scaled * level.hinge_factor * level.hinge_shape
         self._level = level
         self._elements = Elements(level.hinges, level.vertex_count, dtype=level.dtype)
         self._inputs = [wp.from_torch(self.weight), wp.from_torch(level.rest_angle)]

@@ -1,12 +1,13 @@
 """Stretch: springs along the edges.
 
-    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y a_e / l0_e^2      (potential="continuum", DESIGN 4.1)
+    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y c_e a_e / l0_e^2  (potential="continuum", DESIGN 4.1)
                                         k_e = k_s a_e / A           (potential="paper", P6)
 
 | symbol | here | meaning |
 |---|---|---|
 | Y | ``youngs`` | 2D Young's modulus [N/m] |
 | a_e | ``level.edge_area`` | a third of the adjacent triangles' areas [m^2] |
+| c_e | ``level.edge_factor`` | 1 on triangles; makes alternately split quads isotropic |
 | l0 | ``level.rest_length`` | rest length [m] |
 | k_s | 2.598 Y | the paper's spring constant [N/m] for the same Y on an equilateral lattice (docs/fabrics.md) |
 | A | total rest area of the garment [m^2] |
@@ -14,6 +15,8 @@
 Springs cannot express shear on its own: an isotropic sheet of them has nu = 1/3 and G = 0.375 Y.
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from typing import Any
@@ -78,7 +81,7 @@ class Stretch:
             area = garment_area(level)[level.edge_garment.long()]
             self.stiffness = PAPER_SPRING * modulus * level.edge_area / area
         else:
-            self.stiffness = 3.0 * modulus * level.edge_area / level.rest_length**2
+            self.stiffness = 3.0 * modulus * level.edge_factor * level.edge_area / level.rest_length**2
         self._level = level
         self._elements = Elements(level.edges, level.vertex_count, dtype=level.dtype)
         self._inputs = [wp.from_torch(self.stiffness), wp.from_torch(level.rest_length)]

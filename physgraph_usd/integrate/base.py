@@ -16,9 +16,7 @@ from .metric import Metric
 class ForceField(Protocol):
     """The only face of the physics that an integrator meets."""
 
-    def energy_and_force(
-        self, x: Float[Tensor, "vertices 3"]
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
+    def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N] at positions x [m]."""
         ...
 

@@ -7,8 +7,8 @@
 | rho_i | 1 / s_i.y_i |
 | gamma | s.y / y.z of the newest pair: scales H0^-1 to the curvature last seen |
 
-The two-loop recursion (Nocedal 1980) applied to F needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, so a step
-costs one metric solve and, when the first trial is accepted, one force evaluation.
+The two-loop recursion (Nocedal 1980) applied to F needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, so a
+step costs one metric solve and, when the first trial is accepted, one force evaluation.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class QuasiNewton:
         name: "quasi-newton" or "lbfgs".
     """
 
-    def __init__(self, *, history: int = 8, use_metric: bool = True) -> None:
+    def __init__(self, *, history: int = 5, use_metric: bool = True) -> None:
         """Choose the memory and the first guess.
 
         Args:

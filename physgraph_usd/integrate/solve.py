@@ -1,4 +1,4 @@
-"""The solve of one frame: levels from coarse to fine, steps until the remaining move is small or the budget is spent."""
+"""The solve of one level: steps until the remaining move is small or the budget is spent."""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 Gathering keeps the order of each sum fixed, so a run repeats bit for bit on either device.
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from typing import Any

@@ -1,0 +1,156 @@
+"""Speed and accuracy of one frame: the sleeve at about 26,000 fine vertices.
+
+    python -m benchmarks.sleeve
+
+Prints the gap (Phi - Phi*) / (Phi0 - Phi*) of nested quasi-Newton against milliseconds, force evaluation against torch
+autograd, and the whole frame's time, reading and writing included, against its solver time. Times are medians of one
+run; compare them as ratios. Phi* is the least energy that float64 nested quasi-Newton and Newton found.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.integrate import method_named
+from physgraph_usd.integrate.newton import Newton
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.level import Level
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.samples import write_sample
+from physgraph_usd.shot import RefineOptions, prepare_device, refine_shot
+from physgraph_usd.usd.reader import open_shot
+
+REPEATS = 5
+SCHEDULES = ((5, 5, 5), (10, 10, 5), (16, 16, 7), (20, 20, 10), (32, 32, 8), (40, 40, 10), (60, 60, 15), (80, 80, 30))
+
+
+def main() -> None:
+    """Print the tables."""
+    prepare_device("cpu")
+    with tempfile.TemporaryDirectory() as folder:
+        shot_path = write_sample("sleeve", Path(folder))
+        shot = open_shot(str(shot_path))
+        frame = shot.frame(shot.scene.times[-1]).garments
+        refinements = Refiner.subdivide(shot.scene, [g.level for g in shot.scene.garments])
+        settings = SolveSettings(method_named("quasi-newton"))
+        single, double = (
+            Group(shot.scene.garments, refinements, shot.scene.gravity, settings, dtype=dtype, device="cpu")
+            for dtype in (torch.float32, torch.float64)
+        )
+        finest = single.levels[-1]
+        say(f"sleeve, last frame: {finest.vertex_count} fine vertices, {len(finest.edges)} edges")
+        start, least = reference(double, frame)
+        say(f"Phi0 {start:.6g} J, Phi* {least:.6g} J")
+        front = schedule_table(single, frame, start, least)
+        say_ratio(front)
+        evaluation_table(single, frame)
+        frame_table(shot_path, Path(folder))
+
+
+def descend(group: Group, frame, steps, integrator=None) -> tuple[float, float, torch.Tensor]:
+    """Solve a frame through all levels; returns its energy [J], seconds and positions."""
+    systems, coarse = group.systems(frame)
+    began = time.perf_counter()
+    x = group.levels[0].base.apply(coarse)
+    energy = 0.0
+    for level, system, count in zip(group.levels, systems, steps, strict=True):
+        x = x if level.from_below is None else level.from_below.apply(x)
+        x, report = solve_level(system, integrator or QuasiNewton(), x, level=level.index, budget=Budget(count))
+        energy = report.energy_after
+    return energy, time.perf_counter() - began, x
+
+
+def reference(group: Group, frame) -> tuple[float, float]:
+    """Energy of the upsampled input and the least energy known [J]."""
+    systems, coarse = group.systems(frame)
+    start = systems[-1].energy_and_force(group.levels[-1].base.apply(coarse))[0]
+    energies = []
+    for steps in ((400, 400, 1200), (80, 80, 800)):
+        energy, _, x = descend(group, frame, steps)
+        energies.append(energy)
+    x, report = solve_level(systems[-1], Newton(), x, level=0, budget=Budget(5))
+    return start, min(*energies, report.energy_after)
+
+
+def schedule_table(group: Group, frame, start: float, least: float) -> list[tuple[float, float]]:
+    """Print gap against time; returns (gap, seconds) for each schedule."""
+    say("\n| steps per level | gap | ms |\n|---|---|---|")
+    front = []
+    for steps in SCHEDULES:
+        runs = [descend(group, frame, steps) for _ in range(REPEATS)]
+        gap = (runs[0][0] - least) / (start - least)
+        seconds = statistics.median(run[1] for run in runs)
+        front.append((gap, seconds))
+        say(f"| {steps} | {gap:.2%} | {1e3 * seconds:.0f} |")
+    return front
+
+
+def say_ratio(front: list[tuple[float, float]]) -> None:
+    """Print the time to a gap of 1% over the time to 3%."""
+    times = {bound: min((s for gap, s in front if gap <= bound), default=float("nan")) for bound in (0.03, 0.01)}
+    say(f"\ntime to 1% / time to 3%: {times[0.01] / times[0.03]:.2f}")
+
+
+def evaluation_table(group: Group, frame) -> None:
+    """Print the time of one force and energy evaluation against torch autograd of the same energy."""
+    systems, coarse = group.systems(frame)
+    level = group.levels[-1]
+    x = level.base.apply(coarse)
+    ours = median_seconds(lambda: systems[-1].energy_and_force(x))
+    theirs = median_seconds(lambda: autograd_evaluation(level, x))
+    say(f"energy and force: {1e3 * ours:.2f} ms; stretch and bending alone by torch autograd {1e3 * theirs:.2f} ms")
+    say(f"ratio: {theirs / ours:.1f}")
+
+
+def autograd_evaluation(level: Level, x: torch.Tensor) -> torch.Tensor:
+    """Stretch and bending of jersey in plain torch, their force by reverse mode."""
+    x = x.detach().requires_grad_()
+    ends, hinge = level.edges.long(), level.hinges.long()
+    length = (x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1)
+    stiffness = 90.0 * level.edge_area / level.rest_length**2
+    stretch = 0.5 * (stiffness * (length - level.rest_length) ** 2).sum()
+    i, j, k, ell = (x[hinge[:, corner]] for corner in range(4))
+    n1, n2 = torch.linalg.cross(j - i, k - i), torch.linalg.cross(ell - i, j - i)
+    sine = (torch.linalg.cross(n1, n2) * (j - i)).sum(dim=1) / (j - i).norm(dim=1)
+    angle = torch.atan2(sine, (n1 * n2).sum(dim=1))
+    bending = 0.5 * (4.7e-6 * level.hinge_shape * (angle - level.rest_angle) ** 2).sum()
+    return torch.autograd.grad(stretch + bending, x)[0]
+
+
+def frame_table(shot: Path, folder: Path) -> None:
+    """Print the whole frame's time over its solver time, in one process."""
+    report = refine_shot(shot, folder / "out.usdc", RefineOptions(temporal="off"))
+    solve = sum(garment["milliseconds"]["solve"] for f in report.frames[1:] for garment in f["garments"])
+    first = report.frames[0]["garments"][0]["milliseconds"]
+    frames = 1e3 * report.seconds["frames"] - sum(first.values())
+    say(f"\n{len(report.frames)} frames: {frames:.0f} ms of which {solve:.0f} ms solving (the first frame left out)")
+    say(f"frame / solver: {frames / solve:.2f}; peak memory {report.peak_memory_mb:.0f} MB")
+
+
+def median_seconds(call, repeats: int = 30) -> float:
+    """Median wall time of a call after a warm-up."""
+    call()
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - began)
+    return statistics.median(times)
+
+
+def say(line: str) -> None:
+    """Write a line to standard output."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
