@@ -107,8 +107,9 @@ def _collides(prim: Usd.Prim) -> bool:
 
 def _match(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
     """Paths of the prims of a kind that an item names."""
-    if _COLLECTION in item:
-        roots: Iterable[Usd.Prim] = _collection(stage, item)
+    roots: Iterable[Usd.Prim]
+    if _COLLECTION in item:  # its members are told one by one, so that what it excludes stays out
+        roots = [prim for prim in _collection(stage, item) if kind(prim)]
     elif any(letter in item for letter in "*?["):
         roots = [prim for prim in traverse(stage) if fnmatch.fnmatchcase(str(prim.GetPath()), item)]
     elif item.startswith("/"):

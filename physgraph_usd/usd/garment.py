@@ -121,7 +121,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         bent_rest=rests_bent(prim),
         **_painted(prim, points.count, notices),
     )
-    notices += [*rest.notices, *_size_notices(garment.path, start, request)]
+    notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
     skinned = prim.GetPath() in request.bake.skinned
     named = {**values.sources, "refine:level": level_source, "rest": rest.source}
     place_on_stage = (prim.GetPath(), cage.kept_faces, skinned, tuple(roots), times)
@@ -175,6 +175,18 @@ def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notic
         return []
     said = " x ".join(f"{length:.3g}" for length in size)
     return [Notice(path, None, f"measures {said} m with {request.units.metres:g} m per unit; check metersPerUnit")]
+
+
+def _unit_notices(prim: Usd.Prim, matrix: np.ndarray, request: Request) -> list[Notice]:
+    """Tell of a layer in other units whose points no scale corrects; USD itself never converts."""
+    scale, metres = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3])))), request.units.metres
+    notices = []
+    for layer in dict.fromkeys(spec.layer for spec in UsdGeom.Mesh(prim).GetPointsAttr().GetPropertyStack()):
+        own = layer.pseudoRoot.GetInfo("metersPerUnit") if layer.pseudoRoot.HasInfo("metersPerUnit") else None
+        if isinstance(own, int | float) and not np.isclose(own, metres) and not np.isclose(own, scale, rtol=0.01):
+            said = f"its layer @{layer.GetDisplayName()}@ has {own:g} m per unit, the stage has {metres:g}"
+            notices.append(Notice(str(prim.GetPath()), None, f"{said}; USD does not convert, check its size"))
+    return notices
 
 
 def is_visible(prim: Usd.Prim, times: Sequence[float]) -> bool:

@@ -173,9 +173,11 @@ def read_number(attribute: Usd.Attribute, time: float | None) -> float:
     Raises:
         SchemaError: When it holds something else.
     """
-    value = attribute.Get(Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
-    if value is None:
-        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    resolved = attribute.GetResolveInfo(code).GetSource()
+    if resolved in {Usd.ResolveInfoSourceNone, Usd.ResolveInfoSourceFallback}:  # samples only, asked for the default
+        code = Usd.TimeCode.EarliestTime()
+    value = attribute.Get(code)
     if not isinstance(value, bool | int | float):
         kind = attribute.GetTypeName()
         raise SchemaError(f"{source_name(attribute)} is {value!r} of type {kind}; a single number is needed")

@@ -65,7 +65,7 @@ def place(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
     """Whether the authored winding is clockwise seen from outside, in the world."""
-    left_handed = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+    left_handed = UsdGeom.Mesh(prim).GetOrientationAttr().Get(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.leftHanded
     return left_handed != bool(np.linalg.det(matrix[:3, :3]) < 0)
 
 

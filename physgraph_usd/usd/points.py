@@ -118,7 +118,7 @@ def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) 
     out = points.copy()
     both = np.concatenate([edges, edges[:, ::-1]]).astype(np.int64) if len(edges) else np.zeros((0, 2), np.int64)
     while True:
-        finite: np.ndarray = np.isfinite(out).all(axis=1)
+        finite = np.asarray(np.isfinite(out).all(axis=1))
         use = both[~finite[both[:, 0]] & finite[both[:, 1]]]
         if len(use) == 0:
             break

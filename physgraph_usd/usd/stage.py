@@ -213,7 +213,7 @@ class CompositionProblem:
     """One arc that USD could not follow.
 
     Attributes:
-        path: Prim that has it.
+        path: Prim that has it; "" for the stage.
         message: What USD said, in one line.
         missing: Whether its file or prim is just not there; False for circles and files that cannot be read.
     """
@@ -240,7 +240,9 @@ def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[Comp
         message = " ".join(text.split()).removesuffix(" .")
         asset = re.search(r"(?:load sublayer|open asset) @([^@]+)@", message)
         exists = asset is not None and bool(Ar.GetResolver().Resolve(asset.group(1)))
-        found[message] = CompositionProblem(path or "/", message, not (exists or "ycle" in message))
+        found[message] = CompositionProblem(
+            "" if path == "/" else path or "", message, not (exists or "ycle" in message)
+        )
     return list(found.values())
 
 
@@ -255,7 +257,7 @@ def refuse_missing_arcs(prim: Usd.Prim, notices: Sequence[Notice]) -> None:
         StageError: With what is missing.
     """
     for notice in notices:
-        if notice.path not in {"", "/"} and prim.GetPath().HasPrefix(Sdf.Path(notice.path)):
+        if notice.path and prim.GetPath().HasPrefix(Sdf.Path(notice.path)):
             raise StageError(f"<{prim.GetPath()}> is incomplete: {notice.message}")
 
 

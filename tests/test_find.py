@@ -1,0 +1,127 @@
+"""Finding garments and colliders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+from stages import COLLIDER_API, add_sheet, author, instanced_shot, new_stage
+
+from physgraph_usd.errors import GarmentError, StageError
+from physgraph_usd.usd.find import find_colliders, find_garments, instance_roots
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Usd.Stage:
+    made = new_stage(tmp_path / "s.usda")
+    add_sheet(made, "/World/hero/coat")
+    add_sheet(made, "/World/hero/hat", tagged=False)
+    add_sheet(made, "/World/crowd/coat", tagged=False)
+    UsdGeom.Cube.Define(made, "/World/box")
+    return made
+
+
+def paths(prims: list[Usd.Prim]) -> list[str]:
+    return [str(prim.GetPath()) for prim in prims]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ([], ["/World/hero/coat"]),
+        (["/World/hero/hat"], ["/World/hero/hat"]),
+        (["/World/hero"], ["/World/hero/coat", "/World/hero/hat"]),
+        (["coat"], ["/World/hero/coat", "/World/crowd/coat"]),
+        (["/World/*/coat"], ["/World/hero/coat", "/World/crowd/coat"]),
+        (["*hat", "coat"], ["/World/hero/coat", "/World/hero/hat", "/World/crowd/coat"]),
+        (["*/c???"], ["/World/hero/coat", "/World/crowd/coat"]),
+    ],
+)
+def test_garments_by_schema_path_name_and_glob(stage: Usd.Stage, wanted: list[str], expected: list[str]) -> None:
+    assert paths(find_garments(stage, wanted)) == expected
+
+
+def test_garments_by_collection(stage: Usd.Stage) -> None:
+    collection = Usd.CollectionAPI.Apply(stage.GetPrimAtPath("/World"), "clothes")
+    collection.IncludePath("/World/hero")
+    collection.ExcludePath("/World/hero/hat")
+    assert paths(find_garments(stage, ["/World.collection:clothes"])) == ["/World/hero/coat"]
+    with pytest.raises(StageError, match="no collection 'shoes'; collections: clothes"):
+        find_garments(stage, ["/World.collection:shoes"])
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ("/World/nobody", "no prim at </World/nobody>; meshes: /World/hero/coat, /World/hero/hat"),
+        ("/World/box", "names no Mesh"),
+        ("*sock", "names no Mesh; meshes: "),
+        ("//bad path", "is no prim path"),
+    ],
+)
+def test_what_is_not_there_lists_what_is(stage: Usd.Stage, wanted: str, message: str) -> None:
+    with pytest.raises(StageError, match=message):
+        find_garments(stage, [wanted])
+
+
+def test_nothing_tagged_lists_the_meshes(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/World/hero/coat").RemoveAppliedSchema("PhysGraphGarmentAPI")
+    with pytest.raises(StageError, match=r"no prim has PhysGraphGarmentAPI.*/World/crowd/coat"):
+        find_garments(stage)
+
+
+def test_the_schema_on_something_else_than_a_mesh_is_refused(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/World/box").AddAppliedSchema("PhysGraphGarmentAPI")
+    with pytest.raises(GarmentError, match=r"</World/box>.*is a Cube, not a Mesh"):
+        find_garments(stage)
+
+
+@pytest.mark.parametrize("state", ["abstract", "over"])
+def test_prims_that_do_not_exist_say_why(stage: Usd.Stage, state: str) -> None:
+    if state == "abstract":
+        stage.CreateClassPrim("/_class")
+        UsdGeom.Mesh.Define(stage, "/_class/cloth")
+    else:
+        UsdGeom.Mesh(stage.OverridePrim("/World/ghost"))
+    with pytest.raises(StageError, match=state):
+        find_garments(stage, ["/_class/cloth" if state == "abstract" else "/World/ghost"])
+
+
+def test_colliders_by_schema_whatever_their_visibility_and_purpose(stage: Usd.Stage) -> None:
+    kinds = {"a": UsdGeom.Sphere, "b": UsdGeom.Mesh, "c": UsdGeom.Capsule, "d": UsdGeom.Plane, "e": UsdGeom.Cube}
+    prims = {name: kind.Define(stage, f"/World/{name}").GetPrim() for name, kind in kinds.items()}
+    for name in "abc":
+        prims[name].AddAppliedSchema(COLLIDER_API)
+    UsdGeom.Imageable(prims["a"]).MakeInvisible()
+    UsdGeom.Imageable(prims["b"]).CreatePurposeAttr("guide")
+    prims["c"].SetActive(False)
+    UsdPhysics.CollisionAPI.Apply(prims["d"])
+    UsdPhysics.CollisionAPI.Apply(prims["e"]).CreateCollisionEnabledAttr(False)
+    assert paths(find_colliders(stage, find_garments(stage))) == ["/World/a", "/World/b", "/World/d"]
+    author(prims["a"], "physgraph:collider:enabled", False, kind="bool")
+    assert paths(find_colliders(stage, find_garments(stage))) == ["/World/b", "/World/d"]
+
+
+def test_colliders_by_relationship_and_by_path(stage: Usd.Stage) -> None:
+    for name in ("a", "b"):
+        UsdGeom.Sphere.Define(stage, f"/World/{name}").GetPrim().AddAppliedSchema(COLLIDER_API)
+    garments = find_garments(stage)
+    relationship = garments[0].CreateRelationship("physgraph:colliders")
+    relationship.SetTargets([Sdf.Path("/World/box")])
+    assert paths(find_colliders(stage, garments)) == ["/World/box"]
+    assert paths(find_colliders(stage, garments, ["/World/b", "/World/hero"])) == ["/World/hero/hat", "/World/b"]
+    relationship.SetTargets([Sdf.Path("/World/gone")])
+    with pytest.raises(StageError, match="/World/gone"):
+        find_colliders(stage, garments)
+
+
+def test_nested_instances_are_listed_outermost_first(tmp_path: Path) -> None:
+    inner = instanced_shot(tmp_path)
+    stage = new_stage(tmp_path / "outer.usda")
+    prim = UsdGeom.Xform.Define(stage, "/World/crowd").GetPrim()
+    prim.GetReferences().AddReference(inner)
+    prim.SetInstanceable(True)
+    garments = find_garments(stage)
+    assert paths(garments) == ["/World/crowd/one/cloth", "/World/crowd/two/cloth"]
+    assert [str(path) for path in instance_roots(garments[1])] == ["/World/crowd", "/World/crowd/two"]

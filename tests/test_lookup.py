@@ -1,0 +1,163 @@
+"""Who gives a fabric value: --set, the prim, its ancestors, the bound materials, the fallback."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdPhysics, UsdShade
+from stages import add_sheet, author, new_stage
+
+from physgraph_usd.errors import SchemaError, UsageError
+from physgraph_usd.fabric import PRESETS
+from physgraph_usd.usd.lookup import check_overrides, find_value, parse_overrides
+from physgraph_usd.usd.materials import Values, find_values
+from physgraph_usd.usd.schema import GARMENT
+from physgraph_usd.usd.stage import read_units
+
+BEND = "physgraph:material:bendStiffness"
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Usd.Stage:
+    made = new_stage(tmp_path / "s.usda", metres=0.01)
+    UsdPhysics.SetStageKilogramsPerUnit(made, 0.001)
+    add_sheet(made, "/World/rig/cloth")
+    return made
+
+
+def cloth(stage: Usd.Stage) -> Usd.Prim:
+    return stage.GetPrimAtPath("/World/rig/cloth")
+
+
+def bind(stage: Usd.Stage, name: str, purpose: str = "") -> Usd.Prim:
+    material = UsdShade.Material.Define(stage, f"/World/{name}")
+    binding = UsdShade.MaterialBindingAPI.Apply(cloth(stage))
+    binding.Bind(material, materialPurpose=purpose or UsdShade.Tokens.allPurpose)
+    return material.GetPrim()
+
+
+def values(stage: Usd.Stage, *overrides: str) -> Values:
+    return find_values(cloth(stage), read_units(stage)[0], parse_overrides(overrides))
+
+
+def test_the_order_of_sources_from_weakest_to_strongest(stage: Usd.Stage) -> None:
+    def bend(*overrides: str) -> tuple[float, str]:
+        found = values(stage, *overrides).found["bendStiffness"]
+        return round(float(found.at(None) or 0.0), 9), found.source
+
+    assert bend() == (PRESETS["jersey"].bend, "fallback")
+    shade = bind(stage, "shade")
+    author(shade, "physics:surfaceBendStiffness", 1e7)
+    assert bend() == (1.0, "</World/shade>.physics:surfaceBendStiffness")
+    author(shade, BEND, 1e-5)
+    assert bend() == (1e-5, f"</World/shade>.{BEND}")
+    author(bind(stage, "physical", "physics"), BEND, 2e-5)
+    assert bend() == (2e-5, f"</World/physical>.{BEND}")
+    author(stage.GetPrimAtPath("/World"), BEND, 3e-5)
+    author(stage.GetPrimAtPath("/World/rig"), BEND, 4e-5)
+    assert bend() == (4e-5, f"</World/rig>.{BEND}")
+    author(cloth(stage), BEND, 5e-5)
+    assert bend() == (5e-5, f"</World/rig/cloth>.{BEND}")
+    assert bend("bendStiffness=6e-5") == (6e-5, "--set")
+    assert bend("</World/rig>.bendStiffness=7e-5", "bendStiffness=6e-5") == (7e-5, "--set")
+    assert bend("/World/rig/cloth.physgraph:material:bendStiffness=8e-5", "</World>.bendStiffness=1")[0] == 8e-5
+    assert bend("bendStiffness=1e-5", "bendStiffness=9e-5")[0] == 9e-5
+
+
+def test_values_of_the_physics_proposal_are_converted_from_stage_units(stage: Usd.Stage) -> None:
+    material = bind(stage, "m", "physics")
+    m, kilograms = 0.01, 0.001
+    author(material, "physics:surfaceStretchStiffness", 30.0 / kilograms)
+    author(material, "physics:surfaceShearStiffness", 10.0 / kilograms)
+    author(material, "physics:surfaceBendStiffness", 4e-6 / (kilograms * m**2))
+    author(material, "physics:density", 200.0 * m**3 / kilograms)
+    author(material, "physgraph:material:thickness", 0.002)
+    fabric = values(stage).fabric(None)
+    found = [fabric.stretch, fabric.shear, fabric.bend, fabric.density, fabric.thickness]
+    np.testing.assert_allclose(found, [30.0, 10.0, 4e-6, 200.0 * 0.002, 0.002], rtol=1e-5)
+
+
+def test_a_proposal_value_of_zero_is_not_given(stage: Usd.Stage) -> None:
+    material = bind(stage, "m")
+    author(material, "physics:density", 0.0)
+    assert values(stage).fabric(None) == PRESETS["jersey"]
+
+
+def test_shear_is_none_until_authored(stage: Usd.Stage) -> None:
+    assert values(stage).fabric(None).shear is None
+    author(cloth(stage), "physgraph:material:shearStiffness", 12.0)
+    assert values(stage).fabric(None).shear == 12.0
+
+
+@pytest.mark.parametrize("kind", ["int", "half", "float", "double", "int64", "uchar", "bool"])
+def test_any_numeric_type_is_read(stage: Usd.Stage, kind: str) -> None:
+    author(stage.GetPrimAtPath("/World/rig"), "physgraph:material:stretchStiffness", 1, kind=kind)
+    assert values(stage).fabric(None).stretch == 1.0
+
+
+def test_what_blender_exports_is_found(stage: Usd.Stage) -> None:
+    author(stage.GetPrimAtPath("/World/rig"), f"userProperties:{BEND}", 5e-6, kind="double")
+    assert values(stage).fabric(None).bend == 5e-6
+
+
+@pytest.mark.parametrize(("kind", "value"), [("string", "soft"), ("float2", (1, 2)), ("float[]", [1.0])])
+def test_what_is_no_number_is_refused_by_name(stage: Usd.Stage, kind: str, value: object) -> None:
+    author(stage.GetPrimAtPath("/World/rig"), BEND, value, kind=kind)
+    with pytest.raises(SchemaError, match=re.escape(f"</World/rig>.{BEND}") + ".*single number"):
+        values(stage).fabric(None)
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_what_is_out_of_limits_is_refused_by_name(stage: Usd.Stage, value: float) -> None:
+    author(cloth(stage), BEND, value)
+    with pytest.raises(SchemaError, match=r"must be finite and in \[0, inf\] N m"):
+        values(stage).fabric(None)
+
+
+def test_a_blocked_value_is_not_given(stage: Usd.Stage) -> None:
+    author(stage.GetPrimAtPath("/World/rig"), BEND, 9e-6)
+    author(cloth(stage), BEND, Sdf.ValueBlock())
+    assert values(stage).found["bendStiffness"].source == f"</World/rig>.{BEND}"
+
+
+def test_animated_sources_are_told(stage: Usd.Stage) -> None:
+    for time in (1.0, 2.0):
+        author(cloth(stage), BEND, time * 1e-6, time=time)
+    author(cloth(stage), "physgraph:guide:stiffness", 100.0, time=1.0)
+    found = values(stage)
+    assert found.animated == {"bendStiffness"}
+    assert found.number("guide:stiffness", None) == 100.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bendStiffness", "cannot read 'bendStiffness'"),
+        ("bendStifness=1", "unknown attribute 'bendStifness'; known attributes: bendScale, bendStiffness"),
+        ("bendStiffness=soft", "cannot use"),
+        ("bendStiffness=-1", r"must be finite and in \[0, inf\]"),
+        ("level=1.5", "whole number"),
+        ("colliders=/World", "not a single number"),
+        ("pin=1", "not a single number"),
+        ("</World.bendStiffness=1", "cannot read|unknown|no such garment"),
+    ],
+)
+def test_overrides_that_cannot_be_used_say_why(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        check_overrides(parse_overrides([text]), [])
+
+
+def test_an_override_for_no_garment_is_refused() -> None:
+    with pytest.raises(UsageError, match="no such garment; garments: /World/coat"):
+        check_overrides(parse_overrides(["</World/coat2>.detail=1"]), [Sdf.Path("/World/coat")])
+    check_overrides(parse_overrides(["</World>.detail=1", "enabled=off"]), [Sdf.Path("/World/coat")])
+
+
+def test_a_fallback_of_the_table_is_given_where_nothing_is_authored(stage: Usd.Stage) -> None:
+    for row in GARMENT.values():
+        if row.type != "rel" and not row.interpolation:
+            expected = None if row.fallback is None else float(row.fallback)
+            assert find_value(cloth(stage), row).at(None) == expected

@@ -1,0 +1,135 @@
+"""Where the rest shape comes from, in which size, and when it is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf, UsdGeom, Vt
+from stages import add_sheet, affine, author, new_stage, save, set_matrix, sheet_points, vec3
+
+from physgraph_usd.errors import GarmentError
+from physgraph_usd.usd.reader import Shot, open_shot
+
+FLAT = sheet_points() * [1.0, 1.0, 0.0]
+
+
+def source(shot: Shot) -> str:
+    return shot.sources[0].sources["rest"]
+
+
+def primvar(mesh: UsdGeom.Mesh, name: str, values: np.ndarray) -> UsdGeom.Primvar:
+    made = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, Sdf.ValueTypeNames.Point3fArray, "vertex")
+    made.Set(vec3(values))
+    return made
+
+
+def test_the_order_of_rest_shapes_from_weakest_to_strongest(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    mesh = add_sheet(stage, default=False, times=(5.0, 6.0))
+
+    def rest(**options) -> tuple[str, np.ndarray]:
+        shot = open_shot(save(stage), **options)
+        return source(shot), shot.scene.garments[0].rest
+
+    name, points = rest()
+    assert name == "first sample of points"
+    np.testing.assert_allclose(points, sheet_points(5.0))
+    np.testing.assert_allclose(rest(frames=(6.0, 6.0))[1], sheet_points(5.0))
+    mesh.GetPointsAttr().Set(vec3(sheet_points()))
+    name, points = rest()
+    assert name == "default points"
+    np.testing.assert_allclose(points, sheet_points())
+    for number, attribute in enumerate(("Pref", "rest"), start=1):
+        primvar(mesh, attribute, FLAT * (1 + 0.1 * number))
+        name, points = rest()
+        assert name == f"</World/cloth>.primvars:{attribute}"
+        np.testing.assert_allclose(points, FLAT * (1 + 0.1 * number), rtol=1e-6)
+    author(mesh.GetPrim(), "physics:restShapePoints", vec3(FLAT), kind="point3f[]")
+    name, points = rest()
+    assert name == "</World/cloth>.physics:restShapePoints"
+    np.testing.assert_allclose(points, FLAT)
+    name, points = rest(rest_frame=6.0)
+    assert name == "points at time code 6 (--rest)"
+    np.testing.assert_allclose(points, sheet_points(6.0))
+
+
+def test_the_rest_shape_has_the_size_that_the_cloth_has_in_the_world(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda", metres=0.01)
+    matrix = affine(np.diag([2.0, 1.0, 0.5]), (7, 0, 0))
+    set_matrix(stage.GetPrimAtPath("/World"), matrix, 1.0)
+    add_sheet(stage)
+    expected = 0.01 * (sheet_points() @ matrix[:3, :3].T + matrix[:3, 3])
+    np.testing.assert_allclose(open_shot(save(stage)).scene.garments[0].rest, expected, atol=1e-9)
+
+
+def test_an_indexed_rest_primvar_of_doubles_is_read(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    mesh = add_sheet(stage)
+    made = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("rest", Sdf.ValueTypeNames.Double3Array, "vertex")
+    made.Set(Vt.Vec3dArray([tuple(map(float, point)) for point in FLAT[::-1]]))
+    made.SetIndices(Vt.IntArray(list(range(19, -1, -1))))
+    np.testing.assert_allclose(open_shot(save(stage)).scene.garments[0].rest, FLAT)
+
+
+def test_s16_a_rest_shape_of_another_topology_is_refused(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    primvar(add_sheet(stage), "rest", FLAT[:-1])
+    with pytest.raises(GarmentError, match=r"</World/cloth>: primvars:rest has 19 values, the mesh has 20 points; "):
+        open_shot(save(stage))
+
+
+@pytest.mark.parametrize("where", ["rest", "default"])
+def test_s16_a_rest_edge_without_length_is_refused_with_its_indices(tmp_path: Path, where: str) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    mesh, points = add_sheet(stage), FLAT.copy()
+    points[6] = points[7]
+    if where == "rest":
+        primvar(mesh, "rest", points)
+    else:
+        mesh.GetPointsAttr().Set(vec3(points))
+    with pytest.raises(GarmentError, match=r"</World/cloth>: .*no length between points\[6\] and points\[7\]; "):
+        open_shot(save(stage))
+
+
+def test_a_rest_shape_that_is_not_finite_is_refused_with_its_index(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    points = FLAT.copy()
+    points[4, 1] = np.nan
+    primvar(add_sheet(stage), "Pref", points)
+    with pytest.raises(GarmentError, match=r"</World/cloth>.primvars:Pref\[4\] is NaN"):
+        open_shot(save(stage))
+
+
+def test_default_points_of_another_topology_give_way_to_the_first_sample(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage).GetPointsAttr().Set(vec3(FLAT[:5]))
+    shot = open_shot(save(stage))
+    assert source(shot) == "first sample of points"
+    assert any("default points are 5, the mesh has 20" in notice.message for notice in shot.warnings)
+
+
+def test_broken_default_points_are_repaired_for_the_rest_shape(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    points = FLAT.copy()
+    points[7] = np.nan
+    add_sheet(stage).GetPointsAttr().Set(vec3(points))
+    shot = open_shot(save(stage))
+    assert np.linalg.norm(shot.scene.garments[0].rest[7] - FLAT[7]) < 0.5
+    assert any("repaired for the rest shape" in notice.message for notice in shot.warnings)
+
+
+def test_a_rest_shape_of_another_size_is_told(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    primvar(add_sheet(stage), "rest", 100 * FLAT)
+    assert any("times as long as the animation's" in notice.message for notice in open_shot(save(stage)).warnings)
+
+
+@pytest.mark.parametrize(("value", "bent"), [("restShapeDefault", True), ("flatDefault", False), (None, False)])
+def test_hinges_rest_flat_or_bent(tmp_path: Path, value: str | None, bent: bool) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    mesh = add_sheet(stage)
+    if value:
+        author(mesh.GetPrim(), "physics:restBendAnglesDefault", value, kind="token")
+    assert open_shot(save(stage)).scene.garments[0].bent_rest == bent

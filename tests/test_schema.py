@@ -1,0 +1,151 @@
+"""The table, the schema files and what USD makes of them agree; and nothing needs them registered."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pxr import Plug, Sdf, Usd, UsdGeom, UsdShade
+from stages import sheet_shot, value_type
+
+from physgraph_usd.errors import UsageError
+from physgraph_usd.fabric import PRESETS
+from physgraph_usd.usd.schema import (
+    COLLIDER_API,
+    GARMENT,
+    GARMENT_API,
+    MATERIAL_API,
+    PROPERTIES,
+    Property,
+    find_property,
+    register,
+    schema_path,
+)
+from physgraph_usd.usd.schema_files import schema_files
+
+TYPES = {GARMENT_API: UsdGeom.Mesh, COLLIDER_API: UsdGeom.Sphere, MATERIAL_API: UsdShade.Material}
+
+
+@pytest.fixture(scope="module")
+def prims() -> dict[str, Usd.Prim]:
+    register()
+    stage = Usd.Stage.CreateInMemory()
+    made = {schema: kind.Define(stage, f"/{schema}").GetPrim() for schema, kind in TYPES.items()}
+    for schema, prim in made.items():
+        assert prim.CanApplyAPI(schema), schema
+        prim.ApplyAPI(schema)
+        assert prim.HasAPI(schema), schema
+    made["stage"] = stage  # type: ignore[assignment]  keeps it alive
+    return made
+
+
+@pytest.mark.parametrize("name", ["generatedSchema.usda", "plugInfo.json", "schema.usda"])
+def test_committed_files_are_what_the_table_gives(name: str) -> None:
+    text = (schema_path() / name).read_text(encoding="utf-8")
+    assert text == schema_files()[name], "run python -m physgraph_usd.usd.schema_files"
+
+
+@pytest.mark.parametrize("row", PROPERTIES, ids=lambda row: f"{row.schema}.{row.name}")
+def test_every_row_is_what_the_registered_schema_says(prims: dict[str, Usd.Prim], row: Property) -> None:
+    prim = prims[row.schema]
+    if row.type == "rel":
+        assert prim.GetRelationship(row.name)
+        return
+    attribute = prim.GetAttribute(row.name)
+    assert attribute.GetTypeName() == value_type(row.type)
+    assert (attribute.GetVariability() == Sdf.VariabilityUniform) == row.uniform
+    assert attribute.GetDocumentation().startswith(row.doc)
+    assert not attribute.HasAuthoredValue()
+    if row.interpolation:
+        assert UsdGeom.Primvar(attribute).GetInterpolation() == row.interpolation
+    elif row.fallback is None:
+        assert attribute.Get() is None
+    else:
+        assert attribute.Get() == pytest.approx(row.fallback)
+        assert type(attribute.Get()) is type(row.fallback)
+
+
+@pytest.mark.parametrize("row", [row for row in PROPERTIES if row.minimum is not None and not row.interpolation])
+def test_limits_reach_usd_where_it_knows_them(prims: dict[str, Usd.Prim], row: Property) -> None:
+    attribute = prims[row.schema].GetAttribute(row.name)
+    hard_limits = getattr(attribute, "GetHardLimits", None)
+    if hard_limits is None:
+        pytest.skip("limits are native from USD 25.11")
+    limits = hard_limits()
+    assert limits.GetMinimum() == pytest.approx(row.minimum)
+    assert limits.GetMaximum() == (None if row.maximum is None else pytest.approx(row.maximum))
+
+
+def test_schemas_apply_only_where_they_belong(prims: dict[str, Usd.Prim]) -> None:
+    xform = UsdGeom.Xform.Define(prims[GARMENT_API].GetStage(), "/x").GetPrim()
+    for schema in TYPES:
+        assert not xform.CanApplyAPI(schema)
+    assert prims[GARMENT_API].CanApplyAPI(COLLIDER_API)
+    assert not prims[COLLIDER_API].CanApplyAPI(GARMENT_API)
+
+
+def test_fallbacks_are_jersey_s() -> None:
+    jersey = PRESETS["jersey"]
+    names = {"stretchStiffness": jersey.stretch, "bendStiffness": jersey.bend, "density": jersey.density}
+    assert {name: GARMENT[name].fallback for name in names} == names
+    assert GARMENT["thickness"].fallback == jersey.thickness
+
+
+def test_every_material_row_says_that_it_is_si() -> None:
+    for row in PROPERTIES:
+        if row.unit:
+            assert "SI, whatever" in row.doc, row.name
+
+
+def test_registering_again_changes_nothing() -> None:
+    register()
+    register()
+    assert Plug.Registry().GetPluginWithName("physgraph")
+    assert json.loads((schema_path() / "plugInfo.json").read_text())["Plugins"][0]["Name"] == "physgraph"
+
+
+@pytest.mark.parametrize("text", ["physgraph:refine:level", "refine:level", "level"])
+def test_properties_are_found_by_short_names(text: str) -> None:
+    assert find_property(text) is GARMENT["refine:level"]
+
+
+def test_a_name_that_several_have_is_not_guessed() -> None:
+    with pytest.raises(UsageError, match="unknown attribute 'nonsense'; known attributes: "):
+        find_property("nonsense")
+
+
+UNREGISTERED = """
+from pxr import Usd, UsdGeom
+stage = Usd.Stage.CreateInMemory()
+UsdGeom.Mesh.Define(stage, "/a").GetPrim().GetAttribute("points").HasFallbackValue()
+from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.schema import register
+register()
+shot = open_shot({path!r})
+prim = shot.stage.GetPrimAtPath("/World/cloth")
+assert not prim.HasAPI("PhysGraphGarmentAPI"), "the schema was registered after all"
+assert shot.scene.garments[0].level == 2
+print(shot.frame(2.0).garments[0].fabric.bend)
+"""
+
+
+def test_garments_are_found_and_read_where_the_schemas_came_too_late(tmp_path: Path) -> None:
+    code = UNREGISTERED.format(path=sheet_shot(tmp_path / "s.usda"))
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == PRESETS["jersey"].bend
+
+
+def test_the_table_needs_no_pxr() -> None:
+    code = (
+        "import sys; sys.modules['pxr'] = None\nfrom physgraph_usd.usd.schema import schema_path; print(schema_path())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
+    )
+    assert done.stdout.strip() == str(schema_path()), done.stderr

@@ -1,0 +1,156 @@
+"""Opening stages: units, axes and every way in which a file can be broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom
+from stages import add_sheet, new_stage, save, sheet_shot
+
+from physgraph_usd.errors import StageError
+from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.stage import composition_problems, open_stage, read_units
+
+
+def layer(path: Path, text: str) -> str:
+    path.write_text("#usda 1.0\n" + text)
+    return str(path)
+
+
+def with_metadata(path: Path, **values: object) -> Usd.Stage:
+    made = Sdf.Layer.CreateNew(str(path))
+    for key, value in values.items():
+        made.pseudoRoot.SetInfo(key, value)
+    made.Save()
+    return Usd.Stage.Open(made)
+
+
+def test_units_stored_as_float_are_read_where_usd_raises(real_data: Path) -> None:
+    for file in sorted((real_data / "stages" / "float_units").iterdir()):
+        stage, notices = open_stage(str(file))
+        with pytest.raises(RuntimeError):
+            UsdGeom.GetStageMetersPerUnit(stage)
+        assert read_units(stage)[0].metres == 1.0
+        assert notices == []
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_units_that_are_no_length_are_told_and_replaced(tmp_path: Path, value: float) -> None:
+    units, notices = read_units(with_metadata(tmp_path / "s.usda", metersPerUnit=value))
+    assert units.metres == 0.01
+    assert "is no length" in str(notices[0])
+
+
+def test_a_metres_per_unit_of_single_precision_is_rounded_to_what_was_meant(tmp_path: Path) -> None:
+    stage = with_metadata(tmp_path / "s.usda", metersPerUnit=float(np.float32(0.01)))
+    assert read_units(stage)[0].metres == 0.01
+
+
+@pytest.mark.parametrize("axis", ["X", "up"])
+def test_an_up_axis_that_usd_does_not_know_is_told(tmp_path: Path, axis: str) -> None:
+    units, notices = read_units(with_metadata(tmp_path / "s.usda", upAxis=axis, metersPerUnit=1.0))
+    np.testing.assert_array_equal(units.up, [0, 1, 0])
+    assert axis in str(notices[0])
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0])
+def test_a_rate_that_is_none_is_told_and_a_moving_sheet_still_read(tmp_path: Path, rate: float) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage)
+    stage.GetRootLayer().pseudoRoot.SetInfo("timeCodesPerSecond", rate)
+    shot = open_shot(save(stage))
+    assert shot.scene.times == (1.0, 2.0, 3.0)
+    assert any("timeCodesPerSecond" in notice.message for notice in shot.warnings)
+
+
+def broken_files(folder: Path) -> dict[str, str]:
+    good = sheet_shot(folder / "good.usda")
+    crate = folder / "good.usdc"
+    Usd.Stage.Open(good).Export(str(crate))
+    data = crate.read_bytes()
+    half, noise = folder / "half.usdc", folder / "noise.usdc"
+    half.write_bytes(data[: len(data) // 2])
+    noise.write_bytes(data[:88] + np.random.default_rng(1).bytes(len(data) - 88))
+    (folder / "empty.usda").write_bytes(b"")
+    (folder / "wrong.usdz").write_bytes(b"PK not a zip")
+    return {
+        "missing": str(folder / "nowhere.usda"),
+        "a folder": str(folder),
+        "truncated crate": str(half),
+        "noise in a crate": str(noise),
+        "empty file": str(folder / "empty.usda"),
+        "not a zip": str(folder / "wrong.usdz"),
+        "syntax": layer(folder / "syntax.usda", 'def Mesh "X" {'),
+        "unknown suffix": layer(folder / "shot.xyz", ""),
+        "broken sublayer": layer(folder / "s1.usda", "(subLayers = [@./syntax.usda@])"),
+        "broken reference": layer(folder / "s2.usda", 'def "A" (references = @./half.usdc@) {\n}\n'),
+        "sublayer circle": layer(folder / "s3.usda", "(subLayers = [@./s3.usda@])"),
+        "reference circle": layer(
+            folder / "s4.usda", 'def "A" (references = </B>) {\n}\ndef "B" (references = </A>) {\n}\n'
+        ),
+        "bad rate": layer(folder / "s5.usda", "(framesPerSecond = -1)"),
+    }
+
+
+def test_broken_files_are_stage_errors_that_name_the_file(tmp_path: Path) -> None:
+    for case, path in broken_files(tmp_path).items():
+        with pytest.raises(StageError, match=r"cannot (open|compose|read)") as caught:
+            open_shot(path, garments=["*"])
+        assert path in str(caught.value), case
+        assert "Error in" not in str(caught.value), case
+
+
+def test_a_crate_cut_anywhere_is_never_a_traceback(tmp_path: Path) -> None:
+    crate = tmp_path / "good.usdc"
+    Usd.Stage.Open(sheet_shot(tmp_path / "good.usda")).Export(str(crate))
+    data = crate.read_bytes()
+    for number, part in enumerate(np.linspace(0.02, 0.98, 13)):
+        cut = tmp_path / f"cut{number}.usdc"
+        cut.write_bytes(data[: int(part * len(data))])
+        with pytest.raises(StageError):
+            open_shot(str(cut))
+
+
+def test_a_missing_sublayer_elsewhere_is_a_notice(tmp_path: Path) -> None:
+    sheet_shot(tmp_path / "cloth.usda")
+    path = layer(tmp_path / "shot.usda", "(metersPerUnit = 1\n subLayers = [@./cloth.usda@, @./lights.usda@])")
+    shot = open_shot(path)
+    assert any("lights.usda" in notice.message for notice in shot.warnings)
+
+
+@pytest.mark.parametrize("arc", ["payload", "references"])
+def test_a_missing_payload_or_reference_of_a_garment_is_an_error(tmp_path: Path, arc: str) -> None:
+    sheet_shot(tmp_path / "cloth.usda")
+    cloth = f'over "cloth" (add {arc} = @./gone.usda@) {{\n}}\n'
+    text = f'(metersPerUnit = 1\n subLayers = [@./cloth.usda@])\nover "World" {{\n{cloth}}}\n'
+    with pytest.raises(StageError, match=r"</World/cloth> is incomplete: .*gone.usda"):
+        open_shot(layer(tmp_path / "shot.usda", text))
+
+
+def test_a_missing_payload_that_should_hold_the_garment_is_told(tmp_path: Path) -> None:
+    path = layer(tmp_path / "shot.usda", 'def Xform "char" (payload = @./gone.usda@) {\n}\n')
+    with pytest.raises(StageError, match=r"no prim at </char/cloth>.*gone.usda"):
+        open_shot(path, garments=["/char/cloth"])
+
+
+def test_a_missing_payload_elsewhere_is_a_notice(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "shot.usda")
+    add_sheet(stage)
+    stage.DefinePrim("/World/set").GetPayloads().AddPayload("./gone.usda")
+    assert any("gone.usda" in notice.message for notice in open_shot(save(stage)).warnings)
+
+
+def test_older_usd_is_understood_by_what_it_said() -> None:
+    class Old:
+        """A stage without a list of composition errors."""
+
+    warnings = [
+        "In </A>: Could not open asset @nowhere.usda@ for payload introduced by @a.usda@</A>.",
+        "Could not load sublayer @gone.usda@ of layer @a.usda@; skipping.",
+        "Cycle detected: one asset and another",
+        "version 0.7.0 is deprecated",
+    ]
+    found = composition_problems(Old(), warnings)  # type: ignore[arg-type]
+    assert [(problem.path, problem.missing) for problem in found] == [("/A", True), ("", True), ("", False)]
