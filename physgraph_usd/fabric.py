@@ -13,7 +13,7 @@ class Fabric:
     """One fabric's parameters.
 
     Attributes:
-        stretch: In-plane Young's modulus of the sheet, Y = E h / (1 - nu^2) [N/m].
+        stretch: In-plane Young's modulus of the sheet, Y = E h [N/m].
         bend: Bending stiffness D = E h^3 / 12 (1 - nu^2) [N m].
         density: Areal density [kg/m^2].
         thickness: Sheet thickness [m].

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
-from sheets import level_of
+from sheets import level_of_kind
 
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.forces.base import Force, ForceModule
@@ -212,25 +212,44 @@ def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int 
     return x
 
 
-def hang(
-    points: np.ndarray, triangles: np.ndarray, pinned: np.ndarray, start: np.ndarray, fabric: Fabric
-) -> np.ndarray:
+def hang(level: Level, start: np.ndarray, fabric: Fabric) -> np.ndarray:
     """Rest positions of a pinned sheet under its own weight, z up."""
-    level = level_of(points, triangles, pin=pinned.astype(float))
     weight = Gravity(level, torch.tensor([fabric.density]), np.array([0.0, 0.0, -G]))
     forces = (*in_plane_terms(level, [fabric]), Bending(level, torch.tensor([fabric.bend])), weight)
     return relax(level, forces, torch.as_tensor(start)).numpy()
 
 
-def cantilever(points: np.ndarray, triangles: np.ndarray, length: float, fabric: Fabric) -> float:
+def cantilever(kind: str, length: float, fabric: Fabric, *, edges: int = 24) -> float:
     """Angle of the chord below the horizontal [rad] of a strip clamped where x <= 0, free at x = length."""
-    start = points.copy()
-    out = np.maximum(points[:, 0], 0.0)
+    edge = length / edges
+    width = 2 * edge * round(0.35 * edges / 2)
+    level = level_of_kind(
+        kind, (length + 2 * edge, width, edge), start=-2 * edge, pinned=lambda p: p[:, 0] < 1e-3 * edge
+    )
+    points = level.rest.numpy()
+    start, out = points.copy(), np.maximum(points[:, 0], 0.0)
     start[:, 0] = np.minimum(points[:, 0], 0.0) + length * np.sin(out / length)
     start[:, 2] = -length * (1.0 - np.cos(out / length))
-    settled = hang(points, triangles, points[:, 0] < 1e-9, start, fabric)
+    settled = hang(level, start, fabric)
     tip = settled[points[:, 0] > length * (1 - 1e-3)].mean(axis=0)
     return float(np.arctan2(-tip[2], tip[0]))
+
+
+def hanging_chain(kind: str, length: float, span: float, fabric: Fabric) -> float:
+    """Sag [m] of a narrow strip whose short sides are pinned a span apart."""
+    edge = length / 30
+    level = level_of_kind(
+        kind,
+        (length, 2 * edge, edge),
+        pinned=lambda p: (p[:, 0] < 0.6 * edge) | (p[:, 0] > p[:, 0].max() - 0.6 * edge),
+    )
+    points = level.rest.numpy()
+    along = points[:, 0] / points[:, 0].max() - 0.5
+    start = points.copy()
+    start[:, 0] = along * span
+    start[:, 2] = -0.8 * catenary_sag(length, span) * (1 - (2 * along) ** 2)
+    start[~level.free[:, 0].numpy(), 2] = 0.0
+    return float(-hang(level, start, fabric)[:, 2].min())
 
 
 def elastica(length: float, rigidity: float, density: float) -> float:
@@ -251,8 +270,17 @@ def elastica(length: float, rigidity: float, density: float) -> float:
 
 
 def peirce(angle: float, length: float, density: float) -> float:
-    """Peirce's D [N m] from the chord's angle: density G c^3, c = length (cos(angle / 2) / (8 tan angle))^(1/3)."""
+    """Peirce's D [N m] from the chord's angle: density G c^3, c = length (cos(angle / 2) / (8 tan angle))^(1/3).
+
+    An approximation of 1930: 6% above the elastica's at the fabric laboratory's 41.5 degrees.
+    """
     return density * G * length**3 * np.cos(angle / 2) / (8 * np.tan(angle))
+
+
+def rigidity_from(angle: float, length: float, density: float) -> float:
+    """The rigidity [N m] with which the elastica has this chord angle."""
+    unit = density * G * length**3
+    return float(brentq(lambda d: elastica(length, d, density) - angle, 0.02 * unit, 2.0 * unit, rtol=1e-6))
 
 
 def catenary_sag(length: float, span: float) -> float:

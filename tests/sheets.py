@@ -9,7 +9,7 @@ import torch
 from meshes import grid
 from scipy.spatial import Delaunay
 
-from physgraph_usd.level import Level, build_levels
+from physgraph_usd.level import Level, build_levels, refine_garments
 from physgraph_usd.mesh.subdivide import subdivide
 from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.scene import Garment
@@ -81,17 +81,21 @@ def irregular(length: float, width: float, edge: float) -> Sheet:
     return np.column_stack([points, np.zeros(len(points))]), faces[flat]
 
 
+def quad_cage(length: float, width: float, edge: float) -> tuple[PolygonMesh, np.ndarray]:
+    """Squares of twice the edge."""
+    cage, points = grid(max(1, round(length / (2 * edge))), max(1, round(width / (2 * edge))))
+    return cage, points * np.array([length, width, 0.0]) / np.maximum(np.ptp(points, axis=0), 1e-300)
+
+
 def quads_refined(length: float, width: float, edge: float) -> Sheet:
     """Squares as one subdivision of a quad cage gives them: diagonals alternate."""
-    cage, points = grid(max(1, round(length / (2 * edge))), max(1, round(width / (2 * edge))))
+    cage, points = quad_cage(length, width, edge)
     refinement = subdivide(cage)
-    points = refinement.linear @ points
-    scale = np.array([length, width, 0.0]) / np.maximum(np.ptp(points, axis=0), 1e-300)
-    return points * scale, refinement.mesh.triangulate().triangles.astype(np.int64)
+    return refinement.linear @ points, refinement.mesh.triangulate().triangles.astype(np.int64)
 
 
 def quads_one_way(length: float, width: float, edge: float) -> Sheet:
-    """Squares whose diagonals all run one way."""
+    """Squares triangulated before they came to us, all diagonals one way."""
     mesh, points = grid(round(length / edge), max(1, round(width / edge)), "triangles")
     scale = np.array([length, width, 0.0]) / np.maximum(np.ptp(points, axis=0), 1e-300)
     return points * scale, mesh.indices.reshape(-1, 3).astype(np.int64)
@@ -104,6 +108,32 @@ KINDS: dict[str, Callable[[float, float, float], Sheet]] = {
     "quads, one way": quads_one_way,
 }
 """Sheets of a length, a width and an edge length, by the name of their mesh kind."""
+
+
+def level_of_kind(
+    kind: str,
+    size: tuple[float, float, float],
+    *,
+    start: float = 0.0,
+    pinned: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> Level:
+    """A sheet of a mesh kind in float64; quads are refined, so that the level knows them for quads.
+
+    Args:
+        kind: One of `KINDS`.
+        size: Length, width and edge length.
+        start: Where x begins.
+        pinned: Tells from points which are pinned.
+    """
+    shift = np.array([start, 0.0, 0.0])
+    if kind != "quads, alternating":
+        points, triangles = KINDS[kind](*size)
+        points = points + shift
+        return level_of(points, triangles, pin=np.zeros(len(points)) if pinned is None else pinned(points) * 1.0)
+    cage, points = quad_cage(*size)
+    points = points + shift
+    garment = garment_of(cage, points, pin=np.zeros(len(points)) if pinned is None else pinned(points) * 1.0)
+    return build_levels([garment], refine_garments([garment], [1]), dtype=torch.float64)[-1]
 
 
 def quality(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -99,7 +99,7 @@ def test_triangle_inverse_undoes_the_sides(case: tuple[PolygonMesh, np.ndarray],
 
 
 def test_material_axes_follow_the_rest_frame_and_not_the_triangles():
-    """A sheet in a coordinate plane, or rolled about a coordinate axis, has the axes of its frame up to quarter turns."""
+    """A sheet in a coordinate plane, or rolled about a coordinate axis, has its frame's axes up to quarter turns."""
     flat, triangles = equilateral(0.5, 0.4, 0.1)
     roll = np.stack([flat[:, 0], 0.2 * np.sin(flat[:, 1] / 0.2), 0.2 * np.cos(flat[:, 1] / 0.2)], axis=1)
     for rest in (flat, flat[:, [2, 0, 1]], roll, roll[:, [1, 2, 0]]):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -88,7 +90,7 @@ def test_s3_needle_sheet_is_solved_without_wild_steps(aspect: float, shear: floa
     out, report = solve_level(
         system, QuasiNewton(), x, level=0, budget=Budget(30), observe=lambda carry: visited.append(carry.x)
     )
-    moves = torch.stack([(b - a).norm(dim=1) for a, b in zip(visited, visited[1:], strict=False)])
+    moves = torch.stack([(b - a).norm(dim=1) for a, b in pairwise(visited)])
     assert bool(out.isfinite().all())
     assert report.energy_after < report.energy_before
     assert float(moves.max()) < 0.1
