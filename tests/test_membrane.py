@@ -1,0 +1,170 @@
+"""The triangle membrane: when it takes over, what it keeps, and how it sits beside edge springs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from energies import evaluate
+from meshes import grid
+from sheets import equilateral, garment_of, level_of
+from test_forces import crumple
+
+from physgraph_usd.fabric import Fabric
+from physgraph_usd.forces.membrane import Membrane, in_plane_terms
+from physgraph_usd.forces.stretch import Stretch
+from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.integrate import method_named
+from physgraph_usd.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
+from physgraph_usd.mesh.diagonals import quad_edges
+from physgraph_usd.scene import GarmentFrame
+from physgraph_usd.shot import inspect_shot
+
+SPRINGS, TRIANGLES = Fabric(30.0), Fabric(30.0, shear=7.0)
+
+
+def pair() -> Level:
+    """Two garments of quads and triangles side by side, refined once."""
+    mesh, points = grid(4, 3, "mixed")
+    garments = [garment_of(mesh, 0.1 * points), garment_of(mesh, 0.1 * points + [1.0, 0.0, 0.0])]
+    return build_levels(garments, refine_garments(garments, [1, 1]), dtype=torch.float64)[-1]
+
+
+@pytest.mark.parametrize("potential", ["continuum", "paper"])
+@pytest.mark.parametrize(
+    ("fabrics", "kinds"),
+    [
+        ((SPRINGS, SPRINGS), (Stretch,)),
+        ((TRIANGLES, TRIANGLES), (Membrane,)),
+        ((SPRINGS, TRIANGLES), (Stretch, Membrane)),
+        ((TRIANGLES, SPRINGS), (Stretch, Membrane)),
+        ((Fabric(30.0, shear=0.0), SPRINGS), (Stretch, Membrane)),
+    ],
+)
+def test_each_garment_has_the_term_its_fabric_asks_for(
+    fabrics: tuple[Fabric, Fabric], kinds: tuple[type, ...], potential: str
+):
+    level = pair()
+    x = crumple(level.rest.numpy(), 0.005, 1)
+    terms = in_plane_terms(level, fabrics, potential=potential)
+    assert tuple(type(term) for term in terms) == kinds
+    found = sum((evaluate(term, x)[1] for term in terms), torch.zeros_like(x))
+    for span, fabric in zip(level.spans, fabrics, strict=True):
+        alone = in_plane_terms(level, (fabric, fabric), potential=potential)
+        assert len(alone) == 1
+        assert torch.allclose(found[span], evaluate(alone[0], x)[1][span], rtol=1e-12, atol=1e-15)
+
+
+def test_small_strains_of_an_isotropic_membrane_are_those_of_springs():
+    points, triangles = equilateral(0.5, 0.4, 0.1)
+    level = level_of(points, triangles)
+    springs = in_plane_terms(level, [Fabric(30.0)])[0]
+    membrane = in_plane_terms(level, [Fabric(30.0, shear=0.375 * 30.0)])[0]
+    strain = torch.eye(3, dtype=torch.float64) + 1e-6 * torch.as_tensor(np.random.default_rng(1).normal(size=(3, 3)))
+    small = level.rest @ strain
+    assert evaluate(membrane, small)[0] == pytest.approx(evaluate(springs, small)[0], rel=1e-4)
+
+
+def test_without_stiffness_in_shear_a_sheared_sheet_is_free():
+    """A shear along the rest frame's axes costs the second order only."""
+    mesh, points = grid(3, 2, "triangles")
+    level = level_of(points, mesh.indices.reshape(-1, 3))
+    membrane = in_plane_terms(level, [Fabric(30.0, shear=0.0)])[0]
+    costs = []
+    for angle in (1e-2, 1e-3):
+        sheared = points.copy()
+        sheared[:, 0] += angle * points[:, 1]
+        costs.append(evaluate(membrane, torch.as_tensor(sheared))[0])
+    assert costs[0] / costs[1] == pytest.approx(1e4, rel=1e-3)
+
+
+def test_painted_scale_multiplies_the_triangles():
+    points, triangles = equilateral(0.5, 0.4, 0.1)
+    plain = level_of(points, triangles)
+    painted = level_of(points, triangles, stretch_scale=np.full(len(points), 2.5))
+    x = crumple(points, 0.01, 3)
+    energies = [evaluate(in_plane_terms(level, [TRIANGLES])[0], x)[0] for level in (plain, painted)]
+    assert energies[1] == pytest.approx(2.5 * energies[0])
+
+
+def test_quads_tell_sides_from_diagonals():
+    mesh, points = grid(2, 1, "mixed")
+    split = mesh.triangulate(points)
+    level = build_levels([garment_of(mesh, points)], [()], dtype=torch.float64)[0]
+    edges = level.edges.numpy()
+    from_quad, diagonal = quad_edges(split, mesh.counts, edges)
+    found = {
+        tuple(edge): (share, bool(cross))
+        for edge, share, cross in zip(edges.tolist(), from_quad, diagonal, strict=True)
+    }
+    assert found[0, 4] == (0.0, False)
+    assert found[1, 4] == (0.5, False)
+    assert found[1, 2] == (1.0, False)
+    assert [edge for edge, (_, cross) in found.items() if cross] in ([(1, 5)], [(2, 4)])
+    factors = dict(zip(map(tuple, edges.tolist()), level.edge_factor.tolist(), strict=True))
+    assert factors[0, 4] == 1.0
+    assert factors[1, 4] == pytest.approx((1 + QUAD_SPRING[0]) / 2)
+    assert factors[1, 2] == QUAD_SPRING[0]
+    across = [factors[edge] for edge, (_, cross) in found.items() if cross]
+    assert across == [QUAD_SPRING[1]]
+    hinges = dict(
+        zip((tuple(sorted(h)) for h in level.hinges[:, :2].tolist()), level.hinge_factor.tolist(), strict=True)
+    )
+    assert hinges[0, 4] == 1.0
+    assert hinges[1, 4] == pytest.approx((1 + QUAD_HINGE[0]) / 2)
+    assert QUAD_HINGE[1] in hinges.values()
+
+
+def test_the_paper_potential_has_no_quad_factors():
+    level = pair()
+    for name in ("edge_factor", "hinge_factor"):
+        assert len(getattr(level, name).unique()) > 1
+    springs = in_plane_terms(level, [SPRINGS, SPRINGS], potential="paper")[0]
+    share = springs.stiffness / level.edge_area
+    assert torch.allclose(share, share[:1].expand_as(share))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_mixed_group_is_what_its_garments_are_alone(dtype: torch.dtype):
+    """Pulled, so that there is one rest state."""
+    mesh, points = grid(6, 6)
+    points = 0.03 * points
+    bump = 0.01 * np.sin(20 * points[:, 1])
+    pulled = points * [1.15, 1.02, 1.0] + np.stack([0 * bump, 0 * bump, bump], axis=1)
+    frames = [GarmentFrame(pulled, SPRINGS), GarmentFrame(pulled + np.array([1.0, 0, 0]), TRIANGLES)]
+    settings = SolveSettings(method_named("quasi-newton"), steps=100, tolerance=1e-5)
+
+    def solve(chosen: list[GarmentFrame]) -> tuple[list[np.ndarray], dict[str, float]]:
+        garments = [garment_of(mesh, points) for _ in chosen]
+        refinements = refine_garments(garments, [1] * len(garments))
+        group = Group(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=dtype, device="cpu")
+        shapes, _, telemetry = group.solve(chosen, None, at=None)
+        return shapes, telemetry["energy_joules"]["output"]
+
+    together, energies = solve(frames)
+    assert {"stretch", "membrane"} <= set(energies)
+    for shape, frame, term, other in zip(
+        together, frames, ("stretch", "membrane"), ("membrane", "stretch"), strict=True
+    ):
+        alone, energy = solve([frame])
+        assert energy[term] == pytest.approx(energies[term], rel=1e-3)
+        assert other not in energy
+        assert np.abs(shape - alone[0]).max() < 0.01 * 0.015
+
+
+@pytest.mark.parametrize("shear", [None, 5.0])
+def test_the_report_says_which_garments_are_membranes(sample: Callable[[str], Path], shear: float | None):
+    overrides = () if shear is None else (f"physgraph:material:shearStiffness={shear}",)
+    report = inspect_shot(sample("tshirt"), overrides=overrides)
+    path = report["garments"][0]["path"]
+    if shear is None:
+        assert report["modelled"]["stretch"] == "edge springs"
+        assert "membrane" not in report["modelled"]
+        assert "0.375 Y" in report["left_out"]["triangle membrane"]
+    else:
+        assert report["modelled"]["membrane"] == f"triangle membrane for {path}"
+        assert "stretch" not in report["modelled"]
+        assert not {"shear", "triangle membrane"} & set(report["left_out"])
