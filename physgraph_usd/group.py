@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -96,11 +97,13 @@ class Group:
         """
         self.garments = tuple(garments)
         self._gravity, self._settings = gravity, settings
-        self.levels = build_levels(garments, refinements, dtype=dtype, device=device)
+        self.levels = build_levels([_recentred(g) for g in garments], refinements, dtype=dtype, device=device)
         self._guide_maps = [GuideMap(level) for level in self.levels]
         cage, finest = self.levels[0], self.levels[-1]
         triangles = cage.triangles.cpu().numpy()
         self._frames = MovingFrames(finest, triangles, cage.rest.double().cpu().numpy())
+        self._fixed = np.flatnonzero(~finest.free.cpu().numpy().ravel())
+        self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
         self._material: tuple[object, ...] = ()
         self._forces: list[_LevelForces] = []
 
@@ -143,6 +146,7 @@ class Group:
             "measure": round(1e3 * (time.perf_counter() - solved), 3),
         }
         points = result.double().cpu().numpy() + origin
+        points[self._fixed] = self._place_fixed @ world
         return [points[span] for span in self.levels[-1].spans], carried, telemetry
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
@@ -275,6 +279,13 @@ class Group:
         where = ", ".join(f"<{garment.path}>" for garment in self.garments)
         when = "" if at is None else f" at time code {at:g}"
         return f"{where}{when}: {error}; terms that are not finite: {', '.join(broken)}"
+
+
+def _recentred(garment: Garment) -> Garment:
+    """The garment with its rest shape about the origin: far away, float32 would lose its edges."""
+    if not len(garment.rest):
+        return garment
+    return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))
 
 
 def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:

@@ -58,11 +58,13 @@ class Metric:
         rows = torch.as_tensor(coo.row.astype(np.int32), device=free.device)
         columns = torch.as_tensor(coo.col.astype(np.int32), device=free.device)
         values = torch.as_tensor(coo.data.astype(np.float64), device=free.device)
-        self._solver = solver(matrix.shape[0], rows, columns, values, MatrixType.COO)
+        self._solver = solver(matrix.shape[0], rows, columns, values, MatrixType.COO) if len(mask) else None
         self._mask = free
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero where a vertex may not move."""
         out = torch.empty_like(force)
+        if self._solver is None:
+            return out
         self._solver.solve((force * self._mask * self._scale).contiguous(), out)
         return out * self._mask
