@@ -1,0 +1,117 @@
+"""Small scenes for tests of the solver: cages, frames made of points, and their solves without a stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from meshes import grid
+from sheets import garment_of
+
+from physgraph_usd.fabric import Fabric
+from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.integrate import method_named
+from physgraph_usd.integrate.base import System
+from physgraph_usd.level import refine_garments
+from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene, State
+
+DOWN = np.array([0.0, -9.81, 0.0])
+FABRIC = Fabric(30.0, 4.7e-6, 0.187)
+GUIDE = 2000.0
+
+
+def sheet(columns: int, rows: int, edge: float = 0.05, *, kind: str = "triangles") -> tuple[PolygonMesh, np.ndarray]:
+    """A flat sheet in the plane of x and y [m]."""
+    mesh, points = grid(columns, rows, kind)
+    return mesh, edge * points
+
+
+def settings_of(**options: object) -> SolveSettings:
+    """Settings with an integrator named by ``integrator``."""
+    return SolveSettings(method_named(str(options.pop("integrator", "quasi-newton"))), **options)  # type: ignore[arg-type]
+
+
+def refiner_of(
+    garments: Sequence[Garment],
+    *,
+    level: int = 1,
+    times: Sequence[float] = (),
+    gravity: np.ndarray = DOWN,
+    dtype: torch.dtype = torch.float64,
+    **options: object,
+) -> Refiner:
+    """A refiner of garments, all at one level."""
+    scene = Scene(tuple(garments), gravity, tuple(times))
+    return Refiner(scene, settings_of(**options), levels=[level] * len(garments), dtype=dtype)
+
+
+def frame_of(points: np.ndarray, time: float | None = None, *, fabric: Fabric = FABRIC, guide: float = GUIDE) -> Frame:
+    """A frame of one garment."""
+    return Frame(time, (GarmentFrame(points, fabric, guide),))
+
+
+def solved(
+    mesh: PolygonMesh,
+    rest: np.ndarray,
+    points: np.ndarray,
+    *,
+    fabric: Fabric = FABRIC,
+    painted: dict[str, np.ndarray] | None = None,
+    **options: object,
+) -> State:
+    """One garment's frame, solved from cold."""
+    return refiner_of([garment_of(mesh, rest, **(painted or {}))], **options).solve(frame_of(points, fabric=fabric))
+
+
+def base_of(mesh: PolygonMesh, points: np.ndarray, level: int) -> np.ndarray:
+    """Cage points placed linearly at a level."""
+    for refinement in refine_garments([garment_of(mesh, points)], [level])[0]:
+        points = refinement.linear @ points
+    return points
+
+
+def group_of(
+    mesh: PolygonMesh,
+    rest: np.ndarray,
+    *,
+    level: int = 1,
+    gravity: np.ndarray = DOWN,
+    dtype: torch.dtype = torch.float64,
+    **options: object,
+) -> Group:
+    """One garment's group."""
+    garments = [garment_of(mesh, rest)]
+    return Group(
+        garments, refine_garments(garments, [level]), gravity, settings_of(**options), dtype=dtype, device="cpu"
+    )
+
+
+def finest_system(group: Group, points: np.ndarray, *, fabric: Fabric = FABRIC) -> tuple[System, torch.Tensor]:
+    """The finest level's problem of one frame and its linear start [m], recentred."""
+    systems, coarse = group.systems([GarmentFrame(points, fabric, GUIDE)])
+    return systems[-1], group.levels[-1].base.apply(coarse)
+
+
+def wave(points: np.ndarray, *, squeeze: float = 0.1, height: float = 0.01, phase: float = 0.0) -> np.ndarray:
+    """A sheet squeezed along x and waved in z."""
+    size = max(float(np.ptp(points[:, 0])), 1e-9)
+    z = height * np.sin(2 * np.pi * points[:, 0] / size + 3.0 * points[:, 1] / size + phase)
+    return np.stack([(1.0 - squeeze) * points[:, 0], points[:, 1], z], axis=1)
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square of vectors' lengths."""
+    return float(np.sqrt((np.asarray(values) ** 2).sum(axis=-1).mean())) if np.size(values) else 0.0
+
+
+def total(telemetry: dict[str, object], which: str) -> float:
+    """Total energy of the "input" or the "output" of a frame [J]."""
+    return sum(telemetry["energy_joules"][which].values())  # type: ignore[index]
+
+
+def moving(points: np.ndarray, path: Callable[[float], np.ndarray], times: Sequence[float]) -> list[Frame]:
+    """Frames of one garment whose points at each time a function gives."""
+    return [frame_of(path(time) if callable(path) else points, time) for time in times]

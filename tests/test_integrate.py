@@ -1,0 +1,337 @@
+"""Integrators against mathematics: quadratics, matrices and reasons to stop."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from cloth import finest_system, group_of, sheet, wave
+
+from physgraph_usd.errors import SolveError, UsageError
+from physgraph_usd.forces.base import ForceModule
+from physgraph_usd.integrate import METHODS, method_named
+from physgraph_usd.integrate.base import Carry, ForceField, Integrator, System
+from physgraph_usd.integrate.metric import REGULARISATION, Metric, kept_to_edges
+from physgraph_usd.integrate.newton import Newton
+from physgraph_usd.integrate.quasi_newton import QuasiNewton, backtrack
+from physgraph_usd.integrate.solve import Budget, solve_level
+
+
+class Quadratic:
+    """E = 1/2 (x - minimum) A (x - minimum), A acting alike on each axis."""
+
+    def __init__(self, matrix: np.ndarray, minimum: torch.Tensor) -> None:
+        self.matrix, self.minimum = torch.as_tensor(matrix), minimum
+
+    def energy_and_force(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        force = self.matrix @ (self.minimum - x)
+        return 0.5 * ((self.minimum - x) * force).sum(), force
+
+    def diagonal(self, x: torch.Tensor) -> torch.Tensor:
+        return self.matrix.diagonal().clone()
+
+
+def laplacian(count: int, *, anchor: float = 0.1) -> np.ndarray:
+    """A chain of springs, each vertex tied a little to its place: symmetric positive definite."""
+    matrix = np.diag(np.full(count, 2.0 + anchor)) - np.eye(count, k=1) - np.eye(count, k=-1)
+    matrix[0, 0] = matrix[-1, -1] = 1.0 + anchor
+    return matrix
+
+
+def spd(count: int, condition: float) -> np.ndarray:
+    """A random symmetric positive definite matrix of a given condition."""
+    rng = np.random.default_rng(3)
+    q = np.linalg.qr(rng.normal(size=(count, count)))[0]
+    return q @ np.diag(np.geomspace(1.0, condition, count)) @ q.T
+
+
+def system_of(matrix: np.ndarray, *, metric: np.ndarray | None = None, fixed: tuple[int, ...] = ()) -> System:
+    count = len(matrix)
+    free = torch.ones((count, 1), dtype=torch.bool)
+    free[list(fixed)] = False
+    minimum = torch.as_tensor(np.random.default_rng(1).normal(size=(count, 3)))
+    h0 = Metric(sp.csr_matrix(matrix if metric is None else metric), free=free, dtype=torch.float64)
+    field = Quadratic(matrix, minimum)
+    assert isinstance(field, ForceField)
+    return System(field, h0, free=free, spacing=torch.ones(count, dtype=torch.float64))
+
+
+def start(count: int) -> torch.Tensor:
+    return torch.as_tensor(np.random.default_rng(2).normal(size=(count, 3)))
+
+
+def real_problem(*, level: int = 1) -> tuple[System, torch.Tensor]:
+    """A squeezed, waved sheet with every force."""
+    mesh, rest = sheet(6, 4)
+    return finest_system(group_of(mesh, rest, level=level), wave(rest))
+
+
+class TestMetric:
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_solves_its_own_matrix(self, dtype: torch.dtype):
+        matrix = 1e-4 * laplacian(40)
+        free = torch.ones((40, 1), dtype=torch.bool)
+        metric = Metric(sp.csr_matrix(matrix), free=free, dtype=dtype)
+        force = start(40).to(dtype)
+        expected = np.linalg.solve(matrix, force.double().numpy())
+        error = np.abs(metric.solve(force).double().numpy() - expected).max() / np.abs(expected).max()
+        assert error < (2e-5 if dtype == torch.float32 else 1e-5), error
+
+    def test_error_is_the_regularisation_and_no_more(self):
+        matrix = laplacian(40)
+        shifted = matrix + REGULARISATION * matrix.diagonal().mean() * np.eye(40)
+        free = torch.ones((40, 1), dtype=torch.bool)
+        force = start(40)
+        got = Metric(sp.csr_matrix(matrix), free=free, dtype=torch.float64).solve(force).numpy()
+        assert np.allclose(got, np.linalg.solve(shifted, force.numpy()), rtol=1e-12)
+
+    def test_fixed_vertices_stay_and_the_rest_is_solved_as_if_they_were_held(self):
+        matrix, held = laplacian(30), [0, 7, 29]
+        free = torch.ones((30, 1), dtype=torch.bool)
+        free[held] = False
+        force = start(30)
+        got = Metric(sp.csr_matrix(matrix), free=free, dtype=torch.float64).solve(force).numpy()
+        keep = np.setdiff1d(np.arange(30), held)
+        assert not got[held].any()
+        assert np.allclose(got[keep], np.linalg.solve(matrix[np.ix_(keep, keep)], force.numpy()[keep]), rtol=1e-5)
+
+    def test_nothing_free_moves_nothing(self):
+        free = torch.zeros((5, 1), dtype=torch.bool)
+        metric = Metric(sp.csr_matrix(laplacian(5)), free=free, dtype=torch.float32)
+        assert not metric.solve(torch.ones((5, 3))).any()
+
+    def test_force_is_left_alone(self):
+        force = start(10)
+        kept = force.clone()
+        Metric(sp.csr_matrix(laplacian(10)), free=torch.ones((10, 1), dtype=torch.bool), dtype=torch.float64).solve(
+            force
+        )
+        assert torch.equal(force, kept)
+
+
+class TestKeptToEdges:
+    @staticmethod
+    def matrices() -> tuple[sp.csr_matrix, sp.csr_matrix, np.ndarray]:
+        mesh, rest = sheet(6, 4)
+        group = group_of(mesh, rest)
+        level, (system, _) = group.levels[-1], finest_system(group, wave(rest))
+        field = system._field
+        assert isinstance(field, ForceModule)
+        edges = level.edges.numpy()
+        return field.rest_matrix(), kept_to_edges(field.rest_matrix(), edges), edges
+
+    def test_row_sums_are_kept(self):
+        whole, kept, _ = self.matrices()
+        assert np.allclose(kept.sum(axis=1), whole.sum(axis=1), rtol=1e-9, atol=1e-12 * abs(whole).max())
+
+    def test_symmetric_positive_definite(self):
+        _, kept, _ = self.matrices()
+        dense = kept.toarray()
+        assert np.allclose(dense, dense.T, rtol=0, atol=1e-14 * np.abs(dense).max())
+        assert np.linalg.eigvalsh(dense).min() > 0
+
+    def test_couples_edges_only_and_never_positively(self):
+        _, kept, edges = self.matrices()
+        dense = kept.toarray()
+        off = dense - np.diag(dense.diagonal())
+        assert (off <= 0).all()
+        allowed = np.zeros(dense.shape, bool)
+        allowed[edges[:, 0], edges[:, 1]] = allowed[edges[:, 1], edges[:, 0]] = True
+        assert not off[~allowed].any()
+
+
+class TestQuasiNewton:
+    def test_exact_metric_solves_a_quadratic_in_one_step(self):
+        matrix = spd(12, 50.0)
+        system = system_of(matrix)
+        method = QuasiNewton()
+        carry = method.step(system, method.start(system, start(12)))
+        assert float((carry.x - system._field.minimum).abs().max()) < 1e-4
+        assert carry.energy < 1e-8
+
+    def test_exact_diagonal_solves_a_separable_quadratic_in_one_step(self):
+        system = system_of(np.diag(np.geomspace(1, 1e4, 9)))
+        method = QuasiNewton(use_metric=False)
+        carry = method.step(system, method.start(system, start(9)))
+        assert carry.energy < 1e-20
+
+    def test_wrong_metric_converges_in_as_many_steps_as_there_are_curvatures(self):
+        """Three curvatures seen through an identity metric: about a step for each, and a few for inexact searches."""
+        q = np.linalg.qr(np.random.default_rng(3).normal(size=(12, 12)))[0]
+        matrix = q @ np.diag(np.repeat([1.0, 5.0, 30.0], 4)) @ q.T
+        system = system_of(matrix, metric=np.eye(12))
+        x, report = solve_level(system, QuasiNewton(), start(12), level=0, budget=Budget(60, 1e-7))
+        assert report.stopped == "tolerance"
+        assert report.steps <= 15, report.steps
+        assert float((x - system._field.minimum).abs().max()) < 1e-6
+
+    @pytest.mark.parametrize("use_metric", [True, False])
+    def test_images_are_the_inverse_metric_of_the_yields(self, use_metric: bool):
+        system, x = real_problem()
+        method = QuasiNewton(use_metric=use_metric)
+        carry = method.start(system, x)
+        scale = 1.0 / system.diagonal(x).unsqueeze(1)
+        for _ in range(6):
+            carry = method.step(system, carry)
+        assert len(carry.memory.pairs) >= 3
+        for pair in carry.memory.pairs:
+            expected = system.apply_metric_inverse(pair.yields) if use_metric else scale * pair.yields
+            assert float((pair.image - expected).norm() / expected.norm()) < 1e-9
+            assert pair.curvature == pytest.approx(float((pair.move * pair.yields).sum()), rel=1e-12)
+            assert pair.curvature > 0
+
+    def test_memory_is_bounded(self):
+        system, x = real_problem()
+        method = QuasiNewton(history=2)
+        carry = method.start(system, x)
+        for _ in range(6):
+            carry = method.step(system, carry)
+        assert len(carry.memory.pairs) == 2
+
+    def test_one_metric_solve_and_mostly_one_force_a_step(self):
+        system, x = real_problem()
+        _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(20))
+        assert report.metric_solves == report.steps + 1
+        assert report.evaluations <= 1.5 * report.steps + 1
+
+    @pytest.mark.parametrize("name", METHODS)
+    def test_energy_never_rises(self, name: str):
+        system, x = real_problem()
+        seen: list[float] = []
+        solve_level(
+            system,
+            method_named(name).build(),
+            x,
+            level=0,
+            budget=Budget(25),
+            observe=lambda carry: seen.append(carry.energy),
+        )
+        assert all(after <= before for before, after in zip(seen, seen[1:], strict=False))
+        assert seen[-1] < seen[0]
+
+    @pytest.mark.parametrize("name", METHODS)
+    def test_fixed_vertices_never_move(self, name: str):
+        system = system_of(spd(12, 9.0), metric=np.eye(12), fixed=(0, 5))
+        x = start(12)
+        out, _ = solve_level(system, method_named(name).build(), x, level=0, budget=Budget(10))
+        assert torch.equal(out[[0, 5]], x[[0, 5]])
+        assert not torch.equal(out[1], x[1])
+
+
+class TestBacktrack:
+    def test_shortens_an_overshoot_to_the_minimum_of_its_parabola(self):
+        system = system_of(np.eye(4))
+        carry = Carry(torch.zeros((4, 3), dtype=torch.float64), *system.energy_and_force(torch.zeros(4, 3).double()))
+        direction = 4.0 * carry.force
+        found = backtrack(system, carry, direction, float((carry.force * direction).sum()))
+        assert found is not None
+        assert torch.allclose(found[0], system._field.minimum)
+
+    def test_refuses_ascent(self):
+        system = system_of(np.eye(4))
+        carry = Carry(torch.zeros((4, 3), dtype=torch.float64), *system.energy_and_force(torch.zeros(4, 3).double()))
+        assert backtrack(system, carry, -carry.force, -1.0) is None
+        assert backtrack(system, carry, carry.force, float("nan")) is None
+
+
+class TestNewton:
+    def test_direction_on_a_quadratic_is_exact_with_the_exact_metric(self):
+        matrix = spd(10, 20.0)
+        system = system_of(matrix)
+        method = Newton()
+        carry = method.start(system, start(10))
+        got = method._direction(system, carry)
+        expected = torch.as_tensor(np.linalg.solve(matrix, carry.force.numpy()))
+        assert float((got - expected).norm() / expected.norm()) < 1e-5
+
+    def test_direction_leaves_a_twentieth_of_the_force_whatever_the_metric(self):
+        matrix = spd(10, 2000.0)
+        system = system_of(matrix, metric=np.eye(10))
+        method = Newton()
+        carry = method.start(system, start(10))
+        left = carry.force - torch.as_tensor(matrix) @ method._direction(system, carry)
+        assert float(left.norm() / carry.force.norm()) < 0.05
+
+    def test_converges_faster_than_linearly_on_cloth(self):
+        system, x = real_problem()
+        moves: list[float] = []
+        solve_level(
+            system,
+            Newton(inner_steps=1000),
+            x,
+            level=0,
+            budget=Budget(60, 1e-9),
+            observe=lambda carry: moves.append(system.remaining_move(carry.preconditioned)),
+        )
+        assert moves[-1] < 1e-9
+        assert moves[-1] < 0.05 * moves[-2], moves[-4:]
+
+    def test_finds_no_less_than_quasi_newton(self):
+        system, x = real_problem()
+        reference = solve_level(system, Newton(), x, level=0, budget=Budget(60, 1e-9))[1].energy_after
+        found = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(300, 1e-6))[1].energy_after
+        assert found >= reference - 1e-6 * abs(reference)
+
+    def test_negative_curvature_gives_a_descent_direction(self):
+        """A flat sheet under compression is a saddle: H is indefinite there."""
+        mesh, rest = sheet(6, 4)
+        points = wave(rest, squeeze=0.2, height=1e-4)
+        system, x = finest_system(group_of(mesh, rest), points)
+        method = Newton()
+        carry = method.start(system, x)
+        assert float((method._direction(system, carry) * carry.force).sum()) > 0
+        assert method.step(system, carry).energy < carry.energy
+
+
+class TestWhyItStopped:
+    def test_steps(self):
+        system, x = real_problem()
+        _, report = solve_level(system, QuasiNewton(), x, level=3, budget=Budget(4))
+        assert (report.stopped, report.steps, report.level) == ("steps", 4, 3)
+
+    def test_no_steps(self):
+        system, x = real_problem()
+        out, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(0))
+        assert (report.stopped, report.steps) == ("steps", 0)
+        assert torch.equal(out, x)
+        assert report.energy_after == report.energy_before
+
+    def test_tolerance_is_met(self):
+        system, x = real_problem()
+        _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(500, 1e-3))
+        assert report.stopped == "tolerance"
+        assert report.remaining_move < 1e-3
+
+    def test_deadline(self):
+        system, x = real_problem()
+        _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(500, 0.0, time.perf_counter()))
+        assert (report.stopped, report.steps) == ("budget", 0)
+
+    def test_stalled(self):
+        system = system_of(np.eye(4))
+        _, report = solve_level(system, QuasiNewton(), system._field.minimum, level=0, budget=Budget(9))
+        assert (report.stopped, report.movers) == ("stalled", {"stayed": 1})
+
+    @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e200])
+    def test_start_that_is_not_finite_is_refused(self, bad: float):
+        system = system_of(spd(4, 2.0))
+        x = start(4)
+        x[2, 1] = bad
+        with pytest.raises(SolveError, match="level 5: .*not finite"):
+            solve_level(system, QuasiNewton(), x, level=5, budget=Budget(3))
+
+    def test_counts(self):
+        system, x = real_problem()
+        _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(7))
+        assert report.vertices == len(x)
+        assert sum(report.movers.values()) == report.steps == 7
+        assert report.milliseconds > 0
+
+
+def test_names():
+    assert all(isinstance(method.build(), Integrator) for method in METHODS.values())
+    with pytest.raises(UsageError, match="unknown integrator 'strech'; known integrators: .*quasi-newton"):
+        method_named("strech")
