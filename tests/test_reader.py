@@ -153,6 +153,28 @@ def test_s31_times_are_the_union_of_authored_samples_and_nothing_else(tmp_path: 
     assert open_shot(path, frames=(2.0, 7.5)).scene.times == (2.0, 7.0)
 
 
+def test_a_transform_on_a_spline_has_its_knots_and_whole_time_codes(tmp_path: Path) -> None:
+    ts = pytest.importorskip("pxr.Ts", reason="splines came with a later USD")
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage, times=())
+    xform = UsdGeom.Xformable(stage.GetPrimAtPath("/World"))
+    add_translate_x = getattr(xform, "AddTranslateXOp", None)
+    if add_translate_x is None:
+        pytest.skip("this USD has no scalar transform ops")
+    attribute = add_translate_x().GetAttr()
+    spline = ts.Spline("double")
+    for time, value in ((1.5, 0.0), (4.0, 2.0)):
+        knot = ts.Knot("double")
+        knot.SetTime(time)
+        knot.SetValue(value)
+        knot.SetNextInterpolation(ts.InterpLinear)
+        spline.SetKnot(knot)
+    attribute.SetSpline(spline)
+    shot = open_shot(save(stage))
+    assert shot.scene.times == (1.5, 2.0, 3.0, 4.0)
+    np.testing.assert_allclose(world(shot, 4.0), sheet_points() + np.array([2.0, 0, 0]), atol=1e-9)
+
+
 def test_a_shot_without_samples_has_one_default_frame(tmp_path: Path) -> None:
     shot = open_shot(sheet_shot(tmp_path / "s.usda", times=()))
     assert shot.scene.times == ()

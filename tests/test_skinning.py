@@ -69,6 +69,17 @@ def test_transforms_of_the_skeleton_count_as_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(points(shot, 6.0), 0.01 * expected, atol=1e-6)
 
 
+def test_transforms_between_animation_samples_are_skinned_exactly_there(tmp_path: Path) -> None:
+    stage = skinned_stage(tmp_path / "s.usda", (1.0, 9.0))
+    for time in (1.0, 3.5, 6.0):
+        set_matrix(stage.GetPrimAtPath("/World"), affine(np.eye(3), (time, 0, 0)), time)
+    shot = open_shot(save(stage))
+    assert shot.scene.times == (1.0, 3.5, 6.0, 9.0)
+    for time in (3.5, 6.0):
+        expected = skinned_points(sheet_points(), JOINTS, time) + np.array([time, 0, 0])
+        np.testing.assert_allclose(points(shot, time), 0.01 * expected, atol=1e-6)
+
+
 def test_only_the_range_is_baked_and_other_meshes_are_not(tmp_path: Path) -> None:
     stage = skinned_stage(tmp_path / "s.usda", tuple(map(float, range(1, 21))))
     bind_skin(add_sheet(stage, f"{ROOT}/body", times=(), tagged=False), ROOT, joints=JOINTS)

@@ -11,7 +11,7 @@ from stages import add_sheet, new_stage, save, sheet_shot
 
 from physgraph_usd.errors import StageError
 from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.stage import composition_problems, open_stage, read_units
+from physgraph_usd.usd.stage import composition_problems, open_stage, pxr_errors, read_units
 
 
 def layer(path: Path, text: str) -> str:
@@ -154,3 +154,8 @@ def test_older_usd_is_understood_by_what_it_said() -> None:
     ]
     found = composition_problems(Old(), warnings)  # type: ignore[arg-type]
     assert [(problem.path, problem.missing) for problem in found] == [("/A", True), ("", True), ("", False)]
+
+
+def test_names_that_are_no_text_are_a_stage_error() -> None:
+    with pytest.raises(StageError, match="reading x: a name in the file is no text"), pxr_errors("reading x"):
+        b"\xb2".decode("utf-8")

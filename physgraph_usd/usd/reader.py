@@ -11,6 +11,7 @@ one frame is ``shot.frame(None)``.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -99,7 +100,7 @@ class Shot:
 
 
 def open_shot(
-    path: str,
+    path: str | os.PathLike[str],
     *,
     garments: Sequence[str] = (),
     colliders: Sequence[str] = (),

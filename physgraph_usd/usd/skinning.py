@@ -31,6 +31,7 @@ class Skinned:
         times: Authored time codes of its skeleton's animation and placement, ascending.
         query: UsdSkel's view of its binding.
         skeleton: The skeleton's prim path.
+        animation: The animation's prim path, or None.
     """
 
     path: Sdf.Path
@@ -38,6 +39,7 @@ class Skinned:
     times: tuple[float, ...]
     query: UsdSkel.SkinningQuery
     skeleton: Sdf.Path
+    animation: Sdf.Path | None
 
 
 class Bake:
@@ -112,7 +114,15 @@ def find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
         for query in binding.GetSkinningTargets():
             if query.GetPrim() == prim and (query.HasJointInfluences() or query.HasBlendShapes()):
                 skeleton = cache.GetSkelQuery(binding.GetSkeleton())
-                return Skinned(path, root.GetPath(), _skeleton_times(skeleton), query, skeleton.GetPrim().GetPath())
+                animation = skeleton.GetAnimQuery()
+                return Skinned(
+                    path,
+                    root.GetPath(),
+                    _skeleton_times(skeleton),
+                    query,
+                    skeleton.GetPrim().GetPath(),
+                    animation.GetPrim().GetPath() if animation else None,
+                )
     return None
 
 
@@ -134,16 +144,41 @@ def _bake(stage: Usd.Stage, layer: Sdf.Layer, wanted: Sequence[Skinned], *, fram
     keep = [skinned.path for skinned in wanted]
     roots = list(dict.fromkeys(skinned.root for skinned in wanted))
     mask = Sdf.Layer.CreateAnonymous("physgraph-mask.usda")
+    mask.timeCodesPerSecond = rates["timeCodesPerSecond"]
     for path in _others(stage, roots, keep):
         Sdf.CreatePrimInLayer(mask, path).active = False
     session = stage.GetSessionLayer()
     session.subLayerPaths.insert(0, mask.identifier)
     try:
+        for skinned in wanted:
+            _sample_animation(stage, mask, skinned, interval=interval)
         with Usd.EditContext(stage, layer):
             for root in roots:
                 UsdSkel.BakeSkinning(UsdSkel.Root.Get(stage, root), interval)
     finally:
         session.subLayerPaths.remove(mask.identifier)
+
+
+def _sample_animation(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, interval: Gf.Interval) -> None:
+    """Give the animation a sample, in a passing layer, at each time code that only a transform has.
+
+    UsdSkel bakes where the animation has samples; between them baked points would run along a chord.
+    """
+    animation = stage.GetPrimAtPath(skinned.animation) if skinned.animation else None
+    if animation is None or animation.IsInstanceProxy():
+        return
+    attributes = [animation.GetAttribute(name) for name in ("rotations", "translations", "scales", "blendShapeWeights")]
+    attribute = next((each for each in attributes if each and each.GetNumTimeSamples()), None)
+    if attribute is None:
+        return
+    own = attribute.GetTimeSamples()
+    wanted = merge([*own, *skinned.times, *transform_times(stage.GetPrimAtPath(skinned.path))])
+    if len(wanted) == len(own):
+        return
+    values = {time: attribute.Get(time) for time in wanted if interval.Contains(time) or time in own}
+    with Usd.EditContext(stage, layer):
+        for time, value in values.items():
+            attribute.Set(value, time)
 
 
 def _others(stage: Usd.Stage, roots: Iterable[Sdf.Path], keep: Sequence[Sdf.Path]) -> list[Sdf.Path]:

@@ -84,6 +84,8 @@ def pxr_errors(what: str) -> Iterator[None]:
         yield
     except Tf.ErrorException as error:
         raise StageError(f"{what}: {reason_of(error)}") from error
+    except UnicodeDecodeError as error:  # a damaged crate hands out names that are no text
+        raise StageError(f"{what}: a name in the file is no text; the file is damaged") from error
 
 
 def reason_of(error: Tf.ErrorException) -> str:

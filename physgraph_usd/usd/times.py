@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from pxr import Usd, UsdGeom
@@ -30,8 +31,23 @@ def garment_times(prim: Usd.Prim) -> tuple[float, ...]:
 
 
 def transform_times(prim: Usd.Prim) -> list[float]:
-    """Every authored time code of the transforms that place a prim, in no order."""
-    return [time for transform in transform_chain(prim) for time in transform.GetTimeSamples()]
+    """Every authored time code of the transforms that place a prim, in no order.
+
+    A transform that a spline animates has its knots and the whole time codes between them.
+    """
+    chain = transform_chain(prim)
+    sampled = [time for transform in chain for time in transform.GetTimeSamples()]
+    return sampled + [
+        time for transform in chain for op in transform.GetOrderedXformOps() for time in _spline_times(op.GetAttr())
+    ]
+
+
+def _spline_times(attribute: Usd.Attribute) -> list[float]:
+    has_spline, get_spline = (getattr(attribute, name, None) for name in ("HasSpline", "GetSpline"))
+    if has_spline is None or get_spline is None or not has_spline():
+        return []
+    knots = [float(time) for time in get_spline().GetKnots().keys()]
+    return [*knots, *map(float, range(math.ceil(min(knots)), math.floor(max(knots)) + 1))] if knots else []
 
 
 def merge(times: Iterable[float]) -> tuple[float, ...]:
