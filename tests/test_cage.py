@@ -92,6 +92,18 @@ def test_creases_are_told(stage: Usd.Stage) -> None:
     assert "creaseIndices sharpen" in str(read_cage(made.GetPrim(), 20, ()).notices[0])
 
 
+def test_topology_controls_that_usd_does_not_know_are_told(stage: Usd.Stage) -> None:
+    made = mesh(stage, COUNTS, INDICES)
+    made.CreateOrientationAttr("upsideDown")
+    for time, scheme in ((1.0, "doSabin"), (2.0, "loop")):
+        made.GetSubdivisionSchemeAttr().Set(scheme, time)
+    notices = "\n".join(map(str, read_cage(made.GetPrim(), 20, ()).notices))
+    assert "orientation is 'upsideDown'" in notices
+    assert "subdivisionScheme is 'doSabin'" in notices
+    assert "subdivisionScheme has time samples" in notices
+    assert not open_shot(save(stage)).scene.garments[0].flipped
+
+
 def test_isolated_points_stay(stage: Usd.Stage) -> None:
     mesh(stage, [3], [0, 1, 5])
     shot = open_shot(save(stage))

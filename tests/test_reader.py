@@ -205,6 +205,15 @@ def test_s32_layer_offsets_are_composed(tmp_path: Path, offset: float, scale: fl
     np.testing.assert_allclose(world(shot, shot.scene.times[1]), sheet_points(2.0), atol=1e-6)
 
 
+def test_garments_whose_times_differ_by_rounding_share_them(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage, "/World/one", times=(1.0, 2.0))
+    add_sheet(stage, "/World/two", times=(1.0, 2.0 + 1e-9))
+    shot = open_shot(save(stage))
+    assert shot.scene.times == (1.0, 2.0)
+    assert [source.times for source in shot.sources] == [(1.0, 2.0), (1.0, 2.0)]
+
+
 def test_a_sublayer_of_another_rate_is_rescaled(tmp_path: Path) -> None:
     sheet_shot(tmp_path / "anim.usda")
     root = Sdf.Layer.CreateNew(str(tmp_path / "shot.usda"))

@@ -16,6 +16,10 @@ from ..errors import GarmentError
 from ..mesh.topology import PolygonMesh
 from .stage import Notice
 
+_CONTROLS = {
+    "subdivisionScheme": ("catmullClark", "loop", "bilinear", "none"),
+    "orientation": ("rightHanded", "leftHanded"),
+}
 _SPLIT = "export the garment with one topology, or split the shot where it changes and use --frames"
 
 
@@ -62,7 +66,7 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
         raise GarmentError(path, f"every one of its {len(counts)} faces is a hole", remedy="clear holeIndices")
     kept_indices = indices[np.repeat(keep, counts)]
     mesh = PolygonMesh(counts[keep], kept_indices, vertex_count)
-    return Cage(mesh, np.flatnonzero(keep).astype(np.int32), (*notices, *_not_carried(usd)))
+    return Cage(mesh, np.flatnonzero(keep).astype(np.int32), (*notices, *_not_carried(usd), *_odd_controls(usd)))
 
 
 def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
@@ -138,3 +142,16 @@ def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
     ]
     said = f"{' and '.join(authored)} sharpen the cage's limit surface; cloth has no sharp edges, so they are dropped"
     return [Notice(str(usd.GetPath()), None, said)] if authored else []
+
+
+def _odd_controls(usd: UsdGeom.Mesh) -> list[Notice]:
+    """Tell of topology controls that USD does not define or that vary in time, which it forbids."""
+    path, notices = str(usd.GetPath()), []
+    for name, known in _CONTROLS.items():
+        attribute = usd.GetPrim().GetAttribute(name)
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+        if value not in known:
+            notices.append(Notice(path, None, f"{name} is {value!r}; USD knows {', '.join(known)}; {known[0]} assumed"))
+        if attribute.GetNumTimeSamples() > 1:
+            notices.append(Notice(path, None, f"{name} has time samples, which USD does not allow; the first is used"))
+    return notices

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from pxr import Sdf, Usd
@@ -35,7 +36,7 @@ from .stage import (
     refuse_missing_arcs,
     root_metadata,
 )
-from .times import merge, within
+from .times import merge, snap, within
 
 
 class Shot:
@@ -54,11 +55,13 @@ class Shot:
     def __init__(self, path: str, stage: Usd.Stage, request: Request, *, readers: Sequence[GarmentReader]) -> None:
         """Put together what ``open_shot`` read."""
         self.path, self.stage = path, stage
-        self.sources: tuple[GarmentSource, ...] = tuple(reader.source for reader in readers)
         self.colliders: tuple[str, ...] = ()
         self.warnings: list[Notice] = []
         self.metres_per_unit = request.units.metres
-        times = merge(time for source in self.sources for time in source.times)
+        times = merge(time for reader in readers for time in reader.source.times)
+        self.sources: tuple[GarmentSource, ...] = tuple(
+            replace(reader.source, times=snap(reader.source.times, times)) for reader in readers
+        )
         self.scene = Scene(tuple(reader.garment for reader in readers), request.units.gravity, times)
         self._readers, self._request = tuple(readers), request
 

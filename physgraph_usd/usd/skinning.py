@@ -16,7 +16,7 @@ from ..errors import GarmentError, StageError
 from .find import instance_roots
 from .lookup import with_ancestors
 from .stage import TRAVERSAL, Notice
-from .times import merge, transform_times
+from .times import SAME_TIME, merge, transform_times
 
 _SHAPE_COUNT = (4, 4)
 
@@ -140,7 +140,9 @@ def _bake(stage: Usd.Stage, layer: Sdf.Layer, wanted: Sequence[Skinned], *, fram
     for name, rate in rates.items():
         if not rate > 0:  # UsdSkel steps by their ratio and would never come to an end
             raise StageError(f"{name} is {rate:g}, so skinning cannot be baked; author a positive rate")
-    interval = Gf.Interval.GetFullInterval() if frames is None else Gf.Interval(*frames)
+    interval = (
+        Gf.Interval.GetFullInterval() if frames is None else Gf.Interval(frames[0] - SAME_TIME, frames[1] + SAME_TIME)
+    )
     keep = [skinned.path for skinned in wanted]
     roots = list(dict.fromkeys(skinned.root for skinned in wanted))
     mask = Sdf.Layer.CreateAnonymous("physgraph-mask.usda")

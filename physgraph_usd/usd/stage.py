@@ -148,8 +148,8 @@ def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
 
 def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
     """Unit vector that points up, shape (3,), and what is odd about it; never raises."""
-    authored = root_metadata(stage, "upAxis")
-    if authored in {None, "Y", "Z"}:
+    authored = root_metadata(stage, "upAxis") or UsdGeom.GetFallbackUpAxis()
+    if authored in {"Y", "Z"}:
         return np.array([0.0, 0.0, 1.0] if authored == "Z" else [0.0, 1.0, 0.0]), []
     return np.array([0.0, 1.0, 0.0]), [Notice("", None, f"upAxis is {authored!r}; USD knows Y and Z; Y assumed")]
 

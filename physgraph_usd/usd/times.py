@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+import numpy as np
 from pxr import Usd, UsdGeom
 
 from .lookup import with_ancestors
@@ -60,6 +61,12 @@ def merge(times: Iterable[float]) -> tuple[float, ...]:
         else:
             kept.append((time, rank))
     return tuple(time for time, _ in kept)
+
+
+def snap(times: Iterable[float], merged: Sequence[float]) -> tuple[float, ...]:
+    """Replace each time code by the one that ``merge`` kept for it."""
+    known = np.asarray(merged)
+    return tuple(float(known[np.abs(known - time).argmin()]) for time in times)
 
 
 def within(times: Iterable[float], frames: tuple[float, float] | None) -> tuple[float, ...]:
