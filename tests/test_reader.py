@@ -13,7 +13,6 @@ from stages import (
     add_sheet,
     affine,
     author,
-    clip_shot,
     instanced_shot,
     new_stage,
     save,
@@ -136,51 +135,6 @@ def test_a_layer_in_other_units_is_told_unless_a_scale_corrects_it(tmp_path: Pat
     assert ("asset.usda@ has 0.01 m per unit" in said(open_shot(save(stage)))) == warned
 
 
-def test_s31_times_are_the_union_of_authored_samples_and_nothing_else(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    stage.SetStartTimeCode(1)
-    stage.SetEndTimeCode(8)
-    rig = UsdGeom.Xform.Define(stage, "/World/rig").GetPrim()
-    for time in (1.0, 1.25, 8.0):
-        set_matrix(rig, np.eye(4), time)
-    add_sheet(stage, "/World/rig/cloth", times=(1.0, 2.0, 7.0, 8.0))
-    add_sheet(stage, "/World/still", times=())
-    add_sheet(stage, "/World/prop", times=(3.0, 4.0), tagged=False)
-    path = save(stage)
-    shot = open_shot(path)
-    assert shot.scene.times == (1.0, 1.25, 2.0, 7.0, 8.0)
-    assert shot.sources[1].times == ()
-    assert open_shot(path, frames=(2.0, 7.5)).scene.times == (2.0, 7.0)
-
-
-def test_a_transform_on_a_spline_has_its_knots_and_whole_time_codes(tmp_path: Path) -> None:
-    ts = pytest.importorskip("pxr.Ts", reason="splines came with a later USD")
-    stage = new_stage(tmp_path / "s.usda")
-    add_sheet(stage, times=())
-    xform = UsdGeom.Xformable(stage.GetPrimAtPath("/World"))
-    add_translate_x = getattr(xform, "AddTranslateXOp", None)
-    if add_translate_x is None:
-        pytest.skip("this USD has no scalar transform ops")
-    attribute = add_translate_x().GetAttr()
-    spline = ts.Spline("double")
-    for time, value in ((1.5, 0.0), (4.0, 2.0)):
-        knot = ts.Knot("double")
-        knot.SetTime(time)
-        knot.SetValue(value)
-        knot.SetNextInterpolation(ts.InterpLinear)
-        spline.SetKnot(knot)
-    attribute.SetSpline(spline)
-    shot = open_shot(save(stage))
-    assert shot.scene.times == (1.5, 2.0, 3.0, 4.0)
-    np.testing.assert_allclose(world(shot, 4.0), sheet_points() + np.array([2.0, 0, 0]), atol=1e-9)
-
-
-def test_a_shot_without_samples_has_one_default_frame(tmp_path: Path) -> None:
-    shot = open_shot(sheet_shot(tmp_path / "s.usda", times=()))
-    assert shot.scene.times == ()
-    np.testing.assert_array_equal(world(shot, None), sheet_points())
-
-
 def test_a_reset_transform_stack_ends_the_chain(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda")
     rig = UsdGeom.Xform.Define(stage, "/World/rig").GetPrim()
@@ -189,45 +143,6 @@ def test_a_reset_transform_stack_ends_the_chain(tmp_path: Path) -> None:
     shot = open_shot(save(stage))
     assert shot.scene.times == (1.0, 2.0, 3.0)
     np.testing.assert_array_equal(world(shot, 2.0), sheet_points(2.0))
-
-
-@pytest.mark.parametrize(("offset", "scale"), [(10.0, 1.0), (0.0, 25 / 24), (-3.5, 2.0)])
-def test_s32_layer_offsets_are_composed(tmp_path: Path, offset: float, scale: float) -> None:
-    sheet_shot(tmp_path / "anim.usda")
-    root = Sdf.Layer.CreateNew(str(tmp_path / "shot.usda"))
-    root.timeCodesPerSecond = 24.0
-    root.pseudoRoot.SetInfo("metersPerUnit", 1.0)
-    root.subLayerPaths.append("./anim.usda")
-    root.subLayerOffsets[0] = Sdf.LayerOffset(offset, scale)
-    root.Save()
-    shot = open_shot(root.realPath)
-    np.testing.assert_allclose(shot.scene.times, offset + scale * np.array([1.0, 2.0, 3.0]), atol=1e-9)
-    np.testing.assert_allclose(world(shot, shot.scene.times[1]), sheet_points(2.0), atol=1e-6)
-
-
-def test_garments_whose_times_differ_by_rounding_share_them(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    add_sheet(stage, "/World/one", times=(1.0, 2.0))
-    add_sheet(stage, "/World/two", times=(1.0, 2.0 + 1e-9))
-    shot = open_shot(save(stage))
-    assert shot.scene.times == (1.0, 2.0)
-    assert [source.times for source in shot.sources] == [(1.0, 2.0), (1.0, 2.0)]
-
-
-def test_a_sublayer_of_another_rate_is_rescaled(tmp_path: Path) -> None:
-    sheet_shot(tmp_path / "anim.usda")
-    root = Sdf.Layer.CreateNew(str(tmp_path / "shot.usda"))
-    root.timeCodesPerSecond = 48.0
-    root.subLayerPaths.append("./anim.usda")
-    root.Save()
-    assert open_shot(root.realPath).scene.times == (2.0, 4.0, 6.0)
-
-
-def test_value_clips_give_times_and_points(tmp_path: Path) -> None:
-    shot = open_shot(clip_shot(tmp_path))
-    assert shot.scene.times == (1.0, 2.0, 3.0)
-    for time in shot.scene.times:
-        np.testing.assert_array_equal(world(shot, time), sheet_points(time))
 
 
 def test_s32_instances_are_read_through_and_their_roots_told(tmp_path: Path) -> None:
@@ -264,18 +179,6 @@ def test_s32_inactive_and_disabled_garments_do_not_count_and_invisible_ones_do(t
     assert len(open_shot(path, skip_invisible=True).scene.garments) == 1
     with pytest.raises(StageError, match=r"gone.*inactive"):
         open_shot(path, garments=["/World/gone"])
-
-
-def test_garments_outside_the_frame_range_are_left_out(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    add_sheet(stage, "/World/early")
-    add_sheet(stage, "/World/late", times=(10.0, 11.0))
-    path = save(stage)
-    shot = open_shot(path, frames=(9.0, 20.0))
-    assert [garment.path for garment in shot.scene.garments] == ["/World/late"]
-    assert "authored time codes run from 1 to 3" in said(shot)
-    with pytest.raises(StageError, match="no garment is left to refine"):
-        open_shot(path, frames=(4.0, 5.0))
 
 
 def test_s32_topology_that_varies_is_refused_with_prim_and_time(tmp_path: Path) -> None:
@@ -373,12 +276,6 @@ def test_frames_do_not_depend_on_the_order_in_which_they_are_read(tmp_path: Path
     assert len([notice for notice in forward.warnings if notice.time == 2.0]) == 1
     forward.frame(2.0)
     assert len([notice for notice in forward.warnings if notice.time == 2.0]) == 1
-
-
-@pytest.mark.parametrize("frames", [(5.0, 1.0), (float("nan"), 2.0), (1.0, float("inf"))])
-def test_a_range_that_is_none_is_refused(tmp_path: Path, frames: tuple[float, float]) -> None:
-    with pytest.raises(UsageError, match="no range"):
-        open_shot(sheet_shot(tmp_path / "s.usda"), frames=frames)
 
 
 def test_the_file_is_not_touched(tmp_path: Path) -> None:
