@@ -13,10 +13,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .mesh.defects import FLAT
 from .mesh.diagonals import quad_edges
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, smooth, subdivide_times
-from .mesh.topology import PolygonMesh, edges_of, find_edges, hinges_of
+from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, hinges_of
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
@@ -201,7 +202,7 @@ def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLev
         linear = sp.csr_matrix(refinement.linear @ linear)
         mesh = refinement.mesh
     rest = linear @ np.asarray(garment.rest, dtype=np.float64)
-    split = mesh.triangulate(rest if not chain else None)
+    split = _sound(mesh.triangulate(rest if not chain else None), rest)
     triangles, hinges = split.triangles, hinges_of(split.triangles)
     edges = edges_of(triangles, mesh.vertex_count).vertices
     from_quad, diagonal = quad_edges(split, mesh.counts, edges)
@@ -220,6 +221,17 @@ def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLev
         linear=linear,
         smooth=smoothing,
     )
+
+
+def _sound(split: TriangleSplit, rest: np.ndarray) -> TriangleSplit:
+    """Without triangles that have no rest area or repeat an earlier one: they are no cloth (STABILITY.md S2)."""
+    corners = rest[split.triangles]
+    sides = corners - np.roll(corners, 1, axis=1)
+    area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    kept = np.zeros(len(area), bool)
+    kept[np.unique(np.sort(split.triangles, axis=1), axis=0, return_index=True)[1]] = True
+    kept &= area > FLAT * (sides**2).sum(axis=2).max(axis=1)
+    return split if kept.all() else TriangleSplit(split.triangles[kept], split.face[kept])
 
 
 def _join(

@@ -13,6 +13,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
+TIE = 1e-5
+"""Relative difference below which two ways to split a face count as equal: rounding must not choose, nor a rotation."""
+
 
 @dataclass(frozen=True, eq=False)
 class Incidence:
@@ -220,10 +223,11 @@ def _fan_corner(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
         areas = np.cross(spokes[:, :-1], spokes[:, 1:]) @ normal[:, :, None]
         worst[:, first] = areas[:, :, 0].min(axis=1)
     if size != 4:
-        return worst.argmax(axis=1)
+        best = worst.max(axis=1, keepdims=True)
+        return (worst >= best - TIE * np.abs(best)).argmax(axis=1)
     lengths = np.linalg.norm(shape[:, [2, 3]] - shape[:, [0, 1]], axis=2)
     inside = worst > 0
-    shorter = lengths[:, 1] < lengths[:, 0]
+    shorter = lengths[:, 1] < (1.0 - TIE) * lengths[:, 0]
     return np.where(inside[:, 0] != inside[:, 1], inside[:, 1], shorter).astype(np.int64)
 
 
