@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -209,7 +210,7 @@ class TestQuasiNewton:
             budget=Budget(25),
             observe=lambda carry: seen.append(carry.energy),
         )
-        assert all(after <= before for before, after in zip(seen, seen[1:], strict=False))
+        assert all(after <= before for before, after in pairwise(seen))
         assert seen[-1] < seen[0]
 
     @pytest.mark.parametrize("name", METHODS)
@@ -320,7 +321,7 @@ class TestWhyItStopped:
         system = system_of(spd(4, 2.0))
         x = start(4)
         x[2, 1] = bad
-        with pytest.raises(SolveError, match="level 5: .*not finite"):
+        with pytest.raises(SolveError, match=r"level 5: .*not finite"):
             solve_level(system, QuasiNewton(), x, level=5, budget=Budget(3))
 
     def test_counts(self):
@@ -333,5 +334,5 @@ class TestWhyItStopped:
 
 def test_names():
     assert all(isinstance(method.build(), Integrator) for method in METHODS.values())
-    with pytest.raises(UsageError, match="unknown integrator 'strech'; known integrators: .*quasi-newton"):
+    with pytest.raises(UsageError, match=r"unknown integrator 'strech'; known integrators: .*quasi-newton"):
         method_named("strech")

@@ -1,0 +1,124 @@
+"""S1, S2, S16: meshes of almost nothing, meshes with faults, and rest shapes that cannot be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cloth import base_of, refiner_of, rms, sheet, solved
+from meshes import mesh_of
+from sheets import garment_of
+
+from physgraph_usd.errors import GarmentError
+from physgraph_usd.mesh.defects import defects
+from physgraph_usd.mesh.topology import PolygonMesh
+
+CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0.01], [0.5, 0.5, 0.5]])
+ALMOST_NOTHING = {
+    "one triangle": ([[0, 1, 2]], 3),
+    "one triangle and two isolated points": ([[0, 1, 2]], 5),
+    "one edge": ([[0, 1]], 2),
+    "an edge and a triangle": ([[0, 1], [1, 2, 3]], 4),
+    "no face": ([], 4),
+    "nothing": ([], 0),
+    "a triangle that repeats a vertex": ([[0, 0, 1]], 2),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("name", ALMOST_NOTHING)
+def test_s1_almost_nothing_is_solved(name: str, level: int, dtype: torch.dtype):
+    mesh = mesh_of(*ALMOST_NOTHING[name])
+    rest = CORNERS[: mesh.vertex_count]
+    moved = rest * [0.9, 1.0, 1.0] + [1.0, 2.0, 3.0]
+    state = solved(mesh, rest, moved, level=level, dtype=dtype)
+    base = base_of(mesh, moved, level)
+    assert state.points[0].shape == base.shape
+    assert np.isfinite(state.points[0]).all()
+    isolated = np.setdiff1d(np.arange(mesh.vertex_count), mesh.indices)
+    assert np.array_equal(state.points[0][isolated], moved[isolated])
+    if not any(len(set(face)) > 2 for face in ALMOST_NOTHING[name][0]):
+        assert np.allclose(state.points[0], base, rtol=0, atol=1e-12)
+
+
+def test_s1_one_triangle_at_rest_only_hangs():
+    """Gravity sinks its centre until the guide holds it, by g density / k_g; nothing else moves the centre."""
+    mesh = mesh_of([[0, 1, 2]])
+    state = solved(mesh, CORNERS[:3], CORNERS[:3], level=0, steps=200, tolerance=1e-9)
+    sunk = (CORNERS[:3] - state.points[0]).mean(axis=0)
+    assert sunk == pytest.approx([0.0, 0.187 * 9.81 / 2000.0, 0.0], abs=1e-8)
+
+
+FAULTS = ("zero-area triangle", "repeated vertex", "coincident point", "duplicate face")
+
+
+def faulty(kind: str) -> tuple[PolygonMesh, np.ndarray, np.ndarray, str]:
+    """A clean sheet with one fault: mesh, rest, vertices at the fault, and what it is called."""
+    mesh, rest = sheet(8, 6)
+    faces, count = mesh.indices.reshape(-1, 3).tolist(), mesh.vertex_count
+    if kind == "zero-area triangle":
+        a, b = 0, 1
+        return (
+            mesh_of([*faces, [a, count, b]]),
+            np.vstack([rest, 0.5 * (rest[a] + rest[b])]),
+            np.array([a, b]),
+            "zero-area-face",
+        )
+    if kind == "repeated vertex":
+        return mesh_of([*faces, [20, 20, 21]]), rest, np.array([20, 21]), "degenerate-face"
+    if kind == "coincident point":
+        return mesh_of(faces, count + 1), np.vstack([rest, rest[20]]), np.array([], int), "isolated-point"
+    return mesh_of([*faces, faces[30]]), rest, np.array(faces[30]), "duplicate-face"
+
+
+def hung(points: np.ndarray) -> np.ndarray:
+    """A sheet stretched and sheared a little and bowed: a smooth answer, so that changes are the fault's."""
+    bow = 0.03 * np.sin(np.pi * points[:, 0] / 0.4)
+    return np.stack([1.03 * points[:, 0] + 0.05 * points[:, 1], 1.01 * points[:, 1], bow], axis=1)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("kind", FAULTS)
+def test_s2_a_fault_leaves_the_rest_of_the_sheet_alone(kind: str, level: int):
+    clean, rest = sheet(8, 6)
+    mesh, worse, at, called = faulty(kind)
+    assert called in {defect.kind for defect in defects(mesh, worse)}
+    options = {"level": level, "steps": 200, "tolerance": 1e-5}
+    good = solved(clean, rest, hung(rest), **options).points[0][: len(rest)]
+    bad = solved(mesh, worse, hung(worse), **options).points[0]
+    assert np.isfinite(bad).all()
+    away = np.setdiff1d(np.arange(len(rest)), at)
+    displaced = rms(good - hung(rest))
+    change = np.linalg.norm(bad[: len(rest)] - good, axis=1)[away].max() / displaced
+    assert change < 0.01, change
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_s2_a_fault_in_compressed_cloth_stays_finite(kind: str):
+    mesh, rest, _, _ = faulty(kind)
+    state = solved(mesh, rest, hung(rest) * [0.8, 1.0, 1.0], level=2, dtype=torch.float32, steps=50)
+    assert np.isfinite(state.points[0]).all()
+    energy = state.telemetry[0]["energy_joules"]
+    assert sum(energy["output"].values()) < sum(energy["input"].values())
+
+
+class TestS16:
+    def test_s16_a_rest_edge_of_no_length_is_refused_by_name(self):
+        mesh, rest = sheet(3, 2)
+        rest[5] = rest[6]
+        with pytest.raises(GarmentError, match="</World/Sheet>: the rest edge between points 6 and 5 has no length"):
+            refiner_of([garment_of(mesh, rest)])
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf])
+    def test_s16_a_rest_point_that_is_not_finite_is_refused_by_name(self, bad: float):
+        mesh, rest = sheet(3, 2)
+        rest[7, 1] = bad
+        with pytest.raises(GarmentError, match="</World/Sheet>: rest position 7 is not finite"):
+            refiner_of([garment_of(mesh, rest)])
+
+    def test_s16_the_closing_edge_of_a_face_is_looked_at_too(self):
+        mesh = mesh_of([[0, 1, 2, 3]])
+        rest = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0]], float)
+        with pytest.raises(GarmentError, match="between points 3 and 0"):
+            refiner_of([garment_of(mesh, rest)])
