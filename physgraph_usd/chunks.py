@@ -34,13 +34,13 @@ class Outcome:
 
     Attributes:
         time: The time code; None for a shot without samples.
-        points: Fine world positions [m] of each garment, or () when the solve failed.
+        points: Fine world positions [m] of each garment, None where it has no sample; () when the solve failed.
         reused: For each garment, True when it kept the previous frame's points.
         record: Telemetry, or {"error": message}, ready for JSON.
     """
 
     time: float | None
-    points: tuple[np.ndarray, ...]
+    points: tuple[np.ndarray | None, ...]
     reused: tuple[bool, ...]
     record: dict[str, object]
 
@@ -98,7 +98,7 @@ def _solve_chunk(solver: Solver, times: list[float | None], skip: int, folder: P
             continue
         index = first + position - skip
         partial = folder / f"{index}.part.npz"
-        arrays: dict[str, Any] = {f"points{k}": points for k, points in enumerate(outcome.points)}
+        arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
         np.savez(partial, **arrays)
         partial.rename(folder / f"{index}.npz")
@@ -113,10 +113,10 @@ def _collect(file: Path, time: float | None, future: Future[None]) -> Outcome:
                 raise SolveError(f"a worker ended without the result of time code {time}")
         clock.sleep(POLL_SECONDS)
     with np.load(file) as data:
-        count = sum(name.startswith("points") for name in data.files)
-        points = tuple(data[f"points{k}"] for k in range(count))
         record = json.loads(str(data["record"]))
         reused = tuple(bool(value) for value in data["reused"])
+        names = [f"points{k}" for k in range(len(reused))]
+        points = tuple(data[name] if name in data.files else None for name in names)
     file.unlink()
     return Outcome(time, points, reused, record)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
@@ -14,6 +15,15 @@ from .group import Group, SolveSettings
 from .level import refine_garments
 from .mesh.subdivide import Refinement
 from .scene import Frame, GarmentFrame, Scene, State
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """One garment's last solved frame."""
+
+    frame: GarmentFrame
+    points: np.ndarray
+    carried: Carried
 
 
 class Refiner:
@@ -56,8 +66,8 @@ class Refiner:
             Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device)
             for garment, chain in zip(scene.garments, self.refinements, strict=True)
         ]
-        self._kept: list[Carried | None] = [None] * len(self._groups)
-        self._last: tuple[Frame, State] | None = None
+        self._last: list[_Known | None] = [None] * len(self._groups)
+        self._time: float | None = None
 
     @staticmethod
     def subdivide(scene: Scene, levels: Sequence[int]) -> list[tuple[Refinement, ...]]:
@@ -66,8 +76,8 @@ class Refiner:
 
     def forget(self) -> None:
         """Start the next frame cold."""
-        self._kept = [None] * len(self._groups)
-        self._last = None
+        self._last = [None] * len(self._groups)
+        self._time = None
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
         """Solve frames in order, one state a frame.
@@ -78,33 +88,50 @@ class Refiner:
         for frame in frames:
             yield self.solve(frame)
 
-    def solve(self, frame: Frame) -> State:
-        """Solve one frame, starting from the last one solved where that helps."""
+    def solve(self, frame: Frame, wanted: Sequence[bool] | None = None) -> State:
+        """Solve one frame, starting from the last one solved where that helps.
+
+        Args:
+            frame: The frame.
+            wanted: For each garment, whether it is asked for; all when None.
+        """
         gap = self._is_gap(frame.time)
-        points: list[np.ndarray] = []
+        points: list[np.ndarray | None] = []
         telemetry: list[dict[str, object]] = []
-        reused = []
-        for index, (group, garment) in enumerate(zip(self._groups, frame.garments, strict=True)):
-            if self._last is not None and _same(garment, self._last[0].garments[index]):
-                points.append(self._last[1].points[index])
+        reused: list[bool] = []
+        for index, garment in enumerate(frame.garments):
+            known = self._last[index]
+            same = known is not None and _same(garment, known.frame)
+            reused.append(same)
+            if wanted is not None and not wanted[index]:
+                points.append(None)
+                telemetry.append({"start": "left out: the garment has no sample here"})
+            elif known is not None and same:
+                points.append(known.points)
                 telemetry.append({"start": "reused: the input equals the last frame's"})
-                reused.append(True)
-                continue
-            kept = None if gap else self._kept[index]
-            solved, self._kept[index], entry = group.solve([garment], kept, at=frame.time)
-            if gap:
-                entry["start"] = "cold: the time between samples is too long"
-            points += solved
-            telemetry.append(entry)
-            reused.append(False)
-        state = State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
-        self._last = (frame, state)
-        return state
+            else:
+                solved, entry = self._solve_group(index, garment, frame.time, gap=gap)
+                points.append(solved)
+                telemetry.append(entry)
+        self._time = frame.time
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
+
+    def _solve_group(
+        self, index: int, garment: GarmentFrame, time: float | None, *, gap: bool
+    ) -> tuple[np.ndarray, dict[str, object]]:
+        """Solve one garment apart and keep what its next frame needs; returns its points and telemetry."""
+        known = self._last[index]
+        kept = None if gap or known is None else known.carried
+        solved, carried, entry = self._groups[index].solve([garment], kept, at=time)
+        self._last[index] = _Known(garment, solved[0], carried)
+        if gap:
+            entry["start"] = "cold: the time between samples is too long"
+        return solved[0], entry
 
     def _is_gap(self, time: float | None) -> bool:
-        if time is None or self._last is None or self._last[0].time is None or not self._spacing:
+        if time is None or self._time is None or not self._spacing:
             return False
-        return time - self._last[0].time > self._settings.reset.gap * self._spacing
+        return time - self._time > self._settings.reset.gap * self._spacing
 
 
 def _same(a: GarmentFrame, b: GarmentFrame) -> bool:

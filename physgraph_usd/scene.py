@@ -95,12 +95,12 @@ class State:
 
     Attributes:
         time: The stage's own time code; None for a shot without samples.
-        points: Fine positions [m], world space, one (V, 3) float32 or float64 array per garment.
+        points: Fine positions [m], world space, shape (V, 3), float64, per garment; None where it was not asked for.
         telemetry: Plain numbers and words per garment, ready for JSON.
         reused: For each garment, True when its input equalled the previous frame's and its points were kept.
     """
 
     time: float | None
-    points: tuple[np.ndarray, ...]
+    points: tuple[np.ndarray | None, ...]
     telemetry: tuple[dict[str, object], ...] = field(default=())
     reused: tuple[bool, ...] = field(default=())

@@ -197,13 +197,19 @@ class _ShotSolver:
             try:
                 frame = shot.frame(time)
                 read = 1e3 * (clock.perf_counter() - read)
-                state = refiner.solve(frame)
+                state = refiner.solve(frame, sampled_at(shot, time))
             except SolveError as error:
                 refiner.forget()
                 yield Outcome(time, (), (), {"time": time, "error": str(error)})
                 continue
             record = {"time": time, "read_ms": round(read, 3), "garments": list(state.telemetry)}
             yield Outcome(time, state.points, state.reused, record)
+
+
+def sampled_at(shot: Shot, time: float | None) -> list[bool]:
+    """For each garment, whether the layer gets a sample at a time code: its own authored times, or the first of all."""
+    first = shot.scene.times[0] if shot.scene.times else None
+    return [time in source.times if source.times else time == first for source in shot.sources]
 
 
 def settings_of(options: RefineOptions) -> SolveSettings:

@@ -24,6 +24,7 @@ from .find import find_colliders, find_garments, instance_roots
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .placement import to_metres
+from .provenance import mute_refined
 from .schema import GARMENT
 from .skinning import Bake
 from .stage import (
@@ -139,6 +140,7 @@ def open_shot(
     asked = parse_overrides(overrides)
     _check_options(frames, level, rest_frame)
     stage, notices = open_stage(str(path))
+    notices += [Notice("", None, f"{layer} holds refined cloth and is left out") for layer in mute_refined(stage)]
     with pxr_errors(f"cannot read {path}"), quiet():
         prims = _find(stage, garments, notices)
         check_overrides(asked, [prim.GetPath() for prim in prims])

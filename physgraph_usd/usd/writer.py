@@ -124,12 +124,13 @@ class LayerWriter:
         purpose = "render" if self._mode == "sibling" else UsdGeom.Imageable(prim).ComputePurpose()
         self._hints.append(ModelHints(stream, self._shot.stage, source.path, purpose=purpose))
 
-    def write(self, time: float | None, points: Sequence[np.ndarray], *, changed: Sequence[bool] | None = None) -> None:
+    def write(self, time: float | None, points: Sequence[np.ndarray | None], *, changed: Sequence[bool] | None = None) -> None:
         """Write one time code.
 
         Args:
             time: The stage's own time code, later than the last; None once, for a shot without samples.
-            points: Per garment, fine points [m], world space, shape (V_fine, 3).
+            points: Per garment, fine points [m], world space, shape (V_fine, 3), or None where the garment has no
+                sample at this time.
             changed: Per garment, False where the points are known to equal the last ones.
 
         Raises:
@@ -139,8 +140,11 @@ class LayerWriter:
         if self._time == -np.inf:
             self._author_values(time)
         for index, track in enumerate(self._tracks):
+            array = points[index]
+            if array is None:
+                continue
             different = True if changed is None else bool(changed[index])
-            track.write(time, points[index], self._shot.to_metres(index, time), changed=different)
+            track.write(time, array, self._shot.to_metres(index, time), changed=different)
             self._hints[index].write(time, track.box)
         self._time = np.inf if time is None else time
 
@@ -150,7 +154,7 @@ class LayerWriter:
         for source, garment, values in zip(self._shot.sources, self._shot.scene.garments, frame.garments, strict=True):
             author_used_values(self._stream, source, garment, values)
 
-    def _check_call(self, time: float | None, points: Sequence[np.ndarray]) -> None:
+    def _check_call(self, time: float | None, points: Sequence[np.ndarray | None]) -> None:
         """Refuse calls that would make a wrong layer."""
         if not self._open:
             raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
@@ -159,7 +163,8 @@ class LayerWriter:
         if len(points) != len(self._tracks):
             raise LayerError(f"{len(points)} arrays of points for {len(self._tracks)} garments")
         for track, array in zip(self._tracks, points, strict=True):
-            track.check(array, time)
+            if array is not None:
+                track.check(array, time)
 
     def close(self) -> Path:
         """Finish, validate and move the layer to its final name.
