@@ -129,7 +129,7 @@ def evaluate(force: Force, x: Tensor) -> tuple[float, Tensor]:
     return float(energy), out
 
 
-def difference_force(force: Force, x: Tensor, step: float, vertices: Sequence[int] | None = None) -> Tensor:
+def difference_force(force: Force, x: Tensor, step: float, *, vertices: Sequence[int] | None = None) -> Tensor:
     """Minus the energy's gradient by central differences of sixth order, zero at vertices not asked for."""
     out = torch.zeros_like(x)
     for v in range(len(x)) if vertices is None else vertices:

@@ -7,7 +7,7 @@ The bending probe does the same with the three uniform curvatures. The strips ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,7 +109,7 @@ def plane_stiffness(level: Level, forces: Sequence[Force]) -> np.ndarray:
     none = np.zeros(len(p))
     modes = [(p[:, 0], none), (none, p[:, 1]), (0.5 * p[:, 1], 0.5 * p[:, 0])]
     modes = np.stack([np.stack(mode, axis=1).reshape(-1) for mode in modes], axis=1)
-    stiffness = sum(hessian(force, level.rest, [0, 1]) for force in forces)
+    stiffness = np.sum([hessian(force, level.rest, [0, 1]) for force in forces], axis=0)
     held = np.repeat(rim(level, 1.2 * float(level.spacing.mean())), 2)
     u = relaxed(stiffness, modes, held)
     return u.T @ stiffness @ u / float(level.triangle_area.sum())
@@ -147,7 +147,7 @@ def turned(stiffness: np.ndarray, angle: float) -> np.ndarray:
     return strain.T @ stiffness @ strain
 
 
-def over_directions(measure: object) -> Spread:
+def over_directions(measure: Callable[[float], float]) -> Spread:
     """Mean and extremes of a function of direction over half a turn."""
     values = np.array([measure(angle) for angle in np.linspace(0, np.pi, 73)[:-1]])
     return Spread(float(values.mean()), float(values.min()), float(values.max()))
@@ -177,7 +177,7 @@ def bending_constants(stiffness: np.ndarray) -> dict[str, Spread]:
 def tensile_test(level: Level, forces: Sequence[Force]) -> tuple[float, float]:
     """Young's modulus [N/m] and Poisson's ratio along x: short sides pulled, everything else free."""
     p, strain = level.rest.numpy(), 1.0
-    stiffness = sum(hessian(force, level.rest, [0, 1]) for force in forces)
+    stiffness = np.sum([hessian(force, level.rest, [0, 1]) for force in forces], axis=0)
     edge = float(level.spacing.mean())
     ends = (p[:, 0] < p[:, 0].min() + 0.6 * edge) | (p[:, 0] > p[:, 0].max() - 0.6 * edge)
     held = np.stack([ends, np.arange(len(p)) == int(np.flatnonzero(ends)[0])], axis=1)
@@ -187,7 +187,7 @@ def tensile_test(level: Level, forces: Sequence[Force]) -> tuple[float, float]:
     fit = np.column_stack([p[inside, 0], p[inside, 1], np.ones(inside.sum())])
     slope = np.linalg.lstsq(fit, u.reshape(-1, 2)[inside], rcond=None)[0]
     pulled = u @ stiffness @ u / (float(level.triangle_area.sum()) * float(slope[0, 0]) * strain)
-    return pulled, -slope[1, 1] / slope[0, 0]
+    return float(pulled), float(-slope[1, 1] / slope[0, 0])
 
 
 def cylinder_rigidity(level: Level, radius: float, angle: float) -> float:

@@ -123,6 +123,7 @@ def test_the_paper_potential_has_no_quad_factors():
     for name in ("edge_factor", "hinge_factor"):
         assert len(getattr(level, name).unique()) > 1
     springs = in_plane_terms(level, [SPRINGS, SPRINGS], potential="paper")[0]
+    assert isinstance(springs, Stretch)
     share = springs.stiffness / level.edge_area
     assert torch.allclose(share, share[:1].expand_as(share))
 
@@ -142,7 +143,9 @@ def test_a_mixed_group_is_what_its_garments_are_alone(dtype: torch.dtype):
         refinements = refine_garments(garments, [1] * len(garments))
         group = Group(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=dtype, device="cpu")
         shapes, _, telemetry = group.solve(chosen, None, at=None)
-        return shapes, telemetry["energy_joules"]["output"]
+        energies = telemetry["energy_joules"]
+        assert isinstance(energies, dict)
+        return shapes, energies["output"]
 
     together, energies = solve(frames)
     assert {"stretch", "membrane"} <= set(energies)

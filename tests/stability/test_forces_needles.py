@@ -68,7 +68,7 @@ def test_s3_needle_forces_are_difference_quotients(name: str, aspect: float):
     x = torch.as_tensor(crumpled(points, aspect, 1))
     force = force_of(name, level)
     some = list(range(0, len(x), 4))
-    expected = difference_force(force, x, 2e-3 * 0.1 / aspect, some)
+    expected = difference_force(force, x, 2e-3 * 0.1 / aspect, vertices=some)
     assert (evaluate(force, x)[1][some] - expected[some]).abs().max() < 1e-6 * expected.abs().max()
 
 
@@ -112,4 +112,5 @@ def test_s3_collapsed_triangles_stay_finite(name: str, dtype: torch.dtype):
             assert bool(f.isfinite().all())
             assert bool(force.diagonal(torch.as_tensor(x, dtype=dtype)).isfinite().all())
         matrix = force.rest_matrix()
+        assert matrix is not None
         assert np.isfinite(matrix.data).all()
