@@ -201,7 +201,7 @@ def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLev
         smoothing = sp.csr_matrix(smooth(mesh, refinement) @ smoothing)
         linear = sp.csr_matrix(refinement.linear @ linear)
         mesh = refinement.mesh
-    rest = linear @ np.asarray(garment.rest, dtype=np.float64)
+    rest = np.asarray(linear @ np.asarray(garment.rest, dtype=np.float64))
     split = _sound(mesh.triangulate(rest if not chain else None), rest)
     triangles, hinges = split.triangles, hinges_of(split.triangles)
     edges = edges_of(triangles, mesh.vertex_count).vertices
@@ -217,7 +217,7 @@ def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLev
         edge_factor=edge_factor,
         hinge_factor=at_edge[find_edges(edges, hinges[:, :2])],
         bent_rest=garment.bent_rest,
-        vertex_values={name: linear @ np.asarray(getattr(garment, name), dtype=np.float64) for name in names},
+        vertex_values={name: np.asarray(linear @ getattr(garment, name).astype(np.float64)) for name in names},
         linear=linear,
         smooth=smoothing,
     )
@@ -240,52 +240,46 @@ def _join(
     """Concatenate garments into one level and measure its rest shape."""
     counts = [part.vertex_count for part in parts]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-
-    def stack(name: str) -> np.ndarray:
-        return np.concatenate([getattr(p, name) + o for p, o in zip(parts, starts, strict=False)])
-
-    def owner(name: str) -> np.ndarray:
-        return np.repeat(np.arange(len(parts)), [len(getattr(p, name)) for p in parts])
-
-    def values(name: str) -> np.ndarray:
-        return np.concatenate([p.vertex_values[name] for p in parts])
-
-    rest = np.concatenate([part.rest for part in parts])
-    triangles, edges, hinges = stack("triangles"), stack("edges"), stack("hinges")
-    bent = np.repeat([part.bent_rest for part in parts], [len(part.hinges) for part in parts])
-    shape = rest_shape(rest, triangles, edges, hinges, bent=bent)
-    triangle_area, triangle_inverse = triangle_shape(rest, triangles)
-
-    def real(array: np.ndarray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
-
-    def whole(array: np.ndarray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array, dtype=np.int32), device=device)
-
+    elements = {
+        name: np.concatenate([getattr(part, name) + start for part, start in zip(parts, starts, strict=False)])
+        for name in ("triangles", "edges", "hinges")
+    }
+    owners = {"vertex_garment": counts}
+    owners |= {f"{name[:-1]}_garment": [len(getattr(part, name)) for part in parts] for name in elements}
+    whole = elements | {name: np.repeat(np.arange(len(parts)), sizes) for name, sizes in owners.items()}
+    real = _measured(parts, elements["triangles"], elements["edges"], hinges=elements["hinges"])
     return Level(
         index=index,
         spans=tuple(slice(int(a), int(b)) for a, b in pairwise(starts)),
-        rest=real(rest),
-        triangles=whole(triangles),
-        edges=whole(edges),
-        hinges=whole(hinges),
-        **{name: real(value) for name, value in shape.items()},
-        edge_factor=real(np.concatenate([part.edge_factor for part in parts])),
-        hinge_factor=real(np.concatenate([part.hinge_factor for part in parts])),
-        triangle_area=real(triangle_area),
-        triangle_inverse=real(triangle_inverse),
-        edge_garment=whole(owner("edges")),
-        hinge_garment=whole(owner("hinges")),
-        vertex_garment=whole(np.repeat(np.arange(len(parts)), counts)),
-        triangle_garment=whole(owner("triangles")),
-        stretch_scale=real(values("stretch_scale")[edges].mean(axis=1)),
-        triangle_scale=real(values("stretch_scale")[triangles].mean(axis=1)),
-        bend_scale=real(values("bend_scale")[hinges[:, :2]].mean(axis=1)),
-        pin=real(values("pin")),
+        **{n: torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device) for n, a in real.items()},
+        **{n: torch.as_tensor(np.ascontiguousarray(a, dtype=np.int32), device=device) for n, a in whole.items()},
         from_coarse=sp.csr_matrix(sp.block_diag([part.linear for part in parts])),
         smooth_from_coarse=sp.csr_matrix(sp.block_diag([part.smooth for part in parts])),
         from_below=below,
     )
+
+
+def _measured(
+    parts: Sequence[_GarmentLevel], triangles: np.ndarray, edges: np.ndarray, *, hinges: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Every real-valued field of a level, under its name there."""
+    rest = np.concatenate([part.rest for part in parts])
+    bent = np.repeat([part.bent_rest for part in parts], [len(part.hinges) for part in parts])
+    area, inverse = triangle_shape(rest, triangles)
+    stretch, bend, pin = (
+        np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
+    )
+    return rest_shape(rest, triangles, edges, hinges, bent=bent) | {
+        "rest": rest,
+        "edge_factor": np.concatenate([part.edge_factor for part in parts]),
+        "hinge_factor": np.concatenate([part.hinge_factor for part in parts]),
+        "triangle_area": area,
+        "triangle_inverse": inverse,
+        "stretch_scale": stretch[edges].mean(axis=1),
+        "triangle_scale": stretch[triangles].mean(axis=1),
+        "bend_scale": bend[hinges[:, :2]].mean(axis=1),
+        "pin": pin,
+    }
 
 
 def rest_shape(
