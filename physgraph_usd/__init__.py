@@ -25,7 +25,9 @@ if TYPE_CHECKING:
         UsageError,
     )
     from .fabric import PRESETS, Fabric
-    from .shot import RefineOptions, RefineReport, inspect_shot, refine_shot
+    from .options import RefineOptions
+    from .report import RefineReport
+    from .shot import inspect_shot, refine_shot, refine_shots
     from .usd.reader import Shot, open_shot
     from .usd.schema import schema_path
     from .usd.tag import tag
@@ -49,6 +51,7 @@ __all__ = [
     "inspect_shot",
     "open_shot",
     "refine_shot",
+    "refine_shots",
     "schema_path",
     "tag",
     "validate_layer",
@@ -65,7 +68,9 @@ _ROOMS = {
         "UsageError",
     ),
     "fabric": ("PRESETS", "Fabric"),
-    "shot": ("RefineOptions", "RefineReport", "inspect_shot", "refine_shot"),
+    "options": ("RefineOptions",),
+    "report": ("RefineReport",),
+    "shot": ("inspect_shot", "refine_shot", "refine_shots"),
     "usd.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
     "usd.tag": ("tag",),

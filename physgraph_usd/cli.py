@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Never
+from typing import TYPE_CHECKING, Any, Never
 
 import click
 
 from . import __version__
 from .errors import PhysGraphError, UsageError
+
+if TYPE_CHECKING:
+    from .report import RefineReport
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
@@ -171,6 +174,8 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
     reports = none if report is None else _one_each(shots, report, "--report", suffix=".json")
     roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda")
     given = {name: value for name, value in options.items() if value is not None}
+    if len(shots) > 1 and given.get("workers", 1) > 1:
+        sys.exit(_refine_side_by_side(shots, layers, reports, roots, given))
     codes = {
         _refine_one(shot, layer, given | {"report": report, "root": root}, name=f"{shot}: " if len(shots) > 1 else "")
         for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
@@ -260,7 +265,8 @@ def schema_path() -> None:
 
 
 def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -> int:
-    from .shot import RefineOptions, refine_shot
+    from .options import RefineOptions
+    from .shot import refine_shot
 
     try:
         with _progress(Path(shot).name) as progress:
@@ -270,9 +276,39 @@ def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -
     except PhysGraphError as error:
         click.echo(f"error: {name}{error}", err=True)
         return FAILED
+    return _say(done, name)
+
+
+def _refine_side_by_side(
+    shots: tuple[str, ...],
+    layers: list[Path],
+    reports: Sequence[Path | None],
+    roots: Sequence[Path | None],
+    given: dict[str, Any],
+) -> int:
+    """Refine several shots in processes of their own; each shot keeps to one."""
+    from .options import RefineOptions
+    from .shot import refine_shots
+
+    jobs = [
+        (shot, layer, RefineOptions(**given, report=report, root=root))
+        for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
+    ]
+    codes = set()
+    for shot, done in zip(shots, refine_shots(jobs, workers=given["workers"]), strict=True):
+        if isinstance(done, PhysGraphError):
+            click.echo(f"error: {shot}: {done}", err=True)
+            codes.add(FAILED)
+        else:
+            codes.add(_say(done, f"{shot}: "))
+    return codes.pop() if len(codes) == 1 else IN_PART
+
+
+def _say(done: RefineReport, name: str) -> int:
+    """Print a run's warnings and its layer, or after a dry run its report; returns the exit code."""
     for warning in done.warnings:
         click.echo(f"warning: {name}{warning}", err=True)
-    click.echo(done.to_json() if options["dry_run"] else done.out)
+    click.echo(done.to_json() if done.out is None else done.out)
     return done.exit_code
 
 

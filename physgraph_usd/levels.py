@@ -1,4 +1,9 @@
-"""How many subdivisions a garment needs: no more than its wrinkles (DESIGN section 5)."""
+"""How many subdivisions a garment needs: no more than its wrinkles (DESIGN section 5).
+
+The buckling wavelength is 2 pi sqrt(D / (Y strain)), with the compression of the cage's edges, 90th percentile over
+a few frames. A level resolves it when its mean edge is under a fifth of it; over a quarter, wrinkles of the mesh's own
+size appear instead of the fabric's (STABILITY S39).
+"""
 
 from __future__ import annotations
 
@@ -16,57 +21,73 @@ MOST = 4
 SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
 EDGES_PER_WAVE = 5.0
+FEWEST_EDGES_PER_WAVE = 4.0
 
 
 @dataclass(frozen=True)
 class LevelChoice:
-    """A garment's number of subdivisions and why."""
+    """A garment's number of subdivisions and why.
+
+    Attributes:
+        level: Number of subdivisions.
+        reason: Why, in words.
+        wavelength: Buckling wavelength [m].
+        edge: Mean rest edge at that level [m].
+        warning: What is too coarse, or "".
+    """
 
     level: int
     reason: str
+    wavelength: float
+    edge: float
+    warning: str
 
 
 def choose_levels(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[LevelChoice]:
     """Take each garment's own level, or for `AUTO` the least that resolves its wrinkles.
 
-    The buckling wavelength is 2 pi sqrt(D / (Y strain)) with the compression of the cage's edges, 90th percentile over
-    a few frames; a level resolves it when its mean edge is under a fifth of it.
-
     Args:
         scene: The scene.
-        frame_at: Reads a frame; only asked for a few frames when some level is `AUTO`.
+        frame_at: Reads a frame; asked for a few frames.
 
     Returns:
         One choice per garment.
     """
-    if all(garment.level != AUTO for garment in scene.garments):
-        return [LevelChoice(garment.level, "as authored or asked for") for garment in scene.garments]
     picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
     times: list[float | None] = [scene.times[i] for i in picks] or [None]
     frames = [frame_at(time) for time in times]
     return [
-        _resolve(garment, [frame.garments[index] for frame in frames])
-        if garment.level == AUTO
-        else LevelChoice(garment.level, "as authored or asked for")
-        for index, garment in enumerate(scene.garments)
+        _choose(garment, [frame.garments[index] for frame in frames]) for index, garment in enumerate(scene.garments)
     ]
 
 
-def _resolve(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
+def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     ends = edges_of(garment.mesh.triangulate(garment.rest).triangles, garment.mesh.vertex_count).vertices
     if not len(ends):
-        return LevelChoice(0, "auto: the garment has no faces")
+        level = 0 if garment.level == AUTO else garment.level
+        return LevelChoice(level, "the garment has no faces", 0.0, 0.0, "")
     rest = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
-    compression = [
-        1.0 - np.linalg.norm(f.points[ends[:, 1]] - f.points[ends[:, 0]], axis=1) / np.maximum(rest, 1e-12)
-        for f in frames
-    ]
-    strain = max(float(np.percentile(np.concatenate(compression), 90)), LEAST_STRAIN)
+    strain, edge = _compression(rest, ends, frames), float(rest.mean())
     fabric = frames[0].fabric
     wave = 2.0 * math.pi * math.sqrt(fabric.bend / (fabric.stretch * strain))
-    edge = float(rest.mean())
-    needed = math.ceil(math.log2(max(edge * EDGES_PER_WAVE / wave, 1.0)))
-    level = min(needed, MOST)
-    capped = f", {needed} needed and {MOST} is the most" if needed > MOST else ""
-    reason = f"auto: wrinkles of {1e3 * wave:.1f} mm at {strain:.0%} compression, cage edges of {1e3 * edge:.1f} mm"
-    return LevelChoice(level, reason + capped)
+    said = f"wrinkles of {1e3 * wave:.1f} mm (compression {strain:.2g}), cage edges of {1e3 * edge:.1f} mm"
+    needed = max(math.ceil(math.log2(max(edge * EDGES_PER_WAVE / wave, 1.0))), 0)
+    level, reason = garment.level, "as authored or asked for"
+    if level == AUTO:
+        level = min(needed, MOST)
+        reason = f"auto: {said}" + (f"; {needed} needed, {MOST} is the most" if needed > MOST else "")
+    fine = edge / 2**level
+    warning = ""
+    if wave < FEWEST_EDGES_PER_WAVE * fine:
+        warning = (
+            f"<{garment.path}>: {said}; at level {level} edges of {1e3 * fine:.1f} mm are too coarse for them and show "
+            f"wrinkles of their own size; use level {needed} or raise bendStiffness"
+        )
+    return LevelChoice(level, reason, wave, fine, warning)
+
+
+def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame]) -> float:
+    """90th percentile of the cage edges' compression over some frames."""
+    lengths = [np.linalg.norm(f.points[ends[:, 1]] - f.points[ends[:, 0]], axis=1) for f in frames]
+    ratios = np.concatenate(lengths) / np.tile(np.maximum(rest, 1e-12), len(frames))
+    return max(float(np.percentile(1.0 - ratios, 90)), LEAST_STRAIN)

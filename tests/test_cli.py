@@ -123,7 +123,7 @@ class TestRefine:
         assert (options.temporal, options.rest_frame, options.velocities) == ("off", 4.0, True)
 
     def test_what_is_left_out_keeps_its_default(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
-        from physgraph_usd.shot import RefineOptions
+        from physgraph_usd.options import RefineOptions
 
         run("refine", "a.usda", "-o", tmp_path / "a.usdc")
         for field in fields(RefineOptions):
@@ -131,7 +131,7 @@ class TestRefine:
                 assert getattr(refined[0].options, field.name) == getattr(RefineOptions(), field.name), field.name
 
     def test_every_option_is_one_of_the_call(self) -> None:
-        from physgraph_usd.shot import RefineOptions
+        from physgraph_usd.options import RefineOptions
 
         declared = {parameter.name for parameter in cli.refine.params} - {"shots", "out"}
         assert declared == {field.name for field in fields(RefineOptions)} - {"progress"}

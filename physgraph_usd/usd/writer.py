@@ -124,7 +124,9 @@ class LayerWriter:
         purpose = "render" if self._mode == "sibling" else UsdGeom.Imageable(prim).ComputePurpose()
         self._hints.append(ModelHints(stream, self._shot.stage, source.path, purpose=purpose))
 
-    def write(self, time: float | None, points: Sequence[np.ndarray | None], *, changed: Sequence[bool] | None = None) -> None:
+    def write(
+        self, time: float | None, points: Sequence[np.ndarray | None], *, changed: Sequence[bool] | None = None
+    ) -> None:
         """Write one time code.
 
         Args:

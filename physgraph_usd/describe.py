@@ -1,0 +1,137 @@
+"""What is known of a shot before its first frame is solved: garments, values and their sources, terms on and off."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .levels import LevelChoice
+from .mesh.defects import defects
+from .options import RefineOptions
+from .report import RefineReport
+from .scene import Garment, GarmentFrame
+from .usd.reader import Shot
+from .usd.stage import GarmentSource
+from .usd.survey import survey
+
+
+def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> RefineReport:
+    """Start the report of a run.
+
+    Args:
+        opened: The shot.
+        choices: The level of each garment.
+        options: The run's options.
+
+    Returns:
+        A report without frames.
+    """
+    report = RefineReport(opened.path, None, options.plain())
+    first = opened.frame(opened.scene.times[0] if opened.scene.times else None)
+    parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
+    report.garments = [_garment(*part) for part in parts]
+    report.modelled = _modelled(opened, report, options)
+    report.left_out = _left_out(opened, report)
+    report.warnings = [str(notice) for notice in opened.warnings]
+    report.warnings += [choice.warning for choice in choices if choice.warning]
+    return report
+
+
+def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> dict[str, Any]:
+    """What would be refined, with what, from where, and every defect found, as plain values."""
+    report = begin_report(opened, choices, options)
+    return {
+        "shot": opened.path,
+        "metres_per_unit": opened.metres_per_unit,
+        "times": list(opened.scene.times),
+        "garments": report.garments,
+        "colliders": list(opened.colliders),
+        "modelled": report.modelled,
+        "left_out": report.left_out,
+        "defects": {
+            garment.path: [defect.message for defect in defects(garment.mesh, garment.rest)]
+            for garment in opened.scene.garments
+        },
+        "warnings": report.warnings,
+    }
+
+
+def describe_meshes(path: str, problem: str) -> dict[str, Any]:
+    """What can be said of a stage that could not be opened for refining: its meshes, and why not.
+
+    Raises:
+        StageError: The file cannot be opened at all.
+    """
+    found = survey(path)
+    return {
+        "shot": path,
+        "metres_per_unit": found.metres_per_unit,
+        "problem": problem,
+        "meshes": [
+            {
+                "path": mesh.path,
+                "garment": mesh.garment,
+                "points": mesh.points,
+                "faces": mesh.faces,
+                "samples": len(mesh.times),
+                "problem": mesh.problem or "none",
+                "notices": [str(notice) for notice in mesh.notices],
+            }
+            for mesh in found.meshes
+        ],
+        "warnings": [str(notice) for notice in found.notices],
+    }
+
+
+def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choice: LevelChoice) -> dict[str, Any]:
+    size = np.ptp(garment.rest, axis=0) if len(garment.rest) else np.zeros(3)
+    return {
+        "path": garment.path,
+        "points": garment.mesh.vertex_count,
+        "faces": len(garment.mesh.counts),
+        "size_m": [round(float(length), 4) for length in size],
+        "samples": len(source.times),
+        "level": choice.level,
+        "level_reason": choice.reason,
+        "fine_edge_mm": round(1e3 * choice.edge, 2),
+        "wavelength_mm": round(1e3 * choice.wavelength, 2),
+        "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},
+        "sources": dict(source.sources),
+        "skinned": source.skinned,
+        "pinned_points": int((garment.pin > 0).sum()),
+    }
+
+
+def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
+    angles = "rest shape" if any(garment.bent_rest for garment in opened.scene.garments) else "flat"
+    modelled = {
+        **_in_plane(report),
+        "bending": f"dihedral angles, {angles}",
+        "gravity": f"{np.linalg.norm(opened.scene.gravity):.3g} m/s^2",
+        "guide": "ties the local average to the coarse animation",
+    }
+    if options.temporal == "tether" and len(opened.scene.times) > 1:
+        modelled["tether"] = "ties each frame to the last one's detail"
+    return modelled
+
+
+def _in_plane(report: RefineReport) -> dict[str, str]:
+    """Which garments are sheets of edge springs, and which of triangles because shear stiffness is authored."""
+    springs = [g["path"] for g in report.garments if g["fabric"]["shear"] is None]
+    triangles = [g["path"] for g in report.garments if g["fabric"]["shear"] is not None]
+    modelled = {"stretch": "edge springs" + (f" for {', '.join(springs)}" if triangles else "")} if springs else {}
+    return modelled | ({"membrane": f"triangle membrane for {', '.join(triangles)}"} if triangles else {})
+
+
+def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
+    left_out = {
+        "contact": f"not in this version; {len(opened.colliders)} collider(s) found and ignored",
+        "self contact": "not in this version",
+        "network": "not in this version; quasi-Newton integrates",
+    }
+    if "membrane" not in report.modelled:
+        left_out["triangle membrane"] = "no garment authors shear stiffness: edge springs have G = 0.375 Y"
+    return left_out

@@ -1,0 +1,104 @@
+"""Everything that `refine_shot` can be told, and what it refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .errors import UsageError
+from .group import SolveSettings
+from .integrate import method_named
+
+TEMPORAL = ("tether", "warm", "off")
+POTENTIALS = ("continuum", "paper")
+_NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """Everything that `refine_shot` can be told.
+
+    Attributes:
+        frames: First and last time code, or None for all of the shot.
+        garments: Prim paths, globs or collections; empty finds applied schemas.
+        colliders: Prim paths, globs or collections; empty finds applied schemas.
+        level: Subdivisions; -1 chooses, None takes the stage's.
+        integrator: A name of `integrate.METHODS`.
+        steps: Most steps at the finest level.
+        tolerance: Stop when the cloth would move less than this, RMS, in local edge lengths.
+        budget_ms: Milliseconds a frame, or None.
+        device: "cpu" or "cuda".
+        overrides: "</Prim>.attribute=value" or "attribute=value", as ``--set`` takes them.
+        mode: "over" or "sibling".
+        temporal: "tether", "warm" or "off": how a frame uses the last one.
+        potential: "continuum" or "paper".
+        workers: Processes that share the frames.
+        report: JSON file to write, or None.
+        overwrite: Replace files that exist.
+        dry_run: Read and check everything, write nothing.
+        velocities: Also write point velocities.
+        rest_frame: Time code whose points are the rest shape, or None.
+        root: A .usda to write that lays the new layer over the shot, or None.
+        progress: Called with (frames done, frames in all), or None.
+    """
+
+    frames: tuple[float, float] | None = None
+    garments: Sequence[str] = ()
+    colliders: Sequence[str] = ()
+    level: int | None = None
+    integrator: str = "quasi-newton"
+    steps: int = 12
+    tolerance: float = 2e-3
+    budget_ms: float | None = None
+    device: str = "cpu"
+    overrides: Sequence[str] = ()
+    mode: str = "over"
+    temporal: str = "tether"
+    potential: str = "continuum"
+    workers: int = 1
+    report: Path | None = None
+    overwrite: bool = False
+    dry_run: bool = False
+    velocities: bool = False
+    rest_frame: float | None = None
+    root: Path | None = None
+    progress: Callable[[int, int], None] | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """The options that decide the result, ready for JSON."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_OF_THE_RESULT}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    def solve_settings(self) -> SolveSettings:
+        """The part that concerns the solver."""
+        return SolveSettings(
+            method=method_named(self.integrator),
+            steps=self.steps,
+            tolerance=self.tolerance,
+            budget_ms=self.budget_ms,
+            temporal=self.temporal,
+            potential=self.potential,
+        )
+
+    def check(self) -> None:
+        """Refuse what no shot could be refined with.
+
+        Raises:
+            UsageError: An option is wrong.
+        """
+        method_named(self.integrator)
+        for name, value, known in (
+            ("temporal", self.temporal, TEMPORAL),
+            ("potential", self.potential, POTENTIALS),
+        ):
+            if value not in known:
+                raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")
+        if self.workers < 1 or self.steps < 0 or not self.tolerance >= 0:
+            raise UsageError("workers must be at least 1, steps and tolerance at least 0")
+        if self.budget_ms is not None and not self.budget_ms > 0:
+            raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
+        if self.device != "cpu" and not self.device.startswith("cuda"):
+            raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
