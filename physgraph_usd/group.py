@@ -24,6 +24,7 @@ from .forces.tether import Tether
 from .integrate import Method
 from .integrate.base import System
 from .integrate.metric import Metric, kept_to_edges
+from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .mesh.subdivide import Refinement
@@ -102,6 +103,7 @@ class Group:
         cage, finest = self.levels[0], self.levels[-1]
         triangles = cage.triangles.cpu().numpy()
         self._frames = MovingFrames(finest, triangles, cage.rest.double().cpu().numpy())
+        self._outward = torch.tensor([-1.0 if garment.flipped else 1.0 for garment in garments], device=device)
         self._fixed = np.flatnonzero(~finest.free.cpu().numpy().ravel())
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
         self._material: tuple[object, ...] = ()
@@ -233,6 +235,8 @@ class Group:
                 density = torch.stack([force.density for force in lasting.elastic if isinstance(force, Gravity)])[0]
                 terms = ForceModule((*module.forces, Tether(level, density, self._settings.tether, predicted)))
             system = System(terms, lasting.metric, free=level.free, spacing=level.spacing)
+            if cold:
+                x = leave_saddle(system, level, x, outward=self._outward)
             budget = self._budget(index, len(self.levels), clock)
             x, report = solve_level(system, integrator, x, level=level.index, budget=budget)
             reports.append(report)
