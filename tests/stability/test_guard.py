@@ -1,0 +1,123 @@
+"""S37: whatever an integrator proposes, the guard's result is not worse than the input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from cloth import finest_system, group_of, sheet, wave
+
+from physgraph_usd.integrate.base import Carry, System
+from physgraph_usd.integrate.guard import Guard
+from physgraph_usd.integrate.solve import Budget, solve_level
+
+Proposal = Callable[[Carry, torch.Generator], torch.Tensor]
+
+
+def noise(carry: Carry, generator: torch.Generator) -> torch.Tensor:
+    return torch.randn(carry.x.shape, generator=generator, dtype=carry.x.dtype)
+
+
+def one_nan(carry: Carry, _: torch.Generator) -> torch.Tensor:
+    x = carry.x.clone()
+    x[3, 1] = torch.nan
+    return x
+
+
+PROPOSALS: dict[str, Proposal] = {
+    "random": lambda carry, g: carry.x + 0.05 * noise(carry, g),
+    "tiny random": lambda carry, g: carry.x + 1e-5 * noise(carry, g),
+    "huge": lambda carry, g: carry.x + 1e6 * noise(carry, g),
+    "overflowing": lambda carry, g: carry.x + 1e30 * noise(carry, g),
+    "NaN": lambda carry, _: torch.full_like(carry.x, torch.nan),
+    "one NaN": one_nan,
+    "infinite": lambda carry, _: torch.full_like(carry.x, torch.inf),
+    "collapsed": lambda carry, _: torch.zeros_like(carry.x),
+    "uphill": lambda carry, _: carry.x - 1e-4 * carry.force / carry.force.abs().max(),
+    "overshooting": lambda carry, _: carry.x + 1e3 * carry.force,
+    "still": lambda carry, _: carry.x.clone(),
+}
+
+
+class Adversary:
+    """Proposes what it is told to, like a network with wrong weights."""
+
+    name = "adversary"
+
+    def __init__(self, propose: Proposal, *, seed: int = 0) -> None:
+        self._propose, self._generator = propose, torch.Generator().manual_seed(seed)
+
+    def start(self, system: System, x: torch.Tensor) -> Carry:
+        energy, force = system.energy_and_force(x)
+        return Carry(x, energy, force, mover=self.name)
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        x = self._propose(carry, self._generator)
+        energy, force = system.energy_and_force(x)
+        return Carry(x, energy, force, mover=self.name)
+
+
+def problem(dtype: torch.dtype = torch.float64) -> tuple[System, torch.Tensor]:
+    mesh, rest = sheet(6, 4)
+    return finest_system(group_of(mesh, rest, level=1, dtype=dtype), wave(rest))
+
+
+def descent(system: System, x: torch.Tensor, propose: Proposal, *, seed: int = 0, steps: int = 15) -> list[Carry]:
+    carries: list[Carry] = []
+    solve_level(system, Guard(Adversary(propose, seed=seed)), x, level=0, budget=Budget(steps), observe=carries.append)
+    return carries
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", PROPOSALS)
+def test_s37_energy_never_rises(name: str, dtype: torch.dtype):
+    system, x = problem(dtype)
+    carries = descent(system, x, PROPOSALS[name])
+    assert all(bool(carry.x.isfinite().all()) and np.isfinite(carry.energy) for carry in carries)
+    assert all(after.energy <= before.energy for before, after in pairwise(carries))
+    # The energy that it reports is that of the positions that it returns.
+    assert carries[-1].energy == system.energy_and_force(carries[-1].x)[0]
+    # Where the proposals are worthless, the fallback has worked.
+    if name != "still":
+        assert carries[-1].energy < carries[0].energy
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_s37_random_networks_fall_back_and_say_so(seed: int):
+    system, x = problem()
+    carries = descent(system, x, PROPOSALS["huge"], seed=seed, steps=5)
+    assert {carry.mover for carry in carries[1:]} == {"fallback"}
+
+
+def test_s37_a_good_direction_that_overshoots_is_halved_or_quartered():
+    system, x = problem()
+    image = system.apply_metric_inverse(system.energy_and_force(x)[1])
+    movers = set()
+    for factor in (1.0, 3.0, 6.0, 12.0):
+        carries = descent(system, x, lambda carry, _, by=factor: carry.x + by * image, steps=1)
+        movers.add(carries[-1].mover)
+        assert carries[-1].energy < carries[0].energy
+    assert movers >= {"adversary", "halved"} or movers >= {"adversary", "quartered"}
+
+
+def test_s37_at_the_minimum_it_stays():
+    system, x = problem()
+    from physgraph_usd.integrate.newton import Newton
+
+    x, _ = solve_level(system, Newton(), x, level=0, budget=Budget(60, 1e-10))
+    carries = descent(system, x, PROPOSALS["random"], steps=5)
+    assert carries[-1].energy <= carries[0].energy
+    moved = float((carries[-1].x - x).norm(dim=1).max() / system.spacing.mean())
+    assert moved < 1e-6, moved
+
+
+def test_s37_the_test_sees_a_missing_guard():
+    """Without the guard the same proposals do raise the energy."""
+    system, x = problem()
+    energies: list[float] = []
+    integrator = Adversary(PROPOSALS["random"])
+    solve_level(system, integrator, x, level=0, budget=Budget(5), observe=lambda carry: energies.append(carry.energy))
+    assert any(after > before for before, after in pairwise(energies))

@@ -1,0 +1,117 @@
+"""S29, S31: teleports, gaps and odd sample times."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cloth import frame_of, refiner_of, rms, sheet, solved, wave
+from sheets import garment_of, rotation
+
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.scene import Frame, State
+
+EDGE = 0.05
+MESH, REST = sheet(8, 6, EDGE)
+SPIN = np.diag([-1.0, 1.0, -1.0])
+
+
+def refiner(times: tuple[float, ...], **options: object) -> Refiner:
+    return refiner_of([garment_of(MESH, REST)], level=1, times=times, dtype=torch.float32, **options)
+
+
+def still(time: float) -> np.ndarray:
+    return wave(REST, phase=0.1 * time)
+
+
+JUMPS = {
+    "two metres": lambda points: points + np.array([2.0, 0.0, 0.0]),
+    "half a turn": lambda points: (points - points.mean(axis=0)) @ SPIN + points.mean(axis=0),
+    "two metres and half a turn": lambda points: points @ SPIN + [0.0, 2.0, 0.0],
+}
+
+
+def jumping(name: str) -> list[Frame]:
+    """Three quiet frames, then the jump, then three quiet ones there."""
+    return [frame_of(still(t) if t < 4 else JUMPS[name](still(t)), float(t)) for t in range(1, 7)]
+
+
+@pytest.mark.parametrize("temporal", ["tether", "warm"])
+@pytest.mark.parametrize("name", JUMPS)
+def test_s29_a_teleport_starts_cold(name: str, temporal: str):
+    frames = jumping(name)
+    states = list(refiner(tuple(range(1, 7)), temporal=temporal).refine(frames))
+    cold = refiner(tuple(range(1, 7)), temporal=temporal).solve(frames[3])
+    assert [str(s.telemetry[0]["start"]).partition(":")[0] for s in states] == [
+        "cold",
+        "warm",
+        "warm",
+        "cold",
+        "warm",
+        "warm",
+    ]
+    assert "the cage moved" in str(states[3].telemetry[0]["start"])
+    assert rms(states[3].points[0] - cold.points[0]) <= 1e-6 * EDGE
+
+
+def test_s29_what_moves_smoothly_is_no_teleport():
+    """Ten edges a frame, and a twelfth of a turn."""
+    points = still(0.0)
+    frames = []
+    for step in range(6):
+        angle = step * np.pi / 6
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        frames.append(frame_of(points @ turn.T + [10 * EDGE * step, 0, 0], float(step)))
+    states = refiner(tuple(range(6))).refine(frames)
+    assert [state.telemetry[0]["start"] for state in states] == ["cold"] + ["warm"] * 5
+
+
+def starts(times: tuple[float, ...]) -> list[str]:
+    states = refiner(times).refine([frame_of(still(time), time) for time in times])
+    return [str(state.telemetry[0]["start"]).partition(":")[0] for state in states]
+
+
+@pytest.mark.parametrize(
+    ("times", "cold"),
+    [
+        ((1, 2, 7, 8), [0, 2]),
+        ((1, 2, 3, 4, 5), [0]),
+        ((1001, 1002, 1003, 1006, 1007), [0]),
+        ((1, 4, 7, 10), [0]),
+        ((0.0, 0.5, 1.0, 1.5, 4.0, 4.5), [0, 4]),
+        ((-3.5, -2.25, -1.0), [0]),
+    ],
+)
+def test_s31_a_gap_starts_cold_and_an_even_spacing_of_any_size_does_not(times: tuple[float, ...], cold: list[int]):
+    assert [index for index, start in enumerate(starts(tuple(map(float, times)))) if start == "cold"] == cold
+
+
+def test_s31_after_a_gap_the_frame_is_its_cold_start_to_the_bit():
+    times = (1.0, 2.0, 7.0, 8.0)
+    states = list(refiner(times).refine([frame_of(still(time), time) for time in times]))
+    cold: State = refiner(times).solve(frame_of(still(7.0), 7.0))
+    assert states[2].points[0].tobytes() == cold.points[0].tobytes()
+    assert "time between samples" in str(states[2].telemetry[0]["start"])
+
+
+def test_s31_no_samples_is_one_frame():
+    state = solved(MESH, REST, still(0.0))
+    assert state.time is None
+    assert state.telemetry[0]["start"] == "cold"
+
+
+def test_s31_states_carry_the_frames_own_times():
+    times = (0.1, 1.0 / 3.0, 24.0 * 7 / 30)
+    states = refiner(times).refine([frame_of(still(time), time) for time in times])
+    assert tuple(state.time for state in states) == times
+
+
+def test_s29_rigid_motion_carries_the_answer_along():
+    """Without weight a turned cage gives the turned answer, warm as well as cold."""
+    turn = rotation(2)
+    options = {"steps": 40, "gravity": np.zeros(3)}
+    one = refiner((1.0, 2.0), temporal="warm", **options)
+    first = one.solve(frame_of(still(0.0), 1.0)).points[0]
+    second = one.solve(frame_of(still(0.0) @ turn.T + [0.2, 0.0, 0.1], 2.0))
+    if second.telemetry[0]["start"] == "warm":
+        assert rms((second.points[0] - [0.2, 0.0, 0.1]) @ turn - first) < 1e-3 * EDGE

@@ -1,0 +1,82 @@
+"""S34, S35, S36: the same bytes each time, equal frames kept, and no drift when a stage is put on its own output."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from cloth import DOWN, FABRIC, GUIDE, frame_of, group_of, refiner_of, rms, sheet, solved, total, wave
+from sheets import garment_of
+
+from physgraph_usd.scene import Frame, GarmentFrame
+
+MESH, REST = sheet(8, 6)
+TIMES = tuple(float(time) for time in range(1, 9))
+
+
+def shot() -> list[Frame]:
+    return [frame_of(wave(REST, squeeze=0.02 * time, phase=0.2 * time), time) for time in TIMES]
+
+
+def test_s34_five_runs_give_the_same_bytes():
+    runs = {solved(MESH, REST, wave(REST), level=2, dtype=torch.float32).points[0].tobytes() for _ in range(5)}
+    assert len(runs) == 1
+
+
+def test_s34_a_refiner_that_has_solved_other_frames_gives_the_same_bytes():
+    """Buffers are reused from frame to frame; nothing may leak through them."""
+    fresh = solved(MESH, REST, wave(REST), level=2, dtype=torch.float32).points[0]
+    used = refiner_of([garment_of(MESH, REST)], level=2, dtype=torch.float32)
+    for frame in shot()[:3]:
+        used.solve(frame)
+    used.forget()
+    assert used.solve(frame_of(wave(REST))).points[0].tobytes() == fresh.tobytes()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_s34_shuffled_frames_are_the_sequential_ones_with_temporal_off(seed: int):
+    def refined(frames: list[Frame]) -> dict[float | None, bytes]:
+        refiner = refiner_of([garment_of(MESH, REST)], level=1, times=TIMES, dtype=torch.float32, temporal="off")
+        return {state.time: state.points[0].tobytes() for state in refiner.refine(frames)}
+
+    frames = shot()
+    order = np.random.default_rng(seed).permutation(len(frames))
+    assert refined([frames[i] for i in order]) == refined(frames)
+
+
+def test_s34_the_test_sees_history_where_there_is_one():
+    def refined(frames: list[Frame]) -> dict[float | None, bytes]:
+        refiner = refiner_of([garment_of(MESH, REST)], level=1, times=TIMES, dtype=torch.float32)
+        return {state.time: state.points[0].tobytes() for state in refiner.refine(frames)}
+
+    assert refined(shot()[::-1]) != refined(shot())
+
+
+@pytest.mark.parametrize("temporal", ["tether", "warm", "off"])
+def test_s35_a_hundred_equal_frames_are_one(temporal: str):
+    refiner = refiner_of([garment_of(MESH, REST)], level=1, dtype=torch.float32, temporal=temporal)
+    states = list(refiner.refine(frame_of(wave(REST), float(time)) for time in range(100)))
+    assert len({state.points[0].tobytes() for state in states}) == 1
+    assert [state.reused for state in states] == [(False,)] + [(True,)] * 99
+    assert all("reused" in str(state.telemetry[0]["start"]) for state in states[1:])
+
+
+@pytest.mark.parametrize("temporal", ["tether", "warm"])
+@pytest.mark.parametrize("steps", [4, 12])
+def test_s36_ten_passes_over_its_own_output_do_not_drift(temporal: str, steps: int):
+    group = group_of(MESH, REST, level=2, temporal=temporal, steps=steps, tolerance=0.0)
+    frame = GarmentFrame(wave(REST), FABRIC, GUIDE)
+    kept, outputs, energies = None, [], []
+    for _ in range(11):
+        points, kept, telemetry = group.solve([frame], kept, at=None)
+        outputs.append(points[0])
+        energies.append(total(telemetry, "output"))
+    changes = [rms(after - before) / (0.05 / 4) for before, after in pairwise(outputs)]
+    assert all(after <= before + 1e-9 * abs(before) for before, after in pairwise(energies)), energies
+    assert changes[-1] < 0.5 * changes[0], changes
+    assert max(changes[5:]) <= max(changes[:5]), changes
+    assert total(telemetry, "output") <= total(telemetry, "input")
+    assert np.isfinite(outputs[-1]).all()
+    assert DOWN[1] < 0
