@@ -23,9 +23,9 @@ from physgraph_usd.integrate.newton import Newton
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.level import Level
+from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
-from physgraph_usd.options import RefineOptions
 from physgraph_usd.shot import prepare_device, refine_shot
 from physgraph_usd.usd.reader import open_shot
 

@@ -27,8 +27,10 @@ from .usd.provenance import file_hashes, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
 
+DEFAULTS = RefineOptions()
 
-def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = RefineOptions()) -> RefineReport:
+
+def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFAULTS) -> RefineReport:
     """Refine a shot's garments into a new layer.
 
     Args:
@@ -103,7 +105,8 @@ def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
         given: Options of `RefineOptions` that concern reading.
 
     Returns:
-        Plain values. Where the shot cannot be refined as asked, ``problem`` says why and ``meshes`` lists what there is.
+        Plain values. Where the shot cannot be refined as asked, ``problem`` says why and ``meshes`` lists what is
+        there.
 
     Raises:
         StageError: The file cannot be opened at all.
