@@ -22,6 +22,10 @@ SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
 EDGES_PER_WAVE = 5.0
 FEWEST_EDGES_PER_WAVE = 4.0
+LEAST_TENSION = 1e-9
+"""[N/m]; cloth without stiffness does not buckle."""
+SHORTEST_WAVE = 1e-3
+"""In cage edges; cloth that does not resist bending has no shortest wave."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +73,9 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     rest = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
     strain, edge = _compression(rest, ends, frames), float(rest.mean())
     fabric = frames[0].fabric
-    wave = 2.0 * math.pi * math.sqrt(fabric.bend / (fabric.stretch * strain))
+    wave = 2.0 * math.pi * math.sqrt(fabric.bend / max(fabric.stretch * strain, LEAST_TENSION))
     said = f"wrinkles of {1e3 * wave:.1f} mm (compression {strain:.2g}), cage edges of {1e3 * edge:.1f} mm"
-    needed = max(math.ceil(math.log2(max(edge * EDGES_PER_WAVE / wave, 1.0))), 0)
+    needed = math.ceil(math.log2(max(edge * EDGES_PER_WAVE / max(wave, SHORTEST_WAVE * edge), 1.0)))
     level, reason = garment.level, "as authored or asked for"
     if level == AUTO:
         level = min(needed, MOST)
