@@ -1,0 +1,91 @@
+"""How many subdivisions a garment gets: by the formula for its buckling wavelength."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cloth import DOWN, FABRIC, frame_of, sheet
+from meshes import mesh_of
+from sheets import garment_of
+
+from physgraph_usd.fabric import Fabric
+from physgraph_usd.levels import AUTO, EDGES_PER_WAVE, LEAST_STRAIN, MOST, LevelChoice, choose_levels
+from physgraph_usd.scene import Frame, Scene
+
+EDGE = 0.05
+MESH, REST = sheet(6, 4, EDGE)
+
+
+def choose(
+    squeeze: float, *, level: int = AUTO, fabric: Fabric = FABRIC, times: tuple[float, ...] = (), edge: float = EDGE
+) -> tuple[LevelChoice, list[float | None]]:
+    """The choice for a sheet squeezed evenly, and the times that were read."""
+    rest = REST * edge / EDGE
+    read: list[float | None] = []
+
+    def frame_at(time: float | None) -> Frame:
+        read.append(time)
+        return frame_of((1.0 - squeeze) * rest, time, fabric=fabric)
+
+    scene = Scene((replace(garment_of(MESH, rest), level=level),), DOWN, times)
+    return choose_levels(scene, frame_at)[0], read
+
+
+@pytest.mark.parametrize("squeeze", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize("bend", [1e-6, 4.7e-6, 1e-4])
+def test_a_fifth_of_a_wave_decides(squeeze: float, bend: float):
+    choice, _ = choose(squeeze, fabric=replace(FABRIC, bend=bend))
+    wave = 2 * math.pi * math.sqrt(bend / (FABRIC.stretch * squeeze))
+    mean = EDGE * (6 * 5 + 7 * 4 + 24 * math.sqrt(2)) / (6 * 5 + 7 * 4 + 24)
+    assert choice.wavelength == pytest.approx(wave)
+    assert choice.edge == pytest.approx(mean / 2**choice.level)
+    assert choice.level == MOST or choice.edge <= wave / EDGES_PER_WAVE
+    assert choice.level == 0 or 2 * choice.edge > wave / EDGES_PER_WAVE
+
+
+def test_stiffer_and_finer_cages_need_fewer_levels():
+    levels = [choose(0.1, fabric=replace(FABRIC, bend=bend))[0].level for bend in (1e-2, 4e-4, 1e-4, 2.5e-5)]
+    assert levels == [0, levels[1], levels[1] + 1, levels[1] + 2]
+    halves = [choose(0.1, fabric=replace(FABRIC, bend=2.5e-5), edge=EDGE / n)[0].level for n in (1, 2, 4)]
+    assert halves == [levels[3], levels[3] - 1, levels[3] - 2]
+
+
+def test_cloth_that_is_not_compressed_counts_as_one_per_cent():
+    assert choose(-0.2)[0].wavelength == pytest.approx(choose(LEAST_STRAIN)[0].wavelength)
+
+
+def test_no_more_than_the_most():
+    choice, _ = choose(0.3, fabric=replace(FABRIC, bend=1e-9))
+    assert choice.level == MOST
+    assert "is the most" in choice.reason
+
+
+def test_a_level_that_was_asked_for_is_kept_with_a_word_when_it_is_too_coarse():
+    choice, _ = choose(0.3, level=1, fabric=replace(FABRIC, bend=1e-7))
+    assert choice.level == 1
+    assert choice.reason == "as authored or asked for"
+    assert "too coarse" in choice.warning
+    assert not choose(0.3, level=1, fabric=replace(FABRIC, bend=1e-2))[0].warning
+
+
+def test_few_frames_are_read_first_and_last_among_them():
+    _, read = choose(0.1, times=tuple(float(t) for t in range(1001, 1101)))
+    assert len(read) <= 5
+    assert (read[0], read[-1]) == (1001.0, 1100.0)
+    assert choose(0.1)[1] == [None]
+
+
+@pytest.mark.parametrize("level", [AUTO, 0, 2])
+def test_a_garment_without_faces(level: int):
+    scene = Scene((replace(garment_of(mesh_of([], 3), np.zeros((3, 3))), level=level),), DOWN, ())
+    choice = choose_levels(scene, lambda time: frame_of(np.zeros((3, 3)), time))[0]
+    assert choice.level == max(level, 0)
+
+
+@pytest.mark.parametrize(("stretch", "bend"), [(30.0, 0.0), (0.0, 4.7e-6), (0.0, 0.0)])
+def test_fabrics_without_stiffness(stretch: float, bend: float):
+    choice, _ = choose(0.1, fabric=Fabric(stretch, bend))
+    assert 0 <= choice.level <= MOST

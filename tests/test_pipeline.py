@@ -1,0 +1,205 @@
+"""Frames in, states out: what is reused, what starts warm, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cloth import DOWN, FABRIC, base_of, frame_of, refiner_of, rms, settings_of, sheet, solved, total, wave
+from sheets import garment_of
+
+from physgraph_usd.errors import SolveError
+from physgraph_usd.fabric import Fabric
+from physgraph_usd.mesh.subdivide import smooth
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.scene import Frame, GarmentFrame, Scene
+
+EDGE = 0.05
+MESH, REST = sheet(6, 4, EDGE)
+OTHER, OTHER_REST = sheet(3, 5, EDGE, kind="quads")
+
+
+def refiner(**options: object) -> Refiner:
+    return refiner_of([garment_of(MESH, REST)], dtype=torch.float32, **options)
+
+
+def pair(first: np.ndarray, second: np.ndarray, time: float | None = None) -> Frame:
+    return Frame(time, (GarmentFrame(first, FABRIC), GarmentFrame(second, FABRIC)))
+
+
+def starts(states: list) -> list[str]:
+    return [str(state.telemetry[0]["start"]).partition(":")[0] for state in states]
+
+
+@pytest.mark.parametrize("integrator", ["quasi-newton", "quasi-newton-flat", "lbfgs", "newton", "adam", "gd"])
+@pytest.mark.parametrize("potential", ["continuum", "paper"])
+def test_every_method_lowers_the_energy(integrator: str, potential: str):
+    state = solved(MESH, REST, wave(REST), integrator=integrator, potential=potential, level=1)
+    assert total(state.telemetry[0], "output") < total(state.telemetry[0], "input")
+    assert state.points[0].shape == base_of(MESH, REST, 1).shape
+
+
+def test_levels_report_what_they_did():
+    telemetry = solved(MESH, REST, wave(REST), level=2).telemetry[0]
+    levels = telemetry["levels"]
+    assert [entry["level"] for entry in levels] == [0, 1, 2]
+    assert [entry["vertices"] for entry in levels] == [len(base_of(MESH, REST, level)) for level in (0, 1, 2)]
+    assert all(entry["stopped"] in {"tolerance", "steps", "stalled"} for entry in levels)
+    assert set(telemetry["energy_joules"]["output"]) == {"stretch", "bending", "gravity", "guide"}
+    assert telemetry["strain"]["p50"] <= telemetry["strain"]["p99"] <= telemetry["strain"]["max"]
+
+
+def test_a_budget_of_nothing_returns_the_linear_placement_and_says_so():
+    state = solved(MESH, REST, wave(REST, height=0.05, squeeze=0), level=1, budget_ms=1e-6)
+    assert state.telemetry[0]["levels"][-1]["stopped"] == "budget"
+    assert state.telemetry[0]["levels"][-1]["steps"] == 0
+
+
+def test_no_steps_is_the_linear_placement():
+    stretched = wave(REST, squeeze=-0.05, height=0.0)
+    out = solved(MESH, REST, stretched, level=2, steps=0).points[0]
+    assert np.allclose(out, base_of(MESH, stretched, 2), rtol=0, atol=1e-12)
+
+
+def test_level_zero_solves_the_cage():
+    state = solved(MESH, REST, wave(REST), level=0)
+    assert state.points[0].shape == REST.shape
+    assert total(state.telemetry[0], "output") < total(state.telemetry[0], "input")
+
+
+class TestReuse:
+    @pytest.mark.parametrize("temporal", ["tether", "warm", "off"])
+    def test_equal_frames_are_reused_bitwise(self, temporal: str):
+        one = refiner(temporal=temporal)
+        first = one.solve(frame_of(wave(REST), 1.0))
+        second = one.solve(frame_of(wave(REST).copy(), 2.0))
+        assert second.points[0].tobytes() == first.points[0].tobytes()
+        assert (first.reused, second.reused) == ((False,), (True,))
+        assert second.time == 2.0
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"points": wave(REST) + 1e-12},
+            {"fabric": replace(FABRIC, bend=5e-6)},
+            {"guide": 2001.0},
+            {"detail": 0.5},
+        ],
+    )
+    def test_anything_that_differs_is_solved_anew(self, change: dict[str, object]):
+        one = refiner()
+        one.solve(frame_of(wave(REST), 1.0))
+        other = Frame(2.0, (replace(frame_of(wave(REST)).garments[0], **change),))
+        assert one.solve(other).reused == (False,)
+
+    def test_each_garment_by_itself(self):
+        two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
+        two.solve(pair(wave(REST), wave(OTHER_REST), 1.0))
+        assert two.solve(pair(wave(REST), wave(OTHER_REST, phase=1.0), 2.0)).reused == (True, False)
+
+    def test_a_still_frame_does_not_lose_the_detail_of_the_next(self):
+        states = list(refiner().refine(frame_of(wave(REST, phase=p), float(t)) for t, p in enumerate([0, 0, 0.1])))
+        assert starts(states) == ["cold", "reused", "warm"]
+
+
+class TestTime:
+    def test_warm_starts_take_fewer_steps(self):
+        one = refiner(temporal="warm", level=2)
+        states = [one.solve(frame_of(wave(REST, phase=0.01 * t), float(t))) for t in range(4)]
+        made = [sum(entry["steps"] for entry in state.telemetry[0]["levels"]) for state in states]
+        assert starts(states) == ["cold", "warm", "warm", "warm"]
+        assert max(made[1:]) < made[0]
+
+    def test_tether_holds_detail_more_than_warm_starts_do(self):
+        """A material change that would move the folds moves them less under the tether."""
+
+        def jump(temporal: str) -> float:
+            one = refiner(temporal=temporal, level=1, steps=60)
+            before = one.solve(frame_of(wave(REST), 1.0)).points[0]
+            soft = frame_of(wave(REST) + 1e-9, 2.0, fabric=replace(FABRIC, bend=1e-4))
+            return rms(one.solve(soft).points[0] - before)
+
+        assert jump("tether") < jump("warm")
+
+    def test_off_is_cold_each_time(self):
+        states = list(refiner(temporal="off").refine(frame_of(wave(REST, phase=0.1 * t), float(t)) for t in range(3)))
+        assert starts(states) == ["cold"] * 3
+
+    def test_forget(self):
+        one = refiner()
+        first = one.solve(frame_of(wave(REST), 1.0))
+        one.solve(frame_of(wave(REST, phase=0.1), 2.0))
+        one.forget()
+        again = one.solve(frame_of(wave(REST), 3.0))
+        assert starts([again]) == ["cold"]
+        assert again.points[0].tobytes() == first.points[0].tobytes()
+
+    def test_a_teleport_resets_one_garment_and_not_the_other(self):
+        two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
+        two.solve(pair(wave(REST), wave(OTHER_REST), 1.0))
+        state = two.solve(pair(wave(REST) + 40 * EDGE, wave(OTHER_REST, phase=0.1), 2.0))
+        assert str(state.telemetry[0]["start"]).startswith("cold: the cage moved")
+        assert state.telemetry[1]["start"] == "warm"
+
+
+class TestGain:
+    def test_none_is_the_smooth_surface_and_two_is_twice_the_detail(self):
+        points = wave(REST)
+        surface = smooth(MESH, refiner(level=1).refinements[0][0]) @ points
+
+        def solve(detail: float) -> np.ndarray:
+            frame = Frame(None, (GarmentFrame(points, FABRIC, 2000.0, detail),))
+            return refiner_of([garment_of(MESH, REST)], level=1).solve(frame).points[0]
+
+        assert np.allclose(solve(0.0), surface, rtol=0, atol=1e-9)
+        assert np.allclose(solve(2.0) - surface, 2 * (solve(1.0) - surface), rtol=0, atol=1e-9)
+
+    def test_gain_is_not_fed_back_into_the_next_frame(self):
+        def second(gain: float) -> np.ndarray:
+            one = refiner_of([garment_of(MESH, REST)], level=1)
+            one.solve(Frame(1.0, (GarmentFrame(wave(REST), FABRIC, 2000.0, gain),)))
+            return one.solve(frame_of(wave(REST, phase=0.1), 2.0)).points[0]
+
+        assert np.array_equal(second(1.0), second(3.0))
+
+
+class TestNotFinite:
+    def test_the_error_names_prim_time_and_term(self):
+        with pytest.raises(SolveError, match=r"</World/Sheet> at time code 7: .*not finite.*stretch"):
+            refiner().solve(frame_of(1e30 * wave(REST), 7.0))
+
+    def test_the_next_frame_can_be_solved(self):
+        one = refiner()
+        with pytest.raises(SolveError):
+            one.solve(frame_of(1e30 * wave(REST), 1.0))
+        one.forget()
+        fresh = refiner().solve(frame_of(wave(REST), 2.0))
+        assert one.solve(frame_of(wave(REST), 2.0)).points[0].tobytes() == fresh.points[0].tobytes()
+
+
+def test_animated_stiffness_rebuilds_the_metric_and_returns_to_the_same_bytes():
+    one = refiner(temporal="off")
+    stiff = Fabric(3000.0, 4.7e-4, 0.187)
+    first = one.solve(frame_of(wave(REST), 1.0))
+    other = one.solve(frame_of(wave(REST), 2.0, fabric=stiff))
+    again = one.solve(frame_of(wave(REST), 3.0))
+    assert (
+        other.points[0].tobytes()
+        == solved(MESH, REST, wave(REST), fabric=stiff, dtype=torch.float32).points[0].tobytes()
+    )
+    assert again.points[0].tobytes() == first.points[0].tobytes()
+
+
+def test_garments_do_not_feel_one_another():
+    two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
+    state = two.solve(pair(wave(REST), wave(OTHER_REST)))
+    assert state.points[0].tobytes() == solved(MESH, REST, wave(REST)).points[0].tobytes()
+    assert state.points[1].tobytes() == solved(OTHER, OTHER_REST, wave(OTHER_REST)).points[0].tobytes()
+
+
+def test_garments_levels_may_be_given_or_their_own():
+    scene = Scene((replace(garment_of(MESH, REST), level=2),), DOWN, ())
+    assert len(Refiner(scene, settings_of()).refinements[0]) == 2
+    assert len(Refiner(scene, settings_of(), levels=[1]).refinements[0]) == 1
