@@ -1,0 +1,67 @@
+"""Small shots to refine end to end, and what can be read back from the layers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from layers import errors, open_over, world_metres
+from pxr import Sdf
+from stages import add_sheet, new_stage, save, vec3
+
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.report import RefineReport
+from physgraph_usd.shot import refine_shot
+
+CLOTH = "/World/cloth"
+EDGE = 0.05
+TIMES = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+FAST = {"level": 1, "steps": 6}
+
+
+def cloth_shot(
+    path: Path,
+    *,
+    times: Sequence[float] = TIMES,
+    size: tuple[int, int] = (6, 4),
+    kind: str = "quads",
+    frozen: bool = False,
+    broken: dict[float, float] | None = None,
+) -> Path:
+    """A waving sheet of 5 cm squares; ``frozen`` makes its samples equal, ``broken`` scales those of some times."""
+    stage = new_stage(path, metres=EDGE)
+    mesh = add_sheet(stage, CLOTH, times=times, size=size, kind=kind)
+    attribute = mesh.GetPointsAttr()
+    for time in times:
+        points = np.asarray(attribute.Get(times[0] if frozen else time))
+        attribute.Set(vec3(points * (broken or {}).get(time, 1.0)), time)
+    return Path(save(stage))
+
+
+def refine(shot: Path, out: Path, **options: object) -> RefineReport:
+    """Refine fast and small."""
+    return refine_shot(shot, out, RefineOptions(**FAST | options))  # type: ignore[arg-type]
+
+
+def sample_times(layer: Path, prim: str = CLOTH) -> tuple[float, ...]:
+    """Time codes of a layer's points."""
+    return tuple(Sdf.Layer.FindOrOpen(str(layer)).ListTimeSamplesForPath(f"{prim}.points"))
+
+
+def fine(shot: Path, layer: Path, time: float | None, prim: str = CLOTH) -> np.ndarray:
+    """World points [m] of a refined mesh at a time code."""
+    return world_metres(open_over(shot, layer), prim, time)
+
+
+def faults(layer: Path, shot: Path) -> list[str]:
+    """Errors that the validator finds."""
+    return errors(layer, shot)
+
+
+def command(*args: object, **options: object) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own."""
+    line = [sys.executable, "-m", "physgraph_usd", *map(str, args)]
+    return subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, **options)  # type: ignore[call-overload]
