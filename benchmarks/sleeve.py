@@ -56,7 +56,7 @@ def main() -> None:
         frame_table(shot_path, Path(folder))
 
 
-def descend(group: Group, frame, steps, integrator=None) -> tuple[float, float, torch.Tensor]:
+def descend(group: Group, frame, steps) -> tuple[float, float, torch.Tensor]:
     """Solve a frame through all levels; returns its energy [J], seconds and positions."""
     systems, coarse = group.systems(frame)
     began = time.perf_counter()
@@ -64,7 +64,7 @@ def descend(group: Group, frame, steps, integrator=None) -> tuple[float, float, 
     energy = 0.0
     for level, system, count in zip(group.levels, systems, steps, strict=True):
         x = x if level.from_below is None else level.from_below.apply(x)
-        x, report = solve_level(system, integrator or QuasiNewton(), x, level=level.index, budget=Budget(count))
+        x, report = solve_level(system, QuasiNewton(), x, level=level.index, budget=Budget(count))
         energy = report.energy_after
     return energy, time.perf_counter() - began, x
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -65,6 +65,7 @@ class Level:
         from_coarse: Linear map from the cage, shape (V, C).
         smooth_from_coarse: Smooth map from the cage, shape (V, C).
         from_below: Linear map from the level below, None at the first level.
+        lanes: Most threads that a kernel over the level uses on the CPU.
     """
 
     index: int
@@ -95,6 +96,7 @@ class Level:
     from_coarse: sp.csr_matrix
     smooth_from_coarse: sp.csr_matrix
     from_below: Stencil | None
+    lanes: int = 1
 
     @property
     def dtype(self) -> torch.dtype:
@@ -119,12 +121,12 @@ class Level:
     @cached_property
     def base(self) -> Stencil:
         """Linear map from cage positions to this level."""
-        return Stencil(self.from_coarse, dtype=self.dtype, device=self.device)
+        return Stencil(self.from_coarse, dtype=self.dtype, device=self.device, lanes=self.lanes)
 
     @cached_property
     def smooth_base(self) -> Stencil:
         """Smooth map from cage positions to this level."""
-        return Stencil(self.smooth_from_coarse, dtype=self.dtype, device=self.device)
+        return Stencil(self.smooth_from_coarse, dtype=self.dtype, device=self.device, lanes=self.lanes)
 
 
 def refine_garments(garments: Sequence[Garment], levels: Sequence[int]) -> list[tuple[Refinement, ...]]:
@@ -146,6 +148,7 @@ def build_levels(
     *,
     dtype: torch.dtype = torch.float32,
     device: str = "cpu",
+    lanes: int = 1,
 ) -> tuple[Level, ...]:
     """Build every level of garments that are solved together, the cage itself first.
 
@@ -156,6 +159,7 @@ def build_levels(
         refinements: Their refinements, as `refine_garments` gives them.
         dtype: Scalar type of the tensors.
         device: Their device.
+        lanes: Most threads that a kernel uses on the CPU.
 
     Returns:
         Levels, coarsest first.
@@ -170,8 +174,9 @@ def build_levels(
                 chain[index - 1].linear if index <= len(chain) else sp.identity(part.vertex_count, format="csr")
                 for chain, part in zip(refinements, parts, strict=True)
             ]
-            below = Stencil(sp.csr_matrix(sp.block_diag(maps)), dtype=dtype, device=device)
-        levels.append(_join(index, parts, below, dtype=dtype, device=device))
+            below = Stencil(sp.csr_matrix(sp.block_diag(maps)), dtype=dtype, device=device, lanes=lanes)
+        level = _join(index, parts, below, dtype=dtype, device=device)
+        levels.append(replace(level, lanes=lanes))
     return tuple(levels)
 
 

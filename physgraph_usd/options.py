@@ -14,6 +14,7 @@ from .integrate import method_named
 
 TEMPORAL = ("tether", "warm", "off")
 POTENTIALS = ("continuum", "paper")
+MODES = ("over", "sibling")
 _NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
 
 
@@ -93,6 +94,7 @@ class RefineOptions:
         for name, value, known in (
             ("temporal", self.temporal, TEMPORAL),
             ("potential", self.potential, POTENTIALS),
+            ("mode", self.mode, MODES),
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")
@@ -102,3 +104,6 @@ class RefineOptions:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
+        for file in (self.report, self.root):
+            if file is not None and not (self.overwrite or self.dry_run) and Path(file).exists():
+                raise UsageError(f"{file} exists; choose another name or allow overwriting")

@@ -43,6 +43,7 @@ class Refiner:
         levels: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
+        lanes: int = 1,
     ) -> None:
         """Subdivide the garments and prepare their levels.
 
@@ -52,6 +53,7 @@ class Refiner:
             levels: Subdivisions of each garment; the garments' own when None.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
+            lanes: Most threads that a kernel uses on the CPU; the result does not depend on it.
 
         Raises:
             GarmentError: A rest shape cannot be solved on.
@@ -63,7 +65,7 @@ class Refiner:
         self._settings = settings
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
         self._groups = [
-            Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device)
+            Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device, lanes=lanes)
             for garment, chain in zip(scene.garments, self.refinements, strict=True)
         ]
         self._last: list[_Known | None] = [None] * len(self._groups)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
+import os
 import resource
 import sys
 import time as clock
@@ -27,6 +28,8 @@ from .usd.provenance import file_hashes, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
 
+MOST_LANES = 4
+"""Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
 DEFAULTS = RefineOptions()
 
 
@@ -148,6 +151,7 @@ class _ShotSolver:
     def __init__(self, shot: str, levels: list[int], options: RefineOptions) -> None:
         self.levels = levels
         self._shot, self._options = shot, dataclasses.replace(options, progress=None)
+        self._lanes = min(MOST_LANES, max(1, (os.cpu_count() or 1) // options.workers))
         self._opened: Shot | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -164,7 +168,7 @@ class _ShotSolver:
         prepare_device(device)
         shot = self._opened or _open(self._shot, self._options)
         settings = self._options.solve_settings()
-        refiner = Refiner(shot.scene, settings, levels=self.levels, dtype=torch.float32, device=device)
+        refiner = Refiner(shot.scene, settings, levels=self.levels, device=device, lanes=self._lanes)
         for time in times:
             began = clock.perf_counter()
             try:

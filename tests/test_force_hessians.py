@@ -216,15 +216,18 @@ def test_guide_is_at_rest_on_the_cage_and_blind_to_wrinkles():
     count = level.from_coarse.shape[1]
     coarse = torch.randn((count, 3), dtype=torch.float64)
     guide = Guide(level, guide_map, torch.full((count,), 100.0)).retarget(coarse)
-    average = guide_map.average
-    x = torch.as_tensor(np.linalg.lstsq(average._matrix.toarray(), coarse.numpy(), rcond=None)[0])
-    pinned = level.pin > 0
+    x = level.base.apply(coarse)
     energy, f = evaluate(guide, x)
-    stray = x - level.base.apply(coarse)
-    assert not f[~pinned].abs().max() > 1e-9
-    wrinkle = torch.as_tensor(null_vector(average._matrix.toarray(), pinned.numpy()))[:, None] * torch.ones(3)
-    assert evaluate(guide, x + wrinkle)[0] == pytest.approx(energy, rel=1e-9)
-    assert energy == pytest.approx(0.5 * 10 * float((soft(level, 100.0)[:, None] * stray**2).sum()), rel=1e-9)
+    assert float(energy) == 0.0
+    assert not f.any()
+    matrix = guide_map.spread_matrix.T.toarray()
+    wrinkle = torch.as_tensor(null_vector(matrix, (level.pin > 0).numpy()))[:, None] * torch.ones(3)
+    assert float(evaluate(guide, x + wrinkle)[0]) == pytest.approx(0.0, abs=1e-12)
+    off = torch.randn_like(x)
+    lag = guide_map.average.apply(off)
+    area = torch.as_tensor(guide_map.coarse_area)[:, None]
+    expected = 0.5 * 100.0 * (area * lag**2).sum() + 0.5 * 10 * (soft(level, 100.0)[:, None] * off**2).sum()
+    assert float(evaluate(guide, x + off)[0]) == pytest.approx(float(expected), rel=1e-9)
 
 
 def soft(level: Level, stiffness: float) -> Tensor:

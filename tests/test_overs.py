@@ -89,14 +89,15 @@ def test_a_material_bound_by_collection_reaches_the_sibling(tmp_path: Path) -> N
 
 
 def test_a_sibling_that_is_there_already_is_not_written_over(tmp_path: Path) -> None:
-    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    path = tmp_path / "shot.usda"
     make_shot(path)
-    write_layer(path, out, mode="sibling")
-    root = write_root(tmp_path / "root.usda", layer=out, shot=path)
-    shot = open_shot(str(root), level=1, garments=[COAT])
+    stage = Usd.Stage.Open(str(path))
+    stage.DefinePrim(f"{COAT}_refined", "Mesh")
+    stage.GetRootLayer().Save()
+    shot = open_shot(str(path), level=1, garments=[COAT])
     with pytest.raises(LayerError, match=r"coat_refined> is already on the stage"):
         LayerWriter(shot, refine_all(shot), tmp_path / "again.usdc", mode="sibling")
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["out.usdc", "root.usda", "shot.usda"]
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["shot.usda"]
 
 
 @pytest.mark.parametrize("mode", ["over", "sibling"])

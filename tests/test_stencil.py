@@ -13,18 +13,16 @@ from physgraph_usd.mesh.stencil import Stencil
 
 
 @given(rows=st.integers(1, 8), columns=st.integers(1, 8), density=st.floats(0, 1), seed=st.integers(0, 2**16))
-def test_apply_is_the_product_and_transposed_its_transpose(rows: int, columns: int, density: float, seed: int):
+def test_apply_is_the_product(rows: int, columns: int, density: float, seed: int):
     rng = np.random.default_rng(seed)
     matrix = sp.csr_matrix(np.where(rng.random((rows, columns)) < density, rng.normal(size=(rows, columns)), 0.0))
-    x, y = rng.normal(size=(columns, 3)), rng.normal(size=(rows, 3))
+    x = rng.normal(size=(columns, 3))
     for dtype, tolerance in ((torch.float64, 1e-13), (torch.float32, 1e-5)):
         stencil = Stencil(matrix, dtype=dtype, device="cpu")
         assert stencil.shape == (rows, columns)
         image = stencil.apply(torch.as_tensor(x, dtype=dtype))
         assert np.allclose(image.numpy(), matrix @ x, atol=tolerance)
         assert image.dtype == dtype
-        back = stencil.transposed().apply(torch.as_tensor(y, dtype=dtype))
-        assert np.allclose(back.numpy(), matrix.T @ y, atol=tolerance)
         assert torch.equal(image, stencil.apply(torch.as_tensor(x, dtype=dtype)))
 
 

@@ -4,7 +4,7 @@
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +14,8 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..level import Level
+from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 from ..mesh.topology import incidence
 
@@ -78,12 +80,13 @@ class ForceModule:
 
 @wp.kernel
 def _gather_corners(
+    first: wp.int32,
     starts: wp.array(dtype=wp.int32),
     slots: wp.array(dtype=wp.int32),
     corner_force: wp.array(dtype=Any),
     force: wp.array(dtype=Any),
 ):
-    vertex = wp.tid()
+    vertex = first + wp.tid()
     total = force[vertex]
     for k in range(starts[vertex], starts[vertex + 1]):
         total += corner_force[slots[k]]
@@ -94,6 +97,7 @@ _GATHER = {
     dtype: wp.overload(
         _gather_corners,
         [
+            wp.int32,
             wp.array(dtype=wp.int32),
             wp.array(dtype=wp.int32),
             wp.array(dtype=VECTOR[dtype]),
@@ -112,41 +116,49 @@ class Elements:
 
     Attributes:
         count: Number of elements.
-        corners: Corner vertices, Warp array of N-vectors, shape (count,).
         energy: Energy of each element [J], shape (count,).
         corner_force: Force on each corner [N], shape (count * N, 3).
     """
 
-    def __init__(self, corners: Int[Tensor, "elements corners"], vertex_count: int, *, dtype: torch.dtype) -> None:
-        """Prepare the gather tables and buffers for elements on the device of ``corners``."""
-        self.count, width = corners.shape
-        self.device = str(corners.device)
-        self._vertex_count = vertex_count
-        self._dtype = dtype
-        rows = incidence(corners.cpu().numpy(), vertex_count)
-        slots = rows.element * np.int32(width) + rows.corner
-        self._starts = wp.array(rows.starts, dtype=wp.int32, device=self.device)
-        self._slots = wp.array(slots, dtype=wp.int32, device=self.device)
-        packed = wp.types.vector(length=width, dtype=wp.int32)
-        # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
-        self._corners = corners.clone(memory_format=torch.contiguous_format)
-        self.corners = wp.from_torch(self._corners, dtype=packed)
-        self.energy = torch.zeros(self.count, dtype=dtype, device=self.device)
-        self.corner_force = torch.zeros((self.count * width, 3), dtype=dtype, device=self.device)
-        self._energy, self._corner_force = wp.from_torch(self.energy), vectors(self.corner_force)
-
-    def evaluate(
+    def __init__(
         self,
-        kernel: wp.Kernel,
-        inputs: Sequence[wp.array],
-        x: Float[Tensor, "vertices 3"],
-        force: Float[Tensor, "vertices 3"],
-    ) -> Float[Tensor, ""]:
-        """Run an element kernel and gather: adds to ``force`` and returns the energy.
+        kernels: Mapping[torch.dtype, wp.Kernel],
+        corners: Int[Tensor, "elements corners"],
+        parameters: Sequence[Float[Tensor, " elements"]],
+        *,
+        level: Level,
+    ) -> None:
+        """Prepare the launches, gather tables and buffers on the level's device.
 
         Args:
-            kernel: Called with (x, corners, *inputs, energy, corner_force).
-            inputs: The kernel's own arrays.
+            kernels: For each scalar type, a kernel of (first, x, corners, *parameters, energy, corner_force).
+            corners: Corner vertices.
+            parameters: The kernel's own arrays.
+            level: The level.
+        """
+        self.count, width = corners.shape
+        dtype, device, lanes = level.dtype, level.device, level.lanes
+        rows = incidence(corners.cpu().numpy(), level.vertex_count)
+        starts = wp.array(rows.starts, dtype=wp.int32, device=device)
+        slots = wp.array(rows.element * np.int32(width) + rows.corner, dtype=wp.int32, device=device)
+        # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
+        packed = wp.from_torch(
+            corners.clone(memory_format=torch.contiguous_format), dtype=wp.types.vector(length=width, dtype=wp.int32)
+        )
+        self.energy = torch.zeros(self.count, dtype=dtype, device=device)
+        self.corner_force = torch.zeros((self.count * width, 3), dtype=dtype, device=device)
+        x = vectors(torch.zeros_like(level.rest))
+        own = [wp.from_torch(parameter) for parameter in parameters]
+        buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
+        self._kept = (corners, parameters)
+        self._elements = Launch(kernels[dtype], self.count, [x, packed, *own, *buffers], device=device, lanes=lanes)
+        inputs = [starts, slots, buffers[1], x]
+        self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, device=device, lanes=lanes)
+
+    def evaluate(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Run the element kernel and gather: adds to ``force`` and returns the energy.
+
+        Args:
             x: Positions [m].
             force: Force [N], added to in place.
 
@@ -155,10 +167,8 @@ class Elements:
         """
         if not self.count:
             return torch.zeros((), dtype=torch.float64, device=x.device)
-        arguments = [vectors(x), self.corners, *inputs, self._energy, self._corner_force]
-        wp.launch(kernel, dim=self.count, inputs=arguments, device=self.device)
-        gather = [self._starts, self._slots, self._corner_force, vectors(force)]
-        wp.launch(_GATHER[self._dtype], dim=self._vertex_count, inputs=gather, device=self.device)
+        self._elements({0: vectors(x)})
+        self._gather({3: vectors(force)})
         return self.energy.sum(dtype=torch.float64)
 
 
@@ -166,7 +176,7 @@ def element_overloads(kernel: wp.Kernel, *, width: int, parameters: int) -> dict
     """Instantiate a generic element kernel for float32 and float64.
 
     Args:
-        kernel: Kernel of (x, corners, parameters..., energy, corner_force) with generic arrays.
+        kernel: Kernel of (first, x, corners, parameters..., energy, corner_force) with generic arrays.
         width: Corners of an element.
         parameters: Number of scalar arrays between corners and energy.
 
@@ -178,6 +188,7 @@ def element_overloads(kernel: wp.Kernel, *, width: int, parameters: int) -> dict
         dtype: wp.overload(
             kernel,
             [
+                wp.int32,
                 wp.array(dtype=VECTOR[dtype]),
                 wp.array(dtype=packed),
                 *[wp.array(dtype=SCALAR[dtype])] * parameters,

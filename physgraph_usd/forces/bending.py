@@ -40,6 +40,7 @@ PAPER_HINGE = 3.46
 
 @wp.kernel
 def _bending(
+    first: wp.int32,
     x: wp.array(dtype=Any),
     corners: wp.array(dtype=wp.vec4i),
     weight: wp.array(dtype=Any),
@@ -47,7 +48,7 @@ def _bending(
     energy: wp.array(dtype=Any),
     corner_force: wp.array(dtype=Any),
 ):
-    h = wp.tid()
+    h = first + wp.tid()
     one = weight.dtype(1.0)
     xi = x[corners[h][0]]
     axis = x[corners[h][1]] - xi
@@ -109,12 +110,11 @@ class Bending:
         else:
             self.weight = scaled * level.hinge_factor * level.hinge_shape
         self._level = level
-        self._elements = Elements(level.hinges, level.vertex_count, dtype=level.dtype)
-        self._inputs = [wp.from_torch(self.weight), wp.from_torch(level.rest_angle)]
+        self._elements = Elements(_KERNELS, level.hinges, [self.weight, level.rest_angle], level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(_KERNELS[x.dtype], self._inputs, x, force)
+        return self._elements.evaluate(x, force)
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of w (dtheta/dx)(dtheta/dx)^T at each corner [N/m]."""

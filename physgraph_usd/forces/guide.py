@@ -1,6 +1,6 @@
-"""Guide: ties the average of the fine cloth around each coarse vertex to the coarse animation.
+"""Guide: ties the average of the fine cloth around each coarse vertex to the coarse animation's own average there.
 
-    E = 1/2 sum_c k_g A_c s_c |(R x)_c - x_c|^2 + 1/2 sum_v k_g a_v p_v |x_v - (P x_c)_v|^2
+    E = 1/2 sum_c k_g A_c s_c |(R x)_c - (R P x_c)_c|^2 + 1/2 sum_v k_g a_v p_v |x_v - (P x_c)_v|^2
 
 | symbol | here | meaning |
 |---|---|---|
@@ -10,6 +10,8 @@
 | s_c | painted ``guideScale`` |
 | p_v | 10 pin / (1 - pin) | soft pins: 0 where the pin weight is 0, grows without bound towards 1 |
 
+The target is the average of the upsampled cage, not the cage vertex itself (DESIGN 4.1): at a rim and where the cage is
+curved the average lies inside the vertex, and cloth at rest would be pushed outwards (by 0.2 fine edges at a rim).
 Wrinkles whose mean is zero over a coarse vertex's neighbourhood cost nothing, so large motion stays the artist's.
 """
 
@@ -41,8 +43,10 @@ class GuideMap:
         rows = sp.diags(1.0 / np.maximum(self.coarse_area, np.finfo(float).tiny))
         matrix = sp.csr_matrix(rows @ shares)
         self.spread_matrix = sp.csr_matrix(matrix.T)
-        self.average = Stencil(matrix, dtype=level.dtype, device=level.device)
-        self.spread = self.average.transposed()
+        self.average, self.spread = (
+            Stencil(stencil, dtype=level.dtype, device=level.device, lanes=level.lanes)
+            for stencil in (matrix, self.spread_matrix)
+        )
         self.squares = sp.csr_matrix(matrix.multiply(matrix).T)
         self.shares = sp.csr_matrix(shares.T)
 
@@ -83,9 +87,8 @@ class Guide:
     def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
         """The same ties, to the coarse positions of one frame [m]."""
         guide = copy.copy(self)
-        guide._target = coarse
-        if self._has_soft_pins:
-            guide._base = self._level.base.apply(coarse)
+        guide._base = self._level.base.apply(coarse)
+        guide._target = self._map.average.apply(guide._base)
         return guide
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:

@@ -46,6 +46,7 @@ POISSON = 1.0 / 3.0
 
 @wp.kernel
 def _membrane(
+    first: wp.int32,
     x: wp.array(dtype=Any),
     corners: wp.array(dtype=wp.vec3i),
     a: wp.array(dtype=Any),
@@ -57,7 +58,7 @@ def _membrane(
     energy: wp.array(dtype=Any),
     corner_force: wp.array(dtype=Any),
 ):
-    t = wp.tid()
+    t = first + wp.tid()
     half = normal_stiffness.dtype(0.5)
     one = normal_stiffness.dtype(1.0)
     nu = one / normal_stiffness.dtype(3.0)
@@ -121,14 +122,13 @@ class Membrane:
         self.normal_stiffness = weight * youngs.to(level.rest)[owner] / (1.0 - POISSON**2)
         self.shear_stiffness = weight * shear.to(level.rest)[owner]
         self._level = level
-        self._elements = Elements(level.triangles, level.vertex_count, dtype=level.dtype)
-        self._parameters = [column.contiguous() for column in level.triangle_inverse.T]
-        self._parameters += [self.normal_stiffness, self.shear_stiffness]
-        self._inputs = [wp.from_torch(parameter) for parameter in self._parameters]
+        parameters = [column.contiguous() for column in level.triangle_inverse.T]
+        parameters += [self.normal_stiffness, self.shear_stiffness]
+        self._elements = Elements(_KERNELS, level.triangles, parameters, level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(_KERNELS[x.dtype], self._inputs, x, force)
+        return self._elements.evaluate(x, force)
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each corner's block, geometric part only where it stiffens [N/m].

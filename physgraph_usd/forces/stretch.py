@@ -37,6 +37,7 @@ PAPER_SPRING = 2.598
 
 @wp.kernel
 def _stretch(
+    first: wp.int32,
     x: wp.array(dtype=Any),
     corners: wp.array(dtype=wp.vec2i),
     stiffness: wp.array(dtype=Any),
@@ -44,7 +45,7 @@ def _stretch(
     energy: wp.array(dtype=Any),
     corner_force: wp.array(dtype=Any),
 ):
-    e = wp.tid()
+    e = first + wp.tid()
     span = x[corners[e][1]] - x[corners[e][0]]
     l0 = rest_length[e]
     length = wp.length(span)
@@ -83,12 +84,11 @@ class Stretch:
         else:
             self.stiffness = 3.0 * modulus * level.edge_factor * level.edge_area / level.rest_length**2
         self._level = level
-        self._elements = Elements(level.edges, level.vertex_count, dtype=level.dtype)
-        self._inputs = [wp.from_torch(self.stiffness), wp.from_torch(level.rest_length)]
+        self._elements = Elements(_KERNELS, level.edges, [self.stiffness, level.rest_length], level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(_KERNELS[x.dtype], self._inputs, x, force)
+        return self._elements.evaluate(x, force)
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of k (u u^T + max(0, 1 - l0/l) (I - u u^T)), summed at both ends [N/m]."""

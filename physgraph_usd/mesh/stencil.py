@@ -16,16 +16,19 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from .lanes import Launch
+
 
 @wp.kernel
 def _gather_rows(
+    first: wp.int32,
     starts: wp.array(dtype=wp.int32),
     columns: wp.array(dtype=wp.int32),
     values: wp.array(dtype=Any),
     x: wp.array(dtype=Any),
     out: wp.array(dtype=Any),
 ):
-    row = wp.tid()
+    row = first + wp.tid()
     total = x[0] * values.dtype(0.0)
     for k in range(starts[row], starts[row + 1]):
         total += values[k] * x[columns[k]]
@@ -41,6 +44,7 @@ _GATHER = {
     dtype: wp.overload(
         _gather_rows,
         [
+            wp.int32,
             wp.array(dtype=wp.int32),
             wp.array(dtype=wp.int32),
             wp.array(dtype=SCALAR[dtype]),
@@ -54,6 +58,8 @@ _GATHER = {
 
 def vectors(tensor: Tensor) -> wp.array:
     """A Warp view of a contiguous (N, 3) tensor as N vectors, without a copy."""
+    if not len(tensor):  # Empty tensors keep strides that Warp refuses.
+        return wp.empty(0, dtype=VECTOR[tensor.dtype], device=str(tensor.device))
     return wp.from_torch(tensor, dtype=VECTOR[tensor.dtype], requires_grad=False)
 
 
@@ -64,31 +70,29 @@ class Stencil:
         shape: (rows, columns).
     """
 
-    def __init__(self, matrix: sp.csr_matrix, *, dtype: torch.dtype, device: str) -> None:
+    def __init__(self, matrix: sp.csr_matrix, *, dtype: torch.dtype, device: str, lanes: int = 1) -> None:
         """Copy a scipy matrix to the device.
 
         Args:
             matrix: Any scipy sparse matrix, shape (rows, columns).
             dtype: torch.float32 or torch.float64.
             device: "cpu" or a CUDA device.
+            lanes: Most threads to use on the CPU.
         """
         csr = sp.csr_matrix(matrix)
         csr.sort_indices()
         self.shape: tuple[int, int] = (csr.shape[0], csr.shape[1])
-        self._matrix = csr
-        self._dtype, self._device = dtype, device
-        self._starts = wp.array(csr.indptr.astype(np.int32), dtype=wp.int32, device=device)
-        self._columns = wp.array(csr.indices.astype(np.int32), dtype=wp.int32, device=device)
-        self._values = wp.array(csr.data, dtype=SCALAR[dtype], device=device)
-
-    def transposed(self) -> Stencil:
-        """The transpose, on the same device."""
-        return Stencil(sp.csr_matrix(self._matrix.T), dtype=self._dtype, device=self._device)
+        self._empty = 0 in self.shape
+        starts = wp.array(csr.indptr.astype(np.int32), dtype=wp.int32, device=device)
+        columns = wp.array(csr.indices.astype(np.int32), dtype=wp.int32, device=device)
+        values = wp.array(csr.data, dtype=SCALAR[dtype], device=device)
+        x, out = (wp.zeros(count, dtype=VECTOR[dtype], device=device) for count in reversed(self.shape))
+        inputs = [starts, columns, values, x, out]
+        self._launch = Launch(_GATHER[dtype], self.shape[0], inputs, device=device, lanes=lanes)
 
     def apply(self, x: Float[Tensor, "columns 3"]) -> Float[Tensor, "rows 3"]:
         """The matrix times x."""
         out = torch.zeros((self.shape[0], 3), dtype=x.dtype, device=x.device)
-        if self.shape[0] and self.shape[1]:
-            arguments = [self._starts, self._columns, self._values, vectors(x), vectors(out)]
-            wp.launch(_GATHER[self._dtype], dim=self.shape[0], inputs=arguments, device=self._device)
+        if not self._empty:
+            self._launch({3: vectors(x), 4: vectors(out)})
         return out

@@ -14,7 +14,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 TIE = 1e-5
-"""Relative difference below which two ways to split a face count as equal: rounding must not choose, nor a rotation."""
+"""Relative difference below which two ways to split a face count as equal. Then the lowest vertex number decides, not
+rounding, the rotation of the cloth, its winding or the corner that a face starts at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +225,12 @@ def _fan_corner(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
         worst[:, first] = areas[:, :, 0].min(axis=1)
     if size != 4:
         best = worst.max(axis=1, keepdims=True)
-        return (worst >= best - TIE * np.abs(best)).argmax(axis=1)
+        tied = worst >= best - TIE * np.abs(best)
+        return np.where(tied, corners, np.iinfo(np.int32).max).argmin(axis=1)
     lengths = np.linalg.norm(shape[:, [2, 3]] - shape[:, [0, 1]], axis=2)
     inside = worst > 0
-    shorter = lengths[:, 1] < (1.0 - TIE) * lengths[:, 0]
+    tied = np.abs(lengths[:, 1] - lengths[:, 0]) < TIE * lengths[:, 0]
+    shorter = np.where(tied, corners.argmin(axis=1) % 2, lengths[:, 1] < lengths[:, 0])
     return np.where(inside[:, 0] != inside[:, 1], inside[:, 1], shorter).astype(np.int64)
 
 

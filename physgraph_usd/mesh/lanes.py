@@ -1,0 +1,59 @@
+"""Kernel launches prepared once: on the CPU in slices on several threads, on CUDA whole.
+
+Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile, so slices run side by side. Each
+item writes its own places only, so the number of lanes changes no bit of the result.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+import warp as wp
+
+LEAST_PER_LANE = 4000
+"""Items below which another lane costs more than it saves."""
+
+
+class Launch:
+    """One kernel over items 0 to size - 1; the kernel's first parameter is its slice's first item."""
+
+    def __init__(
+        self, kernel: wp.Kernel, size: int, inputs: Sequence[wp.array], *, device: str, lanes: int = 1
+    ) -> None:
+        """Prepare the launch.
+
+        Args:
+            kernel: Kernel of (first, *inputs).
+            size: Number of items.
+            inputs: The kernel's arrays; those that change are given again at each call.
+            device: "cpu" or a CUDA device.
+            lanes: Most threads to use on the CPU.
+        """
+        lanes = max(1, min(lanes, size // LEAST_PER_LANE)) if device == "cpu" else 1
+        bounds = np.linspace(0, size, lanes + 1).astype(int).tolist()
+        self._commands = [
+            wp.launch(kernel, dim=b - a, inputs=[a, *inputs], device=device, record_cmd=True)
+            for a, b in pairwise(bounds)
+            if b > a
+        ]
+
+    def __call__(self, changed: Mapping[int, wp.array]) -> None:
+        """Run with some inputs replaced, by their place in ``inputs``."""
+        for command in self._commands:
+            for place, array in changed.items():
+                command.set_param_at_index(place + 1, array)
+        others = [_pool(len(self._commands)).submit(command.launch) for command in self._commands[1:]]
+        for command in self._commands[:1]:
+            command.launch()
+        for other in others:
+            other.result()
+
+
+@functools.cache
+def _pool(lanes: int) -> ThreadPoolExecutor:
+    """Threads that wait for slices, shared by all launches of one width."""
+    return ThreadPoolExecutor(lanes - 1, thread_name_prefix="lane")
