@@ -1,0 +1,409 @@
+"""`refine_shot` end to end: options, reports, failures of single frames, and what is never written."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from pxr import Sdf, Usd, UsdGeom
+from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_times
+from stages import author
+
+from physgraph_usd.cli import main
+from physgraph_usd.errors import (
+    LayerError,
+    PhysGraphError,
+    SchemaError,
+    SolveError,
+    StageError,
+    UsageError,
+)
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.shot import inspect_shot, refine_shot
+
+BEND = "physgraph:material:bendStiffness"
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    return cloth_shot(tmp_path / "shot.usdc")
+
+
+def only(folder: Path, *names: str) -> bool:
+    return sorted(file.name for file in folder.iterdir()) == sorted(names)
+
+
+class TestDone:
+    @pytest.mark.parametrize("mode", ["over", "sibling"])
+    def test_layer_report_and_root(self, shot: Path, tmp_path: Path, mode: str):
+        out, told, root = tmp_path / "fine.usdc", tmp_path / "fine.json", tmp_path / "fine.usda"
+        report = refine(shot, out, report=told, root=root, mode=mode, velocities=True)
+        assert (report.exit_code, report.out, report.failed) == (0, out, {})
+        assert faults(out, shot) == []
+        composed = Usd.Stage.Open(str(root))
+        target = UsdGeom.Mesh(composed.GetPrimAtPath(CLOTH + ("_refined" if mode == "sibling" else "")))
+        assert len(target.GetPointsAttr().Get(1.0)) == 13 * 9
+        assert sample_times(out, str(target.GetPath())) == TIMES
+        assert json.loads(told.read_text())["exit_code"] == 0
+
+    def test_report_in_json(self, shot: Path, tmp_path: Path):
+        told = tmp_path / "fine.json"
+        report = refine(shot, tmp_path / "fine.usdc", report=told)
+        data = json.loads(told.read_text())
+        assert data == json.loads(report.to_json())
+        assert {"shot", "out", "exit_code", "options", "garments", "modelled", "left_out", "frames", "failed"} <= set(
+            data
+        )
+        assert [frame["time"] for frame in data["frames"]] == list(TIMES)
+        levels = data["frames"][0]["garments"][0]["levels"]
+        assert all(entry["energy_after"] <= entry["energy_before"] for entry in levels)
+        assert all(entry["stopped"] for entry in levels)
+        assert data["garments"][0]["path"] == CLOTH
+        assert data["garments"][0]["sources"]
+        assert data["seconds"]["total"] >= data["seconds"]["frames"] > 0
+        assert data["peak_memory_mb"] > 10
+        assert {"contact", "self contact", "network"} <= set(data["left_out"])
+        assert not (tmp_path / "fine.json.part").exists()
+
+    def test_progress_counts_up(self, shot: Path, tmp_path: Path):
+        seen: list[tuple[int, int]] = []
+        refine(shot, tmp_path / "fine.usdc", progress=lambda done, total: seen.append((done, total)))
+        assert seen == [(n, 6) for n in range(1, 7)]
+
+    def test_frames_range(self, shot: Path, tmp_path: Path):
+        refine(shot, tmp_path / "fine.usdc", frames=(2.0, 4.0))
+        assert sample_times(tmp_path / "fine.usdc") == (2.0, 3.0, 4.0)
+
+    def test_s31_a_still_garment_has_a_default_and_no_samples(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", times=())
+        out = tmp_path / "fine.usdc"
+        assert refine(shot, out).exit_code == 0
+        assert sample_times(out) == ()
+        assert fine(shot, out, None).shape == (13 * 9, 3)
+        assert faults(out, shot) == []
+
+    def test_s35_a_frozen_shot_is_written_once_and_reused(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", frozen=True, times=tuple(map(float, range(100))))
+        report = refine(shot, tmp_path / "fine.usdc")
+        points = {fine(shot, tmp_path / "fine.usdc", float(t)).tobytes() for t in range(0, 100, 9)}
+        assert len(points) == 1
+        assert all("reused" in frame["garments"][0]["start"] for frame in report.frames[1:])
+        assert len(sample_times(tmp_path / "fine.usdc")) <= 2
+
+    def test_the_shot_is_not_touched(self, shot: Path, tmp_path: Path):
+        before = shot.read_bytes()
+        refine(shot, tmp_path / "fine.usdc")
+        assert shot.read_bytes() == before
+
+    def test_pinned_points_keep_the_input_to_the_bit(self, tmp_path: Path):
+        """S17 through the whole tool: the layer repeats the shot's own float32."""
+        shot = cloth_shot(tmp_path / "shot.usdc", times=(1.0, 2.0))
+        stage = Usd.Stage.Open(str(shot))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+        count = len(mesh.GetPointsAttr().Get(1.0))
+        UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("physgraph:pin", Sdf.ValueTypeNames.FloatArray, "vertex").Set(
+            [1.0] * count
+        )
+        stage.Save()
+        refine(shot, tmp_path / "fine.usdc")
+        layer = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc"))
+        for time in (1.0, 2.0):
+            written = np.asarray(layer.QueryTimeSample(f"{CLOTH}.points", time))[:count]
+            assert np.array_equal(written, np.asarray(mesh.GetPointsAttr().Get(time)))
+
+    def test_s11_far_from_the_origin(self, tmp_path: Path):
+        """1e5 m away by a transform: the local points are those of the shot at home, to single precision."""
+        home, away = cloth_shot(tmp_path / "home.usdc", times=(1.0,)), cloth_shot(tmp_path / "away.usdc", times=(1.0,))
+        stage = Usd.Stage.Open(str(away))
+        UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World")).SetTranslate((1e5 / EDGE, -2e5 / EDGE, 3e5 / EDGE))
+        stage.Save()
+        local = []
+        for path in (home, away):
+            out = tmp_path / f"{path.stem}.fine.usdc"
+            refine(path, out)
+            local.append(np.asarray(Sdf.Layer.FindOrOpen(str(out)).QueryTimeSample(f"{CLOTH}.points", 1.0)))
+        assert np.abs(local[0] - local[1]).max() < 1e-4 * 0.5
+
+
+class TestOverrides:
+    def test_set_changes_the_cloth_and_is_recorded(self, shot: Path, tmp_path: Path):
+        plain, stiff = tmp_path / "plain.usdc", tmp_path / "stiff.usdc"
+        refine(shot, plain)
+        report = refine(shot, stiff, overrides=[f"{BEND}=1e-3"])
+        assert report.garments[0]["fabric"]["bend"] == pytest.approx(1e-3)
+        assert np.abs(fine(shot, plain, 3.0) - fine(shot, stiff, 3.0)).max() > 1e-4
+        assert any("--set" in str(source) for source in report.garments[0]["sources"].values())
+
+    def test_set_for_one_prim_is_an_authored_value(self, shot: Path, tmp_path: Path):
+        asked, authored = tmp_path / "asked.usdc", tmp_path / "authored.usdc"
+        refine(shot, asked, overrides=[f"<{CLOTH}>.{BEND}=1e-3"])
+        stage = Usd.Stage.Open(str(shot))
+        author(stage.GetPrimAtPath(CLOTH), BEND, 1e-3)
+        stage.Save()
+        refine(shot, authored)
+        assert np.array_equal(fine(shot, asked, 3.0), fine(shot, authored, 3.0))
+
+    @pytest.mark.parametrize("value", ["0", "1e-12", "1e3"])
+    def test_extreme_stiffness_gives_a_layer(self, shot: Path, tmp_path: Path, value: str):
+        report = refine(shot, tmp_path / "fine.usdc", overrides=[f"{BEND}={value}"], frames=(1.0, 2.0))
+        assert report.exit_code == 0
+        assert np.isfinite(fine(shot, tmp_path / "fine.usdc", 1.0)).all()
+
+    @pytest.mark.parametrize("level", [-1, 0, 2])
+    def test_no_bending_stiffness_at_any_level(self, shot: Path, tmp_path: Path, level: int):
+        report = refine(shot, tmp_path / "fine.usdc", overrides=[f"{BEND}=0"], frames=(1.0, 1.0), level=min(level, 1))
+        assert report.exit_code == 0
+
+    @pytest.mark.parametrize(
+        "text", ["nonsense", "bendStiffnes=1", f"{BEND}=soft", f"{BEND}=-1", f"{BEND}=nan", f"</World/No>.{BEND}=1"]
+    )
+    def test_what_cannot_be_set_is_refused(self, shot: Path, tmp_path: Path, text: str):
+        with pytest.raises((UsageError, SchemaError)):
+            refine(shot, tmp_path / "fine.usdc", overrides=[text])
+        assert only(tmp_path, "shot.usdc")
+
+
+class TestOptions:
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("integrator", "strech"),
+            ("temporal", "sometimes"),
+            ("potential", "kinetic"),
+            ("mode", "under"),
+            ("device", "tpu"),
+            ("workers", 0),
+            ("steps", -1),
+            ("tolerance", -1e-3),
+            ("tolerance", float("nan")),
+            ("budget_ms", 0.0),
+            ("budget_ms", float("nan")),
+            ("level", -2),
+            ("level", 99),
+            ("frames", (5.0, 1.0)),
+            ("frames", (float("nan"), 1.0)),
+            ("rest_frame", float("inf")),
+        ],
+    )
+    def test_every_option_is_checked_before_anything_is_written(
+        self, shot: Path, tmp_path: Path, name: str, value: object
+    ):
+        for dry_run in (False, True):
+            with pytest.raises(UsageError) as error:
+                refine(shot, tmp_path / "fine.usdc", **{name: value}, dry_run=dry_run)
+            assert str(error.value)
+        assert only(tmp_path, "shot.usdc")
+
+    @pytest.mark.parametrize("name", ["garments", "colliders"])
+    def test_prims_that_are_not_there_are_refused(self, shot: Path, tmp_path: Path, name: str):
+        with pytest.raises(StageError, match="Nowhere"):
+            refine(shot, tmp_path / "fine.usdc", **{name: ["/World/Nowhere"]})
+        assert only(tmp_path, "shot.usdc")
+
+    def test_cuda_without_a_device(self, shot: Path, tmp_path: Path):
+        import torch
+
+        if torch.cuda.is_available():
+            pytest.skip("there is a CUDA device")
+        with pytest.raises(UsageError, match="--device cpu"):
+            refine(shot, tmp_path / "fine.usdc", device="cuda")
+        assert only(tmp_path, "shot.usdc")
+
+    def test_options_that_decide_the_result_are_in_the_record(self, shot: Path, tmp_path: Path):
+        refine(shot, tmp_path / "fine.usdc", steps=3)
+        record = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc")).customLayerData["physgraph"]
+        plain = RefineOptions(level=1, steps=3).plain()
+        assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
+            "progress", "report", "overwrite", "dry_run", "workers", "root",
+        }  # fmt: skip
+        assert json.loads(json.dumps(record, default=str))
+
+    def test_an_existing_layer_is_kept_unless_told(self, shot: Path, tmp_path: Path):
+        out = tmp_path / "fine.usdc"
+        out.write_bytes(b"mine")
+        with pytest.raises(UsageError, match="exists"):
+            refine(shot, out)
+        assert out.read_bytes() == b"mine"
+        assert refine(shot, out, overwrite=True).exit_code == 0
+
+    @pytest.mark.parametrize("name", ["report", "root"])
+    def test_other_files_that_exist_are_refused_before_the_work(self, shot: Path, tmp_path: Path, name: str):
+        """Not after an hour of frames."""
+        file = tmp_path / {"report": "told.json", "root": "root.usda"}[name]
+        file.write_bytes(b"mine")
+        frames: list[int] = []
+        with pytest.raises(UsageError, match="exists"):
+            refine(shot, tmp_path / "fine.usdc", **{name: file}, progress=lambda done, _: frames.append(done))
+        assert file.read_bytes() == b"mine"
+        assert frames == []
+
+    def test_a_folder_that_is_not_there(self, shot: Path, tmp_path: Path):
+        with pytest.raises(LayerError, match="does not exist"):
+            refine(shot, tmp_path / "no" / "fine.usdc")
+
+    def test_the_shot_itself_is_never_the_output(self, shot: Path):
+        before = shot.read_bytes()
+        with pytest.raises(UsageError):
+            refine(shot, shot, overwrite=True)
+        assert shot.read_bytes() == before
+
+    def test_dry_run_writes_nothing_and_knows_everything(self, shot: Path, tmp_path: Path):
+        report = refine(
+            shot, tmp_path / "fine.usdc", dry_run=True, report=tmp_path / "a.json", root=tmp_path / "a.usda"
+        )
+        assert only(tmp_path, "shot.usdc")
+        assert (report.out, report.frames) == (None, [])
+        assert report.garments[0]["level"] == 1
+
+
+class TestFramesThatFail:
+    """Points of 1e25 m: finite in the file, not in the energy."""
+
+    def test_one_is_named_and_the_others_are_written(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        out, told = tmp_path / "fine.usdc", tmp_path / "fine.json"
+        report = refine(shot, out, report=told)
+        assert report.exit_code == 3
+        assert list(report.failed) == ["3"]
+        assert CLOTH in report.failed["3"]
+        assert "time code 3" in report.failed["3"]
+        assert sample_times(out) == (1.0, 2.0, 4.0, 5.0, 6.0)
+        assert json.loads(told.read_text())["failed"].keys() == {"3"}
+        assert faults(out, shot) == []
+
+    def test_the_frame_after_it_is_a_cold_start(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        report = refine(shot, tmp_path / "fine.usdc")
+        assert str(report.frames[3]["garments"][0]["start"]).startswith("cold")
+
+    def test_several_workers_name_the_same(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        report = refine(shot, tmp_path / "fine.usdc", workers=2)
+        assert (report.exit_code, list(report.failed)) == (3, ["3"])
+
+    def test_the_first_one(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={1.0: 1e25})
+        report = refine(shot, tmp_path / "fine.usdc", rest_frame=2.0)
+        assert (report.exit_code, list(report.failed)) == (3, ["1"])
+        assert sample_times(tmp_path / "fine.usdc") == TIMES[1:]
+
+    def test_all_of_them_leave_no_layer(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken=dict.fromkeys(TIMES, 1e25))
+        with pytest.raises(SolveError, match="time code 1"):
+            refine(shot, tmp_path / "fine.usdc")
+        assert only(tmp_path, "shot.usdc")
+
+    def test_a_frame_that_cannot_be_read_fails_alone(self, tmp_path: Path):
+        """More than a tenth of the points NaN in the middle of the shot."""
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={4.0: float("nan")})
+        report = refine(shot, tmp_path / "fine.usdc")
+        assert (report.exit_code, list(report.failed)) == (3, ["4"])
+        assert "NaN" in report.failed["4"]
+
+    def test_the_command_ends_with_3(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        line = ["refine", str(shot), "-o", str(tmp_path / "fine.usdc"), "--level", "1", "--steps", "4"]
+        result = CliRunner().invoke(main, line)
+        assert result.exit_code == 3
+        assert "time code 3" in result.stderr
+
+    def test_an_exception_nobody_foresaw_leaves_nothing(
+        self, shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        def fail(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("physgraph_usd.pipeline.Refiner.solve", fail)
+        with pytest.raises(KeyboardInterrupt):
+            refine(shot, tmp_path / "fine.usdc")
+        assert only(tmp_path, "shot.usdc")
+
+
+class TestS5:
+    @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+    def test_s5_a_broken_point_leaves_other_frames_bitwise_alone(self, tmp_path: Path, bad: float):
+        clean = cloth_shot(tmp_path / "clean.usdc")
+        dirty = cloth_shot(tmp_path / "dirty.usdc")
+        stage = Usd.Stage.Open(str(dirty))
+        attribute = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr()
+        points = np.array(attribute.Get(3.0))
+        points[11, 1] = bad
+        attribute.Set(type(attribute.Get(3.0)).FromNumpy(points), 3.0)
+        stage.Save()
+        report = refine(dirty, tmp_path / "d.usdc", temporal="off")
+        refine(clean, tmp_path / "c.usdc", temporal="off")
+        assert report.exit_code == 0
+        assert any("points[11]" in warning for warning in report.warnings)
+        for time in TIMES:
+            same = np.array_equal(fine(clean, tmp_path / "c.usdc", time), fine(dirty, tmp_path / "d.usdc", time))
+            assert same == (time != 3.0), time
+        assert np.isfinite(fine(dirty, tmp_path / "d.usdc", 3.0)).all()
+        assert np.abs(fine(clean, tmp_path / "c.usdc", 3.0) - fine(dirty, tmp_path / "d.usdc", 3.0)).max() < EDGE
+
+
+class TestBrokenShots:
+    def test_s32_topology_that_varies_is_refused_by_name_and_time(self, shot: Path, tmp_path: Path):
+        stage = Usd.Stage.Open(str(shot))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+        points = mesh.GetPointsAttr().Get(4.0)
+        mesh.GetPointsAttr().Set(points[:-1], 4.0)
+        stage.Save()
+        report = refine(shot, tmp_path / "fine.usdc")
+        assert (report.exit_code, list(report.failed)) == (3, ["4"])
+        assert CLOTH in report.failed["4"]
+        assert "from 35 to 34" in report.failed["4"]
+        assert sample_times(tmp_path / "fine.usdc") == (1.0, 2.0, 3.0, 5.0, 6.0)
+        assert faults(tmp_path / "fine.usdc", shot) == []
+
+    @pytest.mark.parametrize("text", [b"", b"not a stage", b"PXR-USDC" + bytes(200)])
+    def test_files_that_are_no_stage(self, tmp_path: Path, text: bytes):
+        path = tmp_path / "shot.usdc"
+        path.write_bytes(text)
+        with pytest.raises(PhysGraphError, match=r"shot\.usdc"):
+            refine(path, tmp_path / "fine.usdc")
+        with pytest.raises(PhysGraphError):
+            inspect_shot(path)
+        assert only(tmp_path, "shot.usdc")
+
+
+def test_inspect_lists_what_refine_would_use(shot: Path):
+    found = inspect_shot(shot, level=1)
+    assert found["times"] == list(TIMES)
+    assert found["garments"][0]["path"] == CLOTH
+    assert found["defects"] == {CLOTH: []}
+    assert json.loads(json.dumps(found, default=str))
+
+
+@pytest.mark.parametrize("name", ["swatch", "frozen"])
+def test_samples_refine(sample: Callable[[str], Path], tmp_path: Path, name: str):
+    report = refine(sample(name), tmp_path / "fine.usdc", frames=(1.0, 3.0))
+    assert report.exit_code == 0
+    assert faults(tmp_path / "fine.usdc", sample(name)) == []
+
+
+def refined_sample(sample: Callable[[str], Path], folder: Path, name: str) -> np.ndarray:
+    shot, out = sample(name), folder / f"{name}.usdc"
+    refine(shot, out, frames=(8.0, 8.0), temporal="off", level=1)
+    return fine(shot, out, 8.0, inspect_shot(shot)["garments"][0]["path"])
+
+
+@pytest.mark.parametrize("variant", ["cm", "zup", "lefthanded"])
+def test_s7_the_same_swatch_in_other_units_axes_and_handedness(
+    sample: Callable[[str], Path], tmp_path: Path, variant: str
+):
+    plain = refined_sample(sample, tmp_path, "swatch")
+    other = refined_sample(sample, tmp_path, f"swatch_{variant}")
+    if variant == "zup":
+        other = other @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    edge = 0.5 * 0.24 / 15
+    apart = np.sqrt(((plain - other) ** 2).sum(axis=1).mean()) / edge
+    assert apart < 1e-4, apart
+
+
+def test_refine_shot_takes_strings_and_defaults(shot: Path, tmp_path: Path):
+    assert refine_shot(str(shot), str(tmp_path / "fine.usda")).exit_code == 0
