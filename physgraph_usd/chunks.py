@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import shutil
 import tempfile
+import threading
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -75,7 +77,7 @@ def solve_in_chunks(
         return
     folder = Path(tempfile.mkdtemp(prefix="physgraph-"))
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(len(parts), mp_context=context)
+    pool = ProcessPoolExecutor(len(parts), mp_context=context, initializer=end_with_parent, initargs=(folder,))
     try:
         futures = [
             pool.submit(_solve_chunk, solver, list(times[max(0, a - run_up) : b]), a - max(0, a - run_up), folder, a)
@@ -87,6 +89,20 @@ def solve_in_chunks(
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def end_with_parent(folder: Path | None = None) -> None:
+    """End this worker process and remove its folder when the process that started it is gone, even if it was killed."""
+    threading.Thread(target=_outlast_parent, args=(folder,), daemon=True).start()
+
+
+def _outlast_parent(folder: Path | None) -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        os._exit(1)
 
 
 def _solve_chunk(solver: Solver, times: list[float | None], skip: int, folder: Path, first: int) -> None:

@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from . import __version__
-from .chunks import RUN_UP, Outcome, solve_in_chunks
+from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
 from .describe import begin_report, describe, describe_meshes
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .levels import choose_levels
@@ -90,7 +90,7 @@ def refine_shots(
         Per job, in order, its report or the error that ended it.
     """
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=end_with_parent) as pool:
         alone = [(s, out, dataclasses.replace(options, workers=1, progress=None)) for s, out, options in jobs]
         futures = [pool.submit(refine_shot, *job) for job in alone]
         for future in futures:
