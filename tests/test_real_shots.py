@@ -1,0 +1,135 @@
+"""Every real shot refines into a valid layer, every broken one ends with a word and never a traceback (must hold 2)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from pxr import Sdf
+from shots import faults
+
+from physgraph_usd.cli import main
+
+pytestmark = pytest.mark.real_data
+
+VALID = {
+    "01_newton_shirt_dab_cm.usdc": ["/shot/char/shirt_geo"],
+    "02_makehuman_usdskel_dm.usdc": ["/shot/char/top", "/shot/char/shorts"],
+    "06_torus_pull.usda": ["/shot/cloth"],
+    "07_flag_quads_nocollider.usda": ["/shot/flag"],
+    "08_sphere_spin_xformcollider.usdc": ["/shot/set/cloth"],
+    "09_cesiumman_kilt/shot.usda": ["/shot/kilt"],
+    "12_variants/a_lefthanded_consistent.usdc": ["/shot/shirt"],
+    "12_variants/b_winding_flipped_unflagged.usdc": ["/shot/shirt"],
+    "12_variants/c_zup_cm.usdc": ["/shot/shirt"],
+    "12_variants/d_mixed_quads_tris.usdc": ["/shot/shirt"],
+    "12_variants/e_sparse_samples.usdc": ["/shot/shirt"],
+    "12_variants/f_subframe_times_tcps48.usdc": ["/shot/shirt"],
+    "12_variants/g_nonuniform_scaled_parent.usdc": ["/shot/rig/shirt"],
+    "12_variants/h_holes_creases_normals.usdc": ["/shot/shirt"],
+    "12_variants/j_visibility_purpose.usdc": ["/shot/shirt"],
+    "12_variants/k_static_garment.usda": ["/shot/shirt"],
+}
+FIRST = {"01_newton_shirt_dab_cm.usdc": "1001:1003", "02_makehuman_usdskel_dm.usdc": "0:2"}
+STAGES = ("stages/float_units", "stages/usd_wg", "stages/usdskel")
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+def options(garments: list[str]) -> list[str]:
+    return [part for path in garments for part in ("--garment", path)]
+
+
+def refine(data: Path, name: str, folder: Path, *extra: str) -> tuple[Result, Path, dict]:
+    """Refine a shot on the command line: result, layer and report."""
+    out, report = folder / "fine.usdc", folder / "fine.json"
+    line = ["refine", data / "shots" / name, "-o", out, "--report", report, *options(VALID[name]), *extra]
+    result = run(*line)
+    return result, out, json.loads(report.read_text()) if report.exists() else {}
+
+
+def check(data: Path, name: str, refined: tuple[Result, Path, dict]) -> None:
+    result, out, report = refined
+    assert result.exit_code == 0, result.output
+    assert result.stdout.split() == [str(out)]
+    assert report["failed"] == {}
+    assert faults(out, data / "shots" / name) == []
+    for frame in report["frames"]:
+        for garment in frame["garments"]:
+            for level in garment.get("levels", []):
+                assert level["energy_after"] <= level["energy_before"]
+
+
+@pytest.mark.parametrize("name", VALID)
+def test_a_few_frames_of_a_valid_shot(real_data: Path, tmp_path: Path, name: str):
+    refined = refine(real_data, name, tmp_path, "--level", "1", "--frames", FIRST.get(name, "1:3"))
+    check(real_data, name, refined)
+    assert len(refined[2]["frames"]) >= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VALID)
+def test_all_frames_of_a_valid_shot(real_data: Path, tmp_path: Path, name: str):
+    """At the level that a user gets without asking."""
+    check(real_data, name, refine(real_data, name, tmp_path))
+
+
+def test_s5_broken_samples_are_repaired_and_told(real_data: Path, tmp_path: Path):
+    out = tmp_path / "fine.usdc"
+    shot = real_data / "shots" / "11b_nan_frame.usda"
+    result = run("refine", shot, "-o", out, "--garment", "/shot/dress", "--level", "1")
+    assert result.exit_code == 0, result.output
+    assert faults(out, shot) == []
+    assert len(Sdf.Layer.FindOrOpen(str(out)).ListTimeSamplesForPath("/shot/dress.points")) == 6
+    for time in (4, 5):
+        assert any(f"time code {time}" in line and "repaired" in line for line in result.stderr.splitlines())
+
+
+def test_s32_topology_that_varies_is_refused_by_name(real_data: Path, tmp_path: Path):
+    shot = real_data / "shots" / "12_variants" / "i_topology_varying.usda"
+    result = run("refine", shot, "-o", tmp_path / "fine.usdc", "--garment", "/shot/shirt")
+    assert result.exit_code == 1
+    assert "</shot/shirt>" in result.stderr
+    assert "topology" in result.stderr
+    assert "Traceback" not in result.output
+    assert not list(tmp_path.iterdir())
+
+
+def stages(data: Path) -> list[Path]:
+    return sorted(file for folder in STAGES for file in (data / folder).rglob("*.usd*"))
+
+
+def test_every_odd_stage_is_inspected_without_a_traceback(real_data: Path):
+    for path in stages(real_data):
+        result = run("inspect", path, "--json")
+        assert result.exception is None or isinstance(result.exception, SystemExit), (path, result.exception)
+        if result.exit_code == 0:
+            found = json.loads(result.stdout)
+            assert "garments" in found or found["problem"], path
+        else:
+            assert result.exit_code == 1, path
+            assert result.stderr.startswith("error: "), path
+
+
+def test_every_odd_stage_refines_or_says_why_not(real_data: Path, tmp_path: Path):
+    """Every mesh is taken for a garment; what cannot be refined leaves nothing."""
+    done = 0
+    for number, path in enumerate(stages(real_data)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        out = folder / "fine.usdc"
+        result = run("refine", path, "-o", out, "--garment", "/**", "--level", "1", "--steps", "2")
+        assert result.exception is None or isinstance(result.exception, SystemExit), (path, result.exception)
+        assert "Traceback" not in result.output, path
+        if result.exit_code == 0:
+            done += 1
+            assert faults(out, path) == [], path
+        else:
+            assert result.exit_code in (1, 2), (path, result.exit_code)
+            assert "error: " in result.stderr, path
+            assert not list(folder.iterdir()), path
+    assert done > 5
