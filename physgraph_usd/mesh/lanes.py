@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
+import torch
 import warp as wp
 
 LEAST_PER_LANE = 4000
@@ -34,6 +35,8 @@ class Launch:
             lanes: Most threads to use on the CPU.
         """
         lanes = max(1, min(lanes, size // LEAST_PER_LANE)) if device == "cpu" else 1
+        # On CUDA kernels queue behind torch's own work on the same stream.
+        self._stream = None if device == "cpu" else wp.stream_from_torch(torch.cuda.current_stream(device))
         bounds = np.linspace(0, size, lanes + 1).astype(int).tolist()
         self._commands = [
             wp.launch(kernel, dim=b - a, inputs=[a, *inputs], device=device, record_cmd=True)
@@ -46,6 +49,10 @@ class Launch:
         for command in self._commands:
             for place, array in changed.items():
                 command.set_param_at_index(place + 1, array)
+        if self._stream is not None:
+            for command in self._commands:
+                command.launch(stream=self._stream)
+            return
         others = [_pool(len(self._commands)).submit(command.launch) for command in self._commands[1:]]
         for command in self._commands[:1]:
             command.launch()
