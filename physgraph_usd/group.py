@@ -12,10 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .colliders.sign import signed_distances
+from .contact import ContactSettings, FrameContact, LevelContact, Touching
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
 from .forces.base import Force, ForceModule
 from .forces.bending import Bending
+from .forces.contact import Contact
 from .forces.gravity import Gravity
 from .forces.guide import Guide, GuideMap
 from .forces.membrane import in_plane_terms
@@ -27,6 +30,7 @@ from .integrate.metric import Metric, kept_to_edges
 from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
+from .measure import penetration
 from .mesh.subdivide import Refinement
 from .scene import Garment, GarmentFrame
 
@@ -47,6 +51,7 @@ class SolveSettings:
         tether: Tether stiffness [1/s^2].
         potential: "continuum" or "paper".
         reset: When a frame starts cold.
+        contact: How contact is solved.
     """
 
     method: Method
@@ -57,6 +62,7 @@ class SolveSettings:
     tether: float = 400.0
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
+    contact: ContactSettings = field(default_factory=ContactSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +120,12 @@ class Group:
         self._forces: list[_LevelForces] = []
 
     def solve(
-        self, frames: Sequence[GarmentFrame], kept: Carried | None, *, at: float | None
+        self,
+        frames: Sequence[GarmentFrame],
+        kept: Carried | None,
+        *,
+        at: float | None,
+        touching: Sequence[Touching] = (),
     ) -> tuple[list[np.ndarray], Carried, dict[str, object]]:
         """Solve one frame.
 
@@ -122,6 +133,7 @@ class Group:
             frames: The garments at this time code.
             kept: The previous frame's result, or None for a cold start.
             at: The time code, for errors.
+            touching: Surfaces that the garments may touch.
 
         Returns:
             World positions [m] of each garment, what the next frame needs, and telemetry.
@@ -135,17 +147,25 @@ class Group:
         origin = world.mean(axis=0) if len(world) else np.zeros(3)
         coarse = self._tensor(world - origin)
         predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
+        contact = self._contact(touching, coarse, origin)
         prepared = time.perf_counter()
         try:
-            x, reports, module = self._descend(forces, coarse, predicted, clock)
+            x, reports, module = self._descend(forces, coarse, predicted, clock, contact=contact)
         except SolveError as error:
             raise SolveError(self._blame(forces[-1], coarse, error, at)) from error
-        solved = time.perf_counter()
         result = self._finish(x, coarse, frames)
+        pushed = None
+        if contact is not None:
+            scaled = result is not x
+            result, pushed = contact.at(self.levels[-1], self.levels[-1]).project(result)
+            x = x if scaled else result
+        solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
         carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
+        if contact is not None:
+            telemetry["contact"] = self._measure_contact(contact, result, coarse) | {"projected": pushed}
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -219,11 +239,37 @@ class Group:
         fixed = self.levels[-1].base.apply(coarse)
         return torch.where(self.levels[-1].free, predicted, fixed), "warm"
 
+    def _contact(self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray) -> FrameContact | None:
+        """The bodies of a frame, or None when there are none."""
+        if not touching or not len(coarse):
+            return None
+        return FrameContact.begin(self.levels, touching, coarse, origin=origin, settings=self._settings.contact)
+
+    def _measure_contact(self, contact: FrameContact, x: Tensor, coarse: Tensor) -> dict[str, object]:
+        """What is in each body and what crosses it, before and after."""
+        finest = self.levels[-1]
+        base = finest.base.apply(coarse)
+        measured: dict[str, object] = {}
+        for each, shift, before in zip(contact.touching, contact.shifts, contact.distances, strict=True):
+            reach = float(finest.spacing.max())
+            after = signed_distances(each.surface, x + shift, finest.edges, reach=reach)
+            kind = "closed" if each.surface.closed else "open"
+            measured[f"{each.path} ({kind})"] = {
+                "before": asdict(penetration(each.surface, finest, base + shift, before)),
+                "after": asdict(penetration(each.surface, finest, x + shift, after)),
+            }
+        return {"bodies": measured}
+
     def _descend(
-        self, forces: list[_LevelForces], coarse: Tensor, predicted: Tensor | None, clock: float
+        self,
+        forces: list[_LevelForces],
+        coarse: Tensor,
+        predicted: Tensor | None,
+        clock: float,
+        *,
+        contact: FrameContact | None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule]:
         """Walk the levels; a warm start goes straight to the finest."""
-        integrator = self._settings.method.build()
         cold = predicted is None
         first = 0 if cold and self._settings.method.nested else len(self.levels) - 1
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
@@ -238,13 +284,43 @@ class Group:
             if predicted is not None and self._settings.temporal == "tether":
                 density = torch.stack([force.density for force in lasting.elastic if isinstance(force, Gravity)])[0]
                 terms = ForceModule((*module.forces, Tether(level, density, self._settings.tether, predicted)))
-            system = System(terms, lasting.metric, free=level.free, spacing=level.spacing)
-            if cold:
-                x = leave_saddle(system, level, x, outward=self._outward)
             budget = self._budget(index, len(self.levels), clock)
-            x, report = solve_level(system, integrator, x, level=level.index, budget=budget)
-            reports.append(report)
+            view = None if contact is None else contact.at(level, self.levels[-1])
+            x, made, touched = self._rounds(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
+            reports += made
+            module = ForceModule((*module.forces, touched)) if touched is not None else module
         return x, reports, module
+
+    def _rounds(
+        self,
+        terms: ForceModule,
+        metric: Metric,
+        level: Level,
+        *,
+        x: Tensor,
+        cold: bool,
+        view: LevelContact | None,
+        budget: Budget,
+    ) -> tuple[Tensor, list[LevelReport], Contact | None]:
+        """Solve one level; with contact in rounds, each with the planes that its start sees."""
+        integrator = self._settings.method.build()
+        reports: list[LevelReport] = []
+        left = budget.steps
+        touched = None if view is None else view.term(x)
+        while True:
+            module = terms if touched is None else ForceModule((*terms.forces, touched))
+            system = System(module, metric, free=level.free, spacing=level.spacing)
+            if cold and not reports:
+                x = leave_saddle(system, level, x, outward=self._outward)
+            share = left if touched is None else min(left, -(-budget.steps // self._settings.contact.rounds))
+            x, report = solve_level(system, integrator, x, level=level.index, budget=replace(budget, steps=share))
+            reports.append(report)
+            left -= report.steps
+            if view is None or left <= 0 or report.steps == 0 or report.stopped == "budget":
+                return x, reports, touched
+            last, touched = touched, view.term(x)
+            if last is None and touched is None:
+                return x, reports, None
 
     def _budget(self, index: int, count: int, clock: float) -> Budget:
         """Steps and deadline of one level."""
