@@ -219,7 +219,6 @@ def test_custom_properties_of_an_export_choose_the_fabric(tmp_path: Path, merged
     assert sources["density"] == "</root/_materials/Denim"
 
 
-@pytest.mark.xfail(strict=True, reason="Blender writes primvars:physgraph_pin, which reading does not look for")
 def test_a_vertex_group_pins(tmp_path: Path) -> None:
     assert inspect_shot(exported(tmp_path), garments=("coat",))["garments"][0]["pinned_points"] == 9
 
