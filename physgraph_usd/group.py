@@ -184,13 +184,18 @@ class Group:
         Returns:
             One system per level, coarsest first, and the recentred coarse positions [m].
         """
+        modules, coarse = self.modules(frames)
+        parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
+        return [
+            System(m, lasting.metric, free=level.free, spacing=level.spacing) for level, lasting, m in parts
+        ], coarse
+
+    def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
+        """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
         coarse = self._tensor(np.concatenate([f.points for f in frames]))
         coarse = coarse - coarse.mean(dim=0)
-        made = []
-        for level, lasting in zip(self.levels, self._forces_for(frames), strict=True):
-            module = ForceModule((*lasting.elastic, lasting.guide.retarget(coarse)))
-            made.append(System(module, lasting.metric, free=level.free, spacing=level.spacing))
-        return made, coarse
+        forces = self._forces_for(frames)
+        return [ForceModule((*lasting.elastic, lasting.guide.retarget(coarse))) for lasting in forces], coarse
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)

@@ -102,3 +102,9 @@ def test_pins_over_one_are_one_and_told(stage: Usd.Stage) -> None:
     shot = open_shot(save(stage))
     assert shot.scene.garments[0].pin.max() == 1.0
     assert any("goes up to 3" in notice.message for notice in shot.warnings)
+
+
+def test_the_name_that_an_exporter_makes_of_a_colon(stage: Usd.Stage) -> None:
+    prim = stage.GetPrimAtPath("/World/rig/cloth")
+    UsdGeom.PrimvarsAPI(prim).CreatePrimvar("physgraph_pin", value_type("float[]"), "vertex").Set(RAMP.tolist())
+    np.testing.assert_allclose(read(stage, "pin"), RAMP, atol=1e-7)

@@ -64,7 +64,8 @@ def _bending(
     floor = tiny * square + weight.dtype(1.0e-37)
     s1 = wp.max(wp.dot(n1, n1), floor)
     s2 = wp.max(wp.dot(n2, n2), floor)
-    theta = wp.atan2(wp.dot(wp.cross(n1, n2), axis) / length, wp.dot(n1, n2))
+    # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
+    theta = wp.atan2(-length * wp.dot(n1, il), wp.dot(n1, n2))
     half_turn = weight.dtype(math.pi)
     bent = theta - rest_angle[h]
     if bent > half_turn:

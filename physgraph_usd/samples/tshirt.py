@@ -43,6 +43,7 @@ def build() -> PlainStage:
         uv=shirt.uv,
         subsets=((Look("Trim", (0.78, 0.66, 0.40)), _trim(shirt)),),
         fabric=PRESETS["jersey"],
+        level=3,
         skin=_weights(shirt.points),
         scheme="catmullClark",
     )

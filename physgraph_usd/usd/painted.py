@@ -27,12 +27,12 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
         SchemaError: When the interpolation, type, number or sign of the values cannot be used.
     """
     row = GARMENT[short]
-    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(row.name.removeprefix("primvars:"))
-    flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()) if primvar and primvar.HasAuthoredValue() else None
-    if flat is None:
+    primvar = _find(prim, row.name.removeprefix("primvars:"))
+    flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()) if primvar else None
+    if primvar is None or flat is None:
         return np.full(count, float(row.fallback or 0.0)), ()
     values = np.atleast_1d(np.asarray(flat))
-    where = f"<{prim.GetPath()}>.{row.name}"
+    where = f"<{prim.GetPath()}>.{primvar.GetAttr().GetName()}"
     if values.ndim != 1 or not (np.issubdtype(values.dtype, np.number) or values.dtype == bool):
         raise SchemaError(f"{where} is {type(flat).__name__}; author float[]")
     values = values.astype(np.float64)
@@ -50,3 +50,12 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
         said = f"{row.name} goes up to {values.max():g}; values over {row.maximum:g} are taken as {row.maximum:g}"
         return np.minimum(values, row.maximum), (Notice(str(prim.GetPath()), None, said),)
     return values, ()
+
+
+def _find(prim: Usd.Prim, name: str) -> UsdGeom.Primvar | None:
+    """The authored primvar of a name, or of the name that Blender's exporter makes of it: no colons."""
+    for spelled in (name, name.replace(":", "_")):
+        primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(spelled)
+        if primvar and primvar.HasAuthoredValue():
+            return primvar
+    return None

@@ -87,6 +87,7 @@ class PlainMesh:
         subsets: Faces claimed by further materials: (look, face numbers).
         pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,), or None.
         fabric: Material values authored on a garment, or None.
+        level: Number of subdivisions authored on a garment.
         skin: Weights on the stage's skeleton, or None.
         left_handed: Whether faces run clockwise seen from outside.
         scheme: USD subdivision scheme.
@@ -104,6 +105,7 @@ class PlainMesh:
     subsets: tuple[tuple[Look, np.ndarray], ...] = ()
     pin: np.ndarray | None = None
     fabric: Fabric | None = None
+    level: int = 2
     skin: Skin | None = None
     left_handed: bool = False
     scheme: str = "none"

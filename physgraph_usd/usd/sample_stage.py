@@ -60,7 +60,7 @@ def _write_mesh(stage: Usd.Stage, record: PlainStage, mesh: PlainMesh) -> None:
     _write_primvars(usd, mesh)
     _write_looks(stage, usd, mesh)
     if mesh.role == "garment":
-        _write_garment(usd.GetPrim(), mesh.fabric)
+        _write_garment(usd.GetPrim(), mesh.fabric, mesh.level)
     elif mesh.role == "collider":
         usd.GetPrim().AddAppliedSchema("PhysGraphColliderAPI")
 
@@ -135,11 +135,11 @@ def _material(stage: Usd.Stage, look: Look) -> UsdShade.Material:
     return material
 
 
-def _write_garment(prim: Usd.Prim, fabric: Fabric | None) -> None:
+def _write_garment(prim: Usd.Prim, fabric: Fabric | None, level: int) -> None:
     """Apply the garment schema by name and author its material values."""
     prim.AddAppliedSchema("PhysGraphGarmentAPI")
-    level = prim.CreateAttribute("physgraph:refine:level", Sdf.ValueTypeNames.Int, False, Sdf.VariabilityUniform)
-    level.Set(2)
+    name, uniform = "physgraph:refine:level", Sdf.VariabilityUniform
+    prim.CreateAttribute(name, Sdf.ValueTypeNames.Int, False, uniform).Set(level)
     if fabric is None:
         return
     values = {

@@ -22,11 +22,15 @@ FAR = np.array([1e5, -2e5, 3e5])
 @pytest.mark.parametrize("kind", ["triangles", "quads"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_s11_turned_and_carried_far_away(seed: int, kind: str, dtype: torch.dtype, most: float):
-    """A random rotation and 1e5 edge-lengths of meters away, rest shape too: recentred, so nothing is lost."""
+    """A random rotation, and far away, rest shape too: recentred, so nothing is lost.
+
+    The number of steps is fixed: rounding may decide at which step the usual tolerance is met.
+    """
     mesh, rest = sheet(8, 6, EDGE, kind=kind)
     points, turn = wave(rest), rotation(seed)
-    here = solved(mesh, rest, points, level=2, dtype=dtype).points[0]
-    turned = refiner_of([garment_of(mesh, rest @ turn.T + FAR)], level=2, gravity=turn @ DOWN, dtype=dtype)
+    options = {"level": 2, "dtype": dtype, "steps": 6, "tolerance": 0.0}
+    here = solved(mesh, rest, points, **options).points[0]
+    turned = refiner_of([garment_of(mesh, rest @ turn.T + FAR)], gravity=turn @ DOWN, **options)
     there = turned.solve(frame_of(points @ turn.T + FAR)).points[0]
     error = rms((there - FAR) @ turn - here) / (EDGE / 4)
     assert error < most, error

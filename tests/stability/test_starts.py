@@ -61,9 +61,12 @@ def test_s13_a_sheet_at_rest_or_stretched_stays_flat(strain: float):
 
 @pytest.mark.parametrize("height", [1e-5, 1e-4, 1e-3])
 def test_s13_a_sheet_that_is_all_but_flat_leaves_it_as_well(height: float):
-    """A hundredth of an edge of waviness is near enough to the saddle to be stuck there."""
+    """A fiftieth of an edge of waviness is near enough to the saddle to be stuck there, at forty times the energy."""
     mesh, rest = sheet(8, 8, EDGE)
-    outs = [total(solved(mesh, rest, wave(rest, height=h), level=2).telemetry[0], "output") for h in (height, 0.01)]
+    outs = [
+        total(solved(mesh, rest, wave(rest, height=h), level=2, tolerance=2e-4).telemetry[0], "output")
+        for h in (height, 0.01)
+    ]
     assert outs[0] < 1.1 * outs[1], outs
 
 
