@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .colliders.base import MeshPose, Pose, ShapePose, Surface
+from .colliders.base import Surface
 from .colliders.mesh import MeshBody
+from .colliders.pose import Collider, MeshPose, Pose, ShapePose
 from .colliders.primitives import ShapeSurface
 from .contact import Touching
-from .scene import Collider, Garment, GarmentFrame
+from .scene import Garment, GarmentFrame
 
 REACH = 2.0
 """How far the cloth is expected to leave its cage's bounds, in mean cage edges."""
@@ -60,7 +61,8 @@ class Bodies:
         low, high = self._bounds[index]
         if isinstance(pose, ShapePose) and pose.kind == "plane":
             normal = pose.turn[:, 2]
-            return float(np.where(normal > 0, bounds[0], bounds[1]) @ normal) <= pose.centre @ normal + grow
+            lowest = float(np.where(normal > 0, bounds[0], bounds[1]) @ normal)
+            return bool(lowest <= pose.centre @ normal + grow)
         return bool((bounds[0] - grow <= high).all() and (low <= bounds[1] + grow).all())
 
     def touching(self, indices: Sequence[int], offsets: Sequence[float]) -> tuple[Touching, ...]:
@@ -93,10 +95,10 @@ class Bodies:
 def reach_of(garment: Garment, frame: GarmentFrame) -> float:
     """How far from the cage's bounds a body counts as near [m]: its offset and the move expected of the cloth."""
     ends = garment.mesh.half_edges.edges
-    edge = (
-        float(np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1).mean()) if len(ends) else 0.0
-    )
-    return frame.offset + REACH * edge
+    if not len(ends):
+        return frame.offset
+    lengths = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
+    return frame.offset + REACH * float(lengths.mean())
 
 
 def bounds_of(points: np.ndarray) -> np.ndarray:

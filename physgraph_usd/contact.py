@@ -9,7 +9,7 @@ have changed sides.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from .colliders.base import Nearest, Surface
 from .colliders.sign import MARGIN, signed_distances
 from .forces.contact import Contact, Planes
 from .level import Level
+from .measure import penetration
 
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
@@ -30,15 +31,17 @@ class ContactSettings:
     """How contact is solved.
 
     Attributes:
-        form: "quadratic", or "linear" as in the paper.
-        stiffness: k_c, [N/m^3] in the quadratic form and [N] in the linear one.
+        form: "quadratic", "linear" as in the paper, or "off".
+        stiffness: k_c of the quadratic form, in stretch stiffnesses over the square of the cage's mean edge.
+        pressure: k_c over the garment's area of the linear form, in weights of the cloth.
         rounds: How often in a level's steps closest points are found anew.
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
     """
 
     form: str = "quadratic"
-    stiffness: float = 1e5
+    stiffness: float = 15.0
+    pressure: float = 5.0
     rounds: int = 4
     clearance: float = 0.25
     projections: int = 10
@@ -92,12 +95,16 @@ class _Track:
         asked = x[which] + self.shift
         found = self.surface.closest(asked, torch.full_like(moved[which], float("inf")))
         sign = self._signs(which, found, asked, moved[which])
-        away = (asked - found.point) / found.distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
-        outward = found.normal * self._outward(which).unsqueeze(1)
-        normal = torch.where((found.distance > ON_SURFACE).unsqueeze(1), away, outward)
-        signed = found.distance * sign
-        self.at[which], self.known[which] = x[which], signed
-        return which, torch.nn.functional.normalize(normal, dim=1, eps=1e-30), signed
+        self.at[which], self.known[which] = x[which], found.distance * sign
+        distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
+        within = torch.nonzero(sign < 0).squeeze(1)
+        if len(within):
+            way = self.surface.exit(asked[within], _at(found, within))
+            distance[within], point[within], outward[within] = way.distance, way.point, way.normal
+        away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
+        outward = outward * self._outward(which).unsqueeze(1)
+        normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
+        return which, torch.nn.functional.normalize(normal, dim=1, eps=1e-30), distance * sign
 
     def _outward(self, which: Tensor) -> Tensor:
         """1 where a face's normal points away from the body, -1 where the start side is the other one."""
@@ -117,13 +124,23 @@ class _Track:
         return torch.where(told, found.side, sign)
 
 
+def _at(found: Nearest, which: Tensor) -> Nearest:
+    """Some of the closest points."""
+    return Nearest(**{each.name: getattr(found, each.name)[which] for each in fields(found)})
+
+
 class LevelContact:
-    """One level's view of the bodies."""
+    """One level's view of the bodies.
+
+    Attributes:
+        rounds: How often in the level's steps closest points are found anew.
+    """
 
     def __init__(self, level: Level, tracks: Sequence[_Track], settings: ContactSettings) -> None:
         """Keep what is known of the distances."""
         self._level, self._tracks, self._settings = level, tuple(tracks), settings
         self._reach = float(level.spacing.mean())
+        self.rounds = settings.rounds
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> Contact | None:
         """The contact force near positions x [m], or None where nothing can touch."""
@@ -194,7 +211,7 @@ class FrameContact:
             touching: The surfaces.
             coarse: Cage positions [m], recentred.
             origin: World position of the group's origin [m], shape (3,).
-            settings: How contact is solved.
+            settings: How contact is solved, with k_c itself as its stiffness.
         """
         finest = levels[-1]
         base = finest.base.apply(coarse)
@@ -208,10 +225,26 @@ class FrameContact:
             tracks.append(_Track(each.surface, shift, offset, side, base, known))
         return FrameContact(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
 
-    @property
-    def shifts(self) -> list[Float[Tensor, 3]]:
-        """From the group's coordinates to each surface's [m]."""
-        return [track.shift for track in self._tracks]
+    def measure(
+        self, finest: Level, base: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+    ) -> dict[str, object]:
+        """What is in each body and what crosses it, before and after, as plain values.
+
+        Args:
+            finest: The finest level.
+            base: The upsampled cage [m].
+            x: The result [m].
+        """
+        bodies: dict[str, object] = {}
+        for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
+            surface, shift = each.surface, track.shift
+            after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
+            name = each.path if surface.closed else f"{each.path} (open part)"
+            bodies[name] = {
+                "before": asdict(penetration(surface, finest, base + shift, before)),
+                "after": asdict(penetration(surface, finest, x + shift, after)),
+            }
+        return {"bodies": bodies}
 
     def at(self, level: Level, finest: Level) -> LevelContact:
         """The view of one level; its vertices come first among each garment's finest ones."""

@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .colliders.sign import signed_distances
 from .contact import ContactSettings, FrameContact, LevelContact, Touching
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
@@ -30,8 +29,8 @@ from .integrate.metric import Metric, kept_to_edges
 from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
-from .measure import penetration
 from .mesh.subdivide import Refinement
+from .rounds import solve_rounds
 from .scene import Garment, GarmentFrame
 
 COARSE_STEPS = 4
@@ -147,7 +146,7 @@ class Group:
         origin = world.mean(axis=0) if len(world) else np.zeros(3)
         coarse = self._tensor(world - origin)
         predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
-        contact = self._contact(touching, coarse, origin)
+        contact = self._contact(touching, coarse, origin, frames)
         prepared = time.perf_counter()
         try:
             x, reports, module = self._descend(forces, coarse, predicted, clock, contact=contact)
@@ -165,7 +164,8 @@ class Group:
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
         if contact is not None:
-            telemetry["contact"] = self._measure_contact(contact, result, coarse) | {"projected": pushed}
+            start = self.levels[-1].base.apply(coarse)
+            telemetry["contact"] = contact.measure(self.levels[-1], start, result) | {"projected": pushed}
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -244,26 +244,23 @@ class Group:
         fixed = self.levels[-1].base.apply(coarse)
         return torch.where(self.levels[-1].free, predicted, fixed), "warm"
 
-    def _contact(self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray) -> FrameContact | None:
+    def _contact(
+        self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray, frames: Sequence[GarmentFrame]
+    ) -> FrameContact | None:
         """The bodies of a frame, or None when there are none."""
         if not touching or not len(coarse):
             return None
-        return FrameContact.begin(self.levels, touching, coarse, origin=origin, settings=self._settings.contact)
+        settings = replace(self._settings.contact, stiffness=self._contact_stiffness(frames))
+        return FrameContact.begin(self.levels, touching, coarse, origin=origin, settings=settings)
 
-    def _measure_contact(self, contact: FrameContact, x: Tensor, coarse: Tensor) -> dict[str, object]:
-        """What is in each body and what crosses it, before and after."""
-        finest = self.levels[-1]
-        base = finest.base.apply(coarse)
-        measured: dict[str, object] = {}
-        for each, shift, before in zip(contact.touching, contact.shifts, contact.distances, strict=True):
-            reach = float(finest.spacing.max())
-            after = signed_distances(each.surface, x + shift, finest.edges, reach=reach)
-            kind = "closed" if each.surface.closed else "open"
-            measured[f"{each.path} ({kind})"] = {
-                "before": asdict(penetration(each.surface, finest, base + shift, before)),
-                "after": asdict(penetration(each.surface, finest, x + shift, after)),
-            }
-        return {"bodies": measured}
+    def _contact_stiffness(self, frames: Sequence[GarmentFrame]) -> float:
+        """Stiffness of contact that the fabrics' own stiffness or weight, and the cage's edges, ask for."""
+        cage, settings = self.levels[0], self._settings.contact
+        if settings.form == "linear":
+            weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
+            return settings.pressure * weight * float(cage.vertex_area.sum())
+        stretch = max(frame.fabric.stretch for frame in frames)
+        return settings.stiffness * stretch / float(cage.spacing.mean()) ** 2
 
     def _descend(
         self,
@@ -275,8 +272,7 @@ class Group:
         contact: FrameContact | None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule]:
         """Walk the levels; a warm start goes straight to the finest."""
-        cold = predicted is None
-        first = 0 if cold and self._settings.method.nested else len(self.levels) - 1
+        first = 0 if predicted is None and self._settings.method.nested else len(self.levels) - 1
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
         module = ForceModule(())
@@ -291,12 +287,13 @@ class Group:
                 terms = ForceModule((*module.forces, Tether(level, density, self._settings.tether, predicted)))
             budget = self._budget(index, len(self.levels), clock)
             view = None if contact is None else contact.at(level, self.levels[-1])
-            x, made, touched = self._rounds(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
+            cold = predicted is None
+            x, made, touched = self._solve_level(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
             reports += made
-            module = ForceModule((*module.forces, touched)) if touched is not None else module
+            module = module if touched is None else ForceModule((*module.forces, touched))
         return x, reports, module
 
-    def _rounds(
+    def _solve_level(
         self,
         terms: ForceModule,
         metric: Metric,
@@ -307,25 +304,20 @@ class Group:
         view: LevelContact | None,
         budget: Budget,
     ) -> tuple[Tensor, list[LevelReport], Contact | None]:
-        """Solve one level; with contact in rounds, each with the planes that its start sees."""
-        integrator = self._settings.method.build()
-        reports: list[LevelReport] = []
-        left = budget.steps
-        touched = None if view is None else view.term(x)
-        while True:
+        """Solve one level, in rounds where bodies are near; returns the contact term too, where there is one."""
+
+        def system(touched: Contact | None) -> System:
             module = terms if touched is None else ForceModule((*terms.forces, touched))
-            system = System(module, metric, free=level.free, spacing=level.spacing)
-            if cold and not reports:
-                x = leave_saddle(system, level, x, outward=self._outward)
-            share = left if touched is None else min(left, -(-budget.steps // self._settings.contact.rounds))
-            x, report = solve_level(system, integrator, x, level=level.index, budget=replace(budget, steps=share))
-            reports.append(report)
-            left -= report.steps
-            if view is None or left <= 0 or report.steps == 0 or report.stopped == "budget":
-                return x, reports, touched
-            last, touched = touched, view.term(x)
-            if last is None and touched is None:
-                return x, reports, None
+            return System(module, metric, free=level.free, spacing=level.spacing)
+
+        integrator = self._settings.method.build()
+        touched = None if view is None else view.term(x)
+        if cold:
+            x = leave_saddle(system(touched), level, x, outward=self._outward)
+        if view is None:
+            x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
+            return x, [report], None
+        return solve_rounds(system, integrator, x, touched=touched, view=view, level=level.index, budget=budget)
 
     def _budget(self, index: int, count: int, clock: float) -> Budget:
         """Steps and deadline of one level."""

@@ -1,7 +1,7 @@
 """Measures contact from positions alone, without the forces: vertices in bodies, and edges through faces."""
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -52,16 +52,27 @@ def penetration(
         signed: Signed distances at x, lower bounds where they are positive [m].
     """
     free = level.free[:, 0]
-    deep = (signed < -DEEP) if surface.closed else torch.zeros_like(free)
+    depth = _depths(surface, x, signed)
+    deep = depth > DEEP
     inside = int((deep & free).sum())
-    least = float(torch.where(free, signed, torch.zeros_like(signed)).min()) if len(signed) and surface.closed else 0.0
+    deepest = float((depth * free).max()) if len(depth) else 0.0
     return Penetration(
         inside=inside,
         percent=round(100.0 * inside / max(int(free.sum()), 1), 4),
-        deepest_mm=round(1e3 * max(0.0, -least), 4),
+        deepest_mm=round(1e3 * deepest, 4),
         pinned=int((deep & ~free).sum()),
         crossings=crossings(surface, level, x, signed.abs()),
     )
+
+
+def _depths(surface: Surface, x: Tensor, signed: Tensor) -> Float[Tensor, " vertices"]:
+    """How far each vertex is from where it could leave a closed surface [m]; 0 outside."""
+    depth = torch.zeros_like(signed)
+    within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
+    if len(within):
+        found = surface.closest(x[within], torch.full_like(signed[within], float("inf")))
+        depth[within] = surface.exit(x[within], found).distance
+    return depth
 
 
 @wp.kernel

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from .broad_phase import Bodies, bounds_of, reach_of
-from .colliders.base import Pose
+from .colliders.pose import Pose
 from .detail import Carried
 from .errors import GarmentError
 from .group import Group, SolveSettings
@@ -130,17 +130,16 @@ class Refiner:
         """Solve one garment apart and keep what its next frame needs; returns its points and telemetry."""
         known = self._last[index]
         kept = None if gap or known is None else known.carried
-        garment, bodies = self._scene.garments[index], self._bodies
         near = self._near(index, frame)
         while True:
-            touching = bodies.touching(near, [frame.offset])
+            touching = self._bodies.touching(near, [frame.offset])
             solved, carried, entry = self._groups[index].solve([frame], kept, at=time, touching=touching)
-            reached = bodies.near(garment, bounds_of(solved[0]), frame.offset)
-            if set(reached) <= set(near):
+            more = self._reached(index, frame, solved[0])
+            if more <= set(near):
                 break
-            near = tuple(sorted({*near, *reached}))
-        self._last[index] = _Known(frame, solved[0], carried, {each: bodies.pose_of(each) for each in near})
-        if garment.colliders:
+            near = tuple(sorted({*near, *more}))
+        self._last[index] = _Known(frame, solved[0], carried, {each: self._bodies.pose_of(each) for each in near})
+        if self._scene.garments[index].colliders:
             entry["near"] = [self._scene.colliders[each].path for each in near]
         if gap:
             entry["start"] = "cold: the time between samples is too long"
@@ -149,9 +148,16 @@ class Refiner:
     def _near(self, index: int, frame: GarmentFrame) -> tuple[int, ...]:
         """Numbers of the bodies that a garment may touch."""
         garment = self._scene.garments[index]
-        if not garment.colliders:
+        if not garment.colliders or self._settings.contact.form == "off":
             return ()
         return self._bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame))
+
+    def _reached(self, index: int, frame: GarmentFrame, points: np.ndarray) -> set[int]:
+        """Numbers of the bodies whose bounds the solved cloth meets."""
+        garment = self._scene.garments[index]
+        if not garment.colliders or self._settings.contact.form == "off":
+            return set()
+        return set(self._bodies.near(garment, bounds_of(points), frame.offset))
 
     def _same_bodies(self, index: int, frame: GarmentFrame, known: _Known) -> bool:
         """Whether the bodies that a garment may touch are where they were."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .colliders.base import Collider, Pose
+from .colliders.pose import Collider, Pose
 from .fabric import Fabric
 from .mesh.topology import PolygonMesh
 

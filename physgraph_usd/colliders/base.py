@@ -1,4 +1,4 @@
-"""What a collider is, how it is posed, and what can be asked of its surface."""
+"""What can be asked of a posed surface."""
 
 from __future__ import annotations
 
@@ -6,76 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-KINDS = ("mesh", "sphere", "capsule", "cylinder", "cube", "plane")
-
-
-@dataclass(frozen=True)
-class Collider:
-    """What stays the same over the shot.
-
-    Attributes:
-        path: Prim path, its name in reports.
-        kind: One of `KINDS`.
-        offset: Distance kept from it [m], added to the garment's.
-    """
-
-    path: str
-    kind: str
-    offset: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class MeshPose:
-    """A mesh at one time code.
-
-    Attributes:
-        points: Positions [m], world space, shape (V, 3), float64.
-        triangles: Corners, as authored, shape (T, 3), int32; the same array while the topology stays the same.
-    """
-
-    points: np.ndarray
-    triangles: np.ndarray
-
-    def equals(self, other: Pose) -> bool:
-        """Whether both are the same to the bit."""
-        return (
-            isinstance(other, MeshPose)
-            and np.array_equal(self.triangles, other.triangles)
-            and np.array_equal(self.points, other.points)
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class ShapePose:
-    """A primitive at one time code.
-
-    Attributes:
-        kind: "sphere", "capsule", "cylinder", "cube" or "plane".
-        turn: Rotation whose columns are the shape's axes in the world; the third is the axis of a capsule, a cylinder
-            and a plane (its outer normal), shape (3, 3), float64.
-        centre: [m], world space, shape (3,), float64.
-        size: Half sizes along its axes [m]: (r, r, r) of a sphere, (r, r, half height without caps) of a capsule or a
-            cylinder, zero for a plane, shape (3,), float64.
-    """
-
-    kind: str
-    turn: np.ndarray
-    centre: np.ndarray
-    size: np.ndarray
-
-    def equals(self, other: Pose) -> bool:
-        """Whether both are the same to the bit."""
-        return (
-            isinstance(other, ShapePose)
-            and self.kind == other.kind
-            and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("turn", "centre", "size"))
-        )
-
-
-Pose = MeshPose | ShapePose
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +20,7 @@ class Nearest:
         normal: Of the surface there, outward on closed surfaces, shape (N, 3).
         side: 1 on the normals' side, -1 behind, 0 where a closed mesh has to be asked by `Surface.inside`, shape (N,).
         rim: Whether it lies on the rim of an open surface, shape (N,).
+        face: Triangle that it lies on, -1 on primitives, shape (N,), int32.
     """
 
     distance: Float[Tensor, " points"]
@@ -95,6 +28,7 @@ class Nearest:
     normal: Float[Tensor, "points 3"]
     side: Float[Tensor, " points"]
     rim: Bool[Tensor, " points"]
+    face: Int[Tensor, " points"]
 
 
 @runtime_checkable
@@ -122,4 +56,13 @@ class Surface(Protocol):
 
     def inside(self, x: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
         """Whether points are inside; nowhere for open surfaces."""
+        ...
+
+    def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
+        """The closest points through which points inside can leave: not those on faces buried in the same surface.
+
+        Args:
+            x: Points inside.
+            found: What `closest` gave for them.
+        """
         ...

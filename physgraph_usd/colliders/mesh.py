@@ -1,8 +1,10 @@
 """Closest points on a moving triangle mesh, by Warp's bounding volume hierarchy, refitted for each pose."""
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,9 +13,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..mesh.lanes import Launch
-from .base import MeshPose, Nearest
+from .base import Nearest
 from .orient import Pieces, pieces_of
+from .pose import MeshPose
 
+Rim = tuple[np.ndarray, np.ndarray]
+"""Rim edges and rim corners of open triangles, as `Pieces` has them."""
+LIFT = 1e-4
+"""How far above a vertex it is looked whether the surface is buried there, relative to the surface's size."""
 ON_EDGE = 1e-4
 """Barycentric coordinate under which a point is on an edge."""
 
@@ -104,18 +111,17 @@ class MeshSurface:
         self._device, self._lanes = device, lanes
         self._used = np.unique(triangles)
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
+        self._corners = torch.as_tensor(triangles, device=device).long()
+        self._buried: Tensor | None = None
+        self._skin: tuple[wp.Mesh, Tensor] | None = None
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
-        local = self._place(pose)
-        self.mesh = wp.Mesh(
-            points=wp.array(local, dtype=wp.vec3f, device=device),
-            indices=wp.array(triangles.ravel(), dtype=wp.int32, device=device),
-            support_winding_number=self.closed,
-        )
+        self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
 
     def repose(self, pose: MeshPose) -> None:
         """Move the surface to another pose of the same topology."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
         self.mesh.refit()
+        self._buried, self._skin = None, None
 
     def _place(self, pose: MeshPose) -> np.ndarray:
         """Recentre a pose; vertices that no face uses are put on one that a face does."""
@@ -129,6 +135,9 @@ class MeshSurface:
 
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
         """The closest points within reach [m]; the side of a closed surface is left to `inside`."""
+        return self._closest(self.mesh, x, reach)
+
+    def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
         count = len(x)
         asked, limit = x.to(torch.float32).contiguous(), reach.to(torch.float32).contiguous()
         distance = torch.full((count,), float("inf"), dtype=torch.float32, device=x.device)
@@ -137,11 +146,11 @@ class MeshSurface:
         side = torch.zeros_like(distance)
         if count:
             outputs = [wp.from_torch(distance), *(_vectors(each) for each in (point, normal)), wp.from_torch(face)]
-            self._run(_closest, count, [_vectors(asked), wp.from_torch(limit), *outputs, _vectors(weight)])
+            self._run(_closest, mesh, count, [_vectors(asked), wp.from_torch(limit), *outputs, _vectors(weight)])
             if not self.closed:
-                self._run(_side, count, [_vectors(asked), wp.from_torch(limit), wp.from_torch(side)])
+                self._run(_side, mesh, count, [_vectors(asked), wp.from_torch(limit), wp.from_torch(side)])
         rim = self._on_rim(face.long(), weight) & distance.isfinite()
-        return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim)
+        return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
 
     def inside(self, x: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
         """Whether the generalised winding number is over a half (Barill et al. 2018); nowhere for open surfaces."""
@@ -149,12 +158,55 @@ class MeshSurface:
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
             asked = x.to(torch.float32).contiguous()
-            self._run(_winding, len(x), [_vectors(asked), wp.float32(far), wp.from_torch(side)])
+            self._run(_winding, self.mesh, len(x), [_vectors(asked), wp.float32(far), wp.from_torch(side)])
         return side < 0
 
-    def _run(self, kernel: wp.Kernel, count: int, inputs: list[object]) -> None:
+    def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
+        """The closest points on faces that lie bare; where body parts overlap, the nearest face may be deep inside.
+
+        A face lies bare when none of its corners is inside the surface.
+        """
+        if not self.closed or not len(x) or not bool(self._is_buried(found.face).any()):
+            return found
+        skin = self._bare()
+        if skin is None:
+            return found
+        mesh, faces = skin
+        bare = self._closest(mesh, x, torch.full_like(found.distance, float("inf")))
+        return replace(bare, face=faces[bare.face.long()])
+
+    def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
+        """Whether faces have a corner inside the surface; asks for the corners of those faces only."""
+        if self._buried is not None:
+            return self._buried[self._corners[face.long()]].any(dim=1)
+        corners, place = torch.unique(self._corners[torch.unique(face.long())].ravel(), return_inverse=True)
+        return self._lifted_inside(corners)[place]
+
+    def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
+        """Whether points just above vertices are inside."""
+        points = wp.to_torch(self.mesh.points)
+        a, b, c = (points[self._corners[:, corner]] for corner in range(3))
+        area = torch.linalg.cross(b - a, c - a)
+        normal = torch.zeros_like(points).index_add_(0, self._corners.T.reshape(-1), area.repeat(3, 1))
+        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
+        up = torch.nn.functional.normalize(normal[vertices], dim=1, eps=1e-30)
+        return self.inside(points[vertices] + lift * up)
+
+    def _bare(self) -> tuple[wp.Mesh, Tensor] | None:
+        """The faces that lie bare and their numbers; None when there are none."""
+        if self._buried is None:
+            used = torch.as_tensor(self._used, device=self._device).long()
+            self._buried = torch.zeros(len(self.mesh.points), dtype=torch.bool, device=self._device)
+            self._buried[used] = self._lifted_inside(used)
+            faces = torch.nonzero(~self._buried[self._corners].any(dim=1)).squeeze(1)
+            if len(faces):
+                triangles = self.triangles[faces.cpu().numpy()]
+                self._skin = (_hierarchy(self.mesh.points, triangles, False), faces.to(torch.int32))
+        return self._skin
+
+    def _run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
         """Launch over points in slices on several threads."""
-        Launch(kernel, count, [self.mesh.id, *inputs], device=self._device, lanes=self._lanes)({})
+        Launch(kernel, count, [mesh.id, *inputs], device=self._device, lanes=self._lanes)({})
 
     def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
         """Whether closest points lie on a rim edge or a rim vertex."""
@@ -199,6 +251,12 @@ class MeshBody:
         if len(pieces.open):
             made.append(MeshSurface(pose, pieces.open, (pieces.rim, pieces.rim_vertex), **options))
         return made
+
+
+def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh:
+    """Warp's mesh; winding numbers only where there is an inside."""
+    indices = wp.array(triangles.ravel(), dtype=wp.int32, device=points.device)
+    return wp.Mesh(points=points, indices=indices, support_winding_number=closed)
 
 
 def _vectors(tensor: Tensor) -> wp.array:

@@ -47,8 +47,8 @@ def pieces_of(points: np.ndarray, triangles: np.ndarray) -> Pieces:
     """
     first = _welded(points)
     faces = first[np.asarray(triangles, np.int64).reshape(-1, 3)]
-    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    faces = faces[distinct & np.isfinite(points[faces]).all(axis=(1, 2))]
+    distinct = np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    faces = faces[distinct & np.asarray(np.isfinite(points[faces]).all(axis=(1, 2)))]
     if not len(faces):
         empty = np.zeros((0, 3), np.int32)
         return Pieces(empty, empty, empty.astype(bool), empty.astype(bool))
@@ -76,7 +76,7 @@ def pieces_of(points: np.ndarray, triangles: np.ndarray) -> Pieces:
 
 def _welded(points: np.ndarray) -> np.ndarray:
     """First vertex at each vertex's place, shape (V,)."""
-    finite = np.isfinite(points).all(axis=1)
+    finite = np.asarray(np.isfinite(points).all(axis=1))
     if not finite.any():
         return np.arange(len(points))
     low = points[finite].min(axis=0)

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .base import Nearest, ShapePose
+from .base import Nearest
+from .pose import ShapePose
 
 
 class ShapeSurface:
@@ -46,11 +47,16 @@ class ShapeSurface:
         distance = torch.where(signed.abs() <= reach, signed.abs(), torch.full_like(signed, float("inf")))
         side = torch.where(signed < 0, -torch.ones_like(signed), torch.ones_like(signed))
         rim = torch.zeros_like(side, dtype=torch.bool)
-        return Nearest(distance, point @ turn.T, normal @ turn.T, side, rim)
+        face = torch.full_like(side, -1, dtype=torch.int32)
+        return Nearest(distance, point @ turn.T, normal @ turn.T, side, rim, face)
 
     def inside(self, x: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
         """Whether points are inside."""
         return _SHAPES[self._pose.kind](x @ self._turn.to(x), self._size.to(x))[0] < 0
+
+    def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
+        """The same closest points: nothing is buried in a convex shape."""
+        return found
 
 
 def _ball(x: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:

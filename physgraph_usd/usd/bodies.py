@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ..colliders.base import Collider, MeshPose, Pose, ShapePose
+from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ..mesh.topology import PolygonMesh
 from .lookup import COLLIDER_OFFSET, find_value
 from .placement import place, timecode

@@ -120,6 +120,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         level=level,
         flipped=is_flipped(prim, matrix),
         bent_rest=rests_bent(prim),
+        colliders=(),
         **_painted(prim, points.count, notices),
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
