@@ -115,6 +115,7 @@ class Contact:
 
     @staticmethod
     def _prepare(level: Level, planes: Planes, weight: Tensor, energy: Tensor) -> Launch:
+        wp.init()  # Views of tensors do not start Warp by themselves.
         x = vectors(torch.zeros_like(level.rest))
         own = [wp.from_torch(planes.vertex), vectors(planes.normal), wp.from_torch(planes.height)]
         inputs = [x, *own, wp.from_torch(weight), wp.from_torch(energy), x]
