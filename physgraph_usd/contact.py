@@ -42,7 +42,7 @@ class ContactSettings:
     form: str = "quadratic"
     stiffness: float = 15.0
     pressure: float = 5.0
-    rounds: int = 4
+    rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
 
@@ -82,14 +82,14 @@ class _Track:
     at: Tensor
     known: Tensor
 
-    def refresh(self, x: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Find anew what may be nearer than ``near`` beyond the offset.
+    def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Find anew what may be nearer than a distance that each vertex has [m].
 
         Returns:
             Numbers of those vertices, their unit normals away from the surface, and the signed distances.
         """
         moved = (x - self.at).norm(dim=1)
-        which = torch.nonzero(self.known - moved < self.offset + near).squeeze(1)
+        which = torch.nonzero(self.known - moved < within).squeeze(1)
         if not len(which):
             return which, x[which], moved[which]
         asked = x[which] + self.shift
@@ -116,12 +116,13 @@ class _Track:
         if not self.surface.closed:
             behind = (found.side * self.side[which] < 0) & ~found.rim
             return torch.where(behind, -torch.ones_like(moved), torch.ones_like(moved))
-        sign = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
-        told = found.side != 0
-        crossed = ~told & (self.known[which].abs() + found.distance <= MARGIN * moved)
-        if bool(crossed.any()):
-            sign[crossed] = 1.0 - 2.0 * self.surface.inside(asked[crossed]).to(sign)
-        return torch.where(told, found.side, sign)
+        known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
+        may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
+        ask = may_have_crossed & (found.side != known)
+        sign = known.clone()
+        if bool(ask.any()):
+            sign[ask] = 1.0 - 2.0 * self.surface.inside(asked[ask]).to(sign)
+        return sign
 
 
 def _at(found: Nearest, which: Tensor) -> Nearest:
@@ -146,7 +147,7 @@ class LevelContact:
         """The contact force near positions x [m], or None where nothing can touch."""
         planes = []
         for track in self._tracks:
-            vertex, normal, signed = track.refresh(x, self._reach)
+            vertex, normal, signed = track.refresh(x, track.offset + self._reach)
             near = signed < track.offset[vertex] + self._reach
             vertex, normal, signed = vertex[near], normal[near], signed[near]
             height = (normal * x[vertex]).sum(dim=1) - signed + track.offset[vertex]
@@ -166,8 +167,9 @@ class LevelContact:
         for _ in range(self._settings.projections):
             moved = False
             for track in self._tracks:
-                vertex, normal, signed = track.refresh(out, 0.0)
-                lack = self._settings.clearance * track.offset[vertex] - signed
+                least = self._settings.clearance * track.offset
+                vertex, normal, signed = track.refresh(out, least)
+                lack = least[vertex] - signed
                 push = (lack > 1e-7) & self._level.free[vertex, 0]
                 if bool(push.any()):
                     out = out.clone() if not moved else out
@@ -194,6 +196,7 @@ class FrameContact:
     distances: list[Float[Tensor, " vertices"]]
     _tracks: list[_Track] = field(default_factory=list)
     _settings: ContactSettings = field(default_factory=ContactSettings)
+    _views: dict[int, LevelContact] = field(default_factory=dict)
 
     @staticmethod
     def begin(
@@ -247,7 +250,9 @@ class FrameContact:
         return {"bodies": bodies}
 
     def at(self, level: Level, finest: Level) -> LevelContact:
-        """The view of one level; its vertices come first among each garment's finest ones."""
+        """The view of one level, the same at each call; its vertices come first among each garment's finest ones."""
+        if level.index in self._views:
+            return self._views[level.index]
         pairs = zip(level.spans, finest.spans, strict=True)
         places = [torch.arange(fine.start, fine.start + own.stop - own.start) for own, fine in pairs]
         which = torch.cat(places).to(level.rest.device)
@@ -255,7 +260,8 @@ class FrameContact:
             _Track(t.surface, t.shift, t.offset[which], t.side[which], t.at[which].clone(), t.known[which].clone())
             for t in self._tracks
         ]
-        return LevelContact(level, tracks, self._settings)
+        self._views[level.index] = LevelContact(level, tracks, self._settings)
+        return self._views[level.index]
 
 
 def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"], finest: Level) -> Float[Tensor, " vertices"]:

@@ -33,6 +33,11 @@ from .mesh.subdivide import Refinement
 from .rounds import solve_rounds
 from .scene import Garment, GarmentFrame
 
+WORTH = 2.0
+"""Elastic energy of carried detail, over that of the upsampled cage, beyond which a frame starts cold: detail that is
+worth carrying takes compression up and lowers it; carried by a crumpled cage it tears the cloth."""
+LEAST_STRAIN = 1e-2
+"""Strain of the whole garment under which that ratio is not looked at."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
 
@@ -117,6 +122,7 @@ class Group:
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
         self._material: tuple[object, ...] = ()
         self._forces: list[_LevelForces] = []
+        self._stretch = 0.0
 
     def solve(
         self,
@@ -209,6 +215,7 @@ class Group:
                 for level, guide_map in zip(self.levels, self._guide_maps, strict=True)
             ]
             self._material = material
+            self._stretch = max(frame.fabric.stretch for frame in frames)
         return self._forces
 
     def _level_forces(self, level: Level, guide_map: GuideMap, frames: Sequence[GarmentFrame]) -> _LevelForces:
@@ -241,8 +248,19 @@ class Group:
         reset = self._settings.reset
         if motion > reset.move or turn > reset.turn:
             return None, f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees"
-        fixed = self.levels[-1].base.apply(coarse)
-        return torch.where(self.levels[-1].free, predicted, fixed), "warm"
+        finest = self.levels[-1]
+        base = finest.base.apply(coarse)
+        predicted = torch.where(finest.free, predicted, base)
+        carried, plain = (self._elastic_energy(x) for x in (predicted, base))
+        least = LEAST_STRAIN**2 * self._stretch * float(finest.vertex_area.sum())
+        if carried > WORTH * max(plain, least):
+            return None, f"cold: carried detail has {carried / max(plain, least):.3g} times the upsampled cage's energy"
+        return predicted, "warm"
+
+    def _elastic_energy(self, x: Tensor) -> float:
+        """Energy of the finest level's stretch and bending [J]."""
+        terms = [term for term in self._forces[-1].elastic if not isinstance(term, Gravity)]
+        return sum(ForceModule(terms).energies(x).values())
 
     def _contact(
         self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray, frames: Sequence[GarmentFrame]
@@ -259,8 +277,7 @@ class Group:
         if settings.form == "linear":
             weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
             return settings.pressure * weight * float(cage.vertex_area.sum())
-        stretch = max(frame.fabric.stretch for frame in frames)
-        return settings.stiffness * stretch / float(cage.spacing.mean()) ** 2
+        return settings.stiffness * self._stretch / float(cage.spacing.mean()) ** 2
 
     def _descend(
         self,

@@ -17,6 +17,8 @@ from .colliders.mesh import MeshSurface
 from .level import Level
 from .mesh.lanes import Launch
 
+COVER = 0.6
+"""No point of a triangle is farther than this from its nearest corner, in longest sides (1 / sqrt(3), to spare)."""
 DEEP = 1e-4
 """Depth from which a vertex counts as inside [m]."""
 
@@ -122,7 +124,7 @@ def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tens
     """Number of the body's edges through the cloth's faces."""
     corners = x[level.triangles.long()]
     sides = (corners - corners.roll(1, dims=1)).norm(dim=2)
-    near: Bool[Tensor, " triangles"] = distance[level.triangles.long()].amin(dim=1) <= sides.amax(dim=1)
+    near: Bool[Tensor, " triangles"] = distance[level.triangles.long()].amin(dim=1) <= COVER * sides.amax(dim=1)
     if not bool(near.any()):
         return 0
     place, index = np.unique(level.triangles[near].cpu().numpy(), return_inverse=True)
@@ -131,6 +133,7 @@ def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tens
     cloth = wp.Mesh(
         points=wp.from_torch(points, dtype=wp.vec3f),
         indices=wp.array(index.ravel().astype(np.int32), dtype=wp.int32, device=device),
+        bvh_constructor="median" if device == "cpu" else None,  # Built once and asked once: building must be cheap.
     )
     body = wp.to_torch(surface.mesh.points)
     edges = torch.as_tensor(surface.edges, device=x.device)

@@ -36,9 +36,10 @@ def _closest(
     normal: wp.array(dtype=wp.vec3f),
     face: wp.array(dtype=wp.int32),
     weight: wp.array(dtype=wp.vec3f),
+    side: wp.array(dtype=wp.float32),
 ):
     i = first + wp.tid()
-    query = wp.mesh_query_point_no_sign(mesh, x[i], reach[i])
+    query = wp.mesh_query_point_sign_normal(mesh, x[i], reach[i])
     if query.result:
         place = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
         point[i] = place
@@ -46,19 +47,6 @@ def _closest(
         normal[i] = wp.mesh_eval_face_normal(mesh, query.face)
         face[i] = query.face
         weight[i] = wp.vec3f(query.u, query.v, 1.0 - query.u - query.v)
-
-
-@wp.kernel
-def _side(
-    first: wp.int32,
-    mesh: wp.uint64,
-    x: wp.array(dtype=wp.vec3f),
-    reach: wp.array(dtype=wp.float32),
-    side: wp.array(dtype=wp.float32),
-):
-    i = first + wp.tid()
-    query = wp.mesh_query_point_sign_normal(mesh, x[i], reach[i])
-    if query.result:
         side[i] = query.sign
 
 
@@ -112,6 +100,7 @@ class MeshSurface:
         self._used = np.unique(triangles)
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
         self._corners = torch.as_tensor(triangles, device=device).long()
+        self._asked: Tensor | None = None
         self._buried: Tensor | None = None
         self._skin: tuple[wp.Mesh, Tensor] | None = None
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
@@ -134,8 +123,15 @@ class MeshSurface:
         return local
 
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
-        """The closest points within reach [m]; the side of a closed surface is left to `inside`."""
-        return self._closest(self.mesh, x, reach)
+        """The closest points within reach [m].
+
+        The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface that is right unless the face
+        is buried in another part of the surface; there it is left to `inside`.
+        """
+        found = self._closest(self.mesh, x, reach)
+        if self.closed and len(x):
+            found.side[self._is_buried(found.face)] = 0.0
+        return found
 
     def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
         count = len(x)
@@ -146,9 +142,8 @@ class MeshSurface:
         side = torch.zeros_like(distance)
         if count:
             outputs = [wp.from_torch(distance), *(_vectors(each) for each in (point, normal)), wp.from_torch(face)]
-            self._run(_closest, mesh, count, [_vectors(asked), wp.from_torch(limit), *outputs, _vectors(weight)])
-            if not self.closed:
-                self._run(_side, mesh, count, [_vectors(asked), wp.from_torch(limit), wp.from_torch(side)])
+            outputs += [_vectors(weight), wp.from_torch(side)]
+            self._run(_closest, mesh, count, [_vectors(asked), wp.from_torch(limit), *outputs])
         rim = self._on_rim(face.long(), weight) & distance.isfinite()
         return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
 
@@ -176,29 +171,38 @@ class MeshSurface:
         return replace(bare, face=faces[bare.face.long()])
 
     def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
-        """Whether faces have a corner inside the surface; asks for the corners of those faces only."""
-        if self._buried is not None:
-            return self._buried[self._corners[face.long()]].any(dim=1)
-        corners, place = torch.unique(self._corners[torch.unique(face.long())].ravel(), return_inverse=True)
-        return self._lifted_inside(corners)[place]
+        """Whether faces have a corner inside the surface; each corner is asked for once a pose."""
+        count = len(self.mesh.points)
+        if self._buried is None:
+            self._asked, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
+        corners = self._corners[face.long()]
+        needed = torch.zeros(count, dtype=torch.bool, device=face.device)
+        needed[corners.ravel()] = True
+        new = torch.nonzero(needed & ~self._asked).squeeze(1)
+        self._buried[new] = self._lifted_inside(new)
+        self._asked[new] = True
+        return self._buried[corners].any(dim=1)
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
         """Whether points just above vertices are inside."""
+        if not len(vertices):
+            return torch.zeros(0, dtype=torch.bool, device=vertices.device)
         points = wp.to_torch(self.mesh.points)
         a, b, c = (points[self._corners[:, corner]] for corner in range(3))
         area = torch.linalg.cross(b - a, c - a)
-        normal = torch.zeros_like(points).index_add_(0, self._corners.T.reshape(-1), area.repeat(3, 1))
+        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
+        normal = torch.zeros_like(points)
+        for corner in range(3):
+            normal.index_put_((self._corners[:, corner],), area, accumulate=True)
         lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
         up = torch.nn.functional.normalize(normal[vertices], dim=1, eps=1e-30)
         return self.inside(points[vertices] + lift * up)
 
     def _bare(self) -> tuple[wp.Mesh, Tensor] | None:
         """The faces that lie bare and their numbers; None when there are none."""
-        if self._buried is None:
-            used = torch.as_tensor(self._used, device=self._device).long()
-            self._buried = torch.zeros(len(self.mesh.points), dtype=torch.bool, device=self._device)
-            self._buried[used] = self._lifted_inside(used)
-            faces = torch.nonzero(~self._buried[self._corners].any(dim=1)).squeeze(1)
+        if self._skin is None:
+            every = torch.arange(len(self._corners), device=self._device)
+            faces = torch.nonzero(~self._is_buried(every)).squeeze(1)
             if len(faces):
                 triangles = self.triangles[faces.cpu().numpy()]
                 self._skin = (_hierarchy(self.mesh.points, triangles, False), faces.to(torch.int32))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
@@ -40,23 +40,46 @@ def signed_distances(
     found = surface.closest(x[near], torch.full_like(near, float("inf"), dtype=x.dtype))
     out[near] = found.distance
     if surface.closed:
-        asked = found.side == 0
-        side = found.side.clone()
-        if bool(asked.any()):
-            side[asked] = _sides(surface, x, out, near=near[asked], edges=edges)
-        out[near] = out[near] * side
+        out[near] *= _sides(surface, x, out, near=near, told=found.side, edges=edges)
     return out
 
 
-def _sides(surface: Surface, x: Tensor, distance: Tensor, *, near: Tensor, edges: Tensor) -> Float[Tensor, " near"]:
-    """1 outside and -1 inside for vertices of one closed mesh."""
+def _sides(
+    surface: Surface, x: Tensor, distance: Tensor, *, near: Tensor, told: Tensor, edges: Tensor
+) -> Float[Tensor, " near"]:
+    """1 outside and -1 inside for vertices of one closed surface.
+
+    Taken from the closest points where they tell. Where that contradicts a neighbour that no surface divides it from,
+    as it does where a face is buried in part only, and where they do not tell, the winding number does.
+    """
     ends = edges.long()
     length = (x[ends[:, 0]] - x[ends[:, 1]]).norm(dim=1)
-    clear = (distance[ends[:, 0]] + distance[ends[:, 1]] > MARGIN * length).cpu().numpy()
-    pairs = edges.cpu().numpy()[clear]
-    graph = sparse.coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(x), len(x)))
+    clear = ends[distance[ends].sum(dim=1) > MARGIN * length]
+    side = torch.ones(len(x), dtype=x.dtype, device=x.device)
+    side[near] = told
+    settled = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    unsure = (side == 0) | _contradicted(side, clear)
+    while bool(unsure.any()):
+        which = torch.nonzero(unsure).squeeze(1)
+        group, first = _joined(which, clear[unsure[clear].all(dim=1)], len(x))
+        inside = surface.inside(x[which[first]])
+        side[which] = 1.0 - 2.0 * inside.to(x.dtype)[group]
+        settled |= unsure
+        unsure = _contradicted(side, clear) & ~settled
+    return side[near]
+
+
+def _contradicted(side: Tensor, clear: Tensor) -> Bool[Tensor, " vertices"]:
+    """Vertices told to be on the other side of a neighbour that no surface divides them from."""
+    out = torch.zeros(len(side), dtype=torch.bool, device=side.device)
+    out[clear[side[clear].prod(dim=1) < 0].ravel()] = True
+    return out
+
+
+def _joined(which: Tensor, pairs: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Group of each of some vertices that pairs join, and the place of the first of each group."""
+    ends = pairs.cpu().numpy()
+    graph = sparse.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, label = csgraph.connected_components(graph, directed=False)
-    labels = label[near.cpu().numpy()]
-    _, first, group = np.unique(labels, return_index=True, return_inverse=True)
-    inside = surface.inside(x[near[torch.as_tensor(first, device=x.device)]])
-    return 1.0 - 2.0 * inside.to(x.dtype)[torch.as_tensor(group.reshape(-1), device=x.device)]
+    _, first, group = np.unique(label[which.cpu().numpy()], return_index=True, return_inverse=True)
+    return torch.as_tensor(group.reshape(-1), device=which.device), torch.as_tensor(first, device=which.device)
