@@ -32,6 +32,8 @@ from .scene import Garment, GarmentFrame
 
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
+COARSE_TOLERANCE = 0.1
+"""Tolerance of a coarse level over the finest's: folds grow slowly at first, and what is not there is not refined."""
 
 
 @dataclass(frozen=True)
@@ -258,8 +260,9 @@ class Group:
         deadline = None
         if settings.budget_ms is not None:
             deadline = clock + 1e-3 * settings.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
-        steps = settings.steps * (COARSE_STEPS if below else 1)
-        return Budget(steps, settings.tolerance, deadline)
+        if not below:
+            return Budget(settings.steps, settings.tolerance, deadline)
+        return Budget(COARSE_STEPS * settings.steps, COARSE_TOLERANCE * settings.tolerance, deadline)
 
     def _finish(self, x: Tensor, coarse: Tensor, frames: Sequence[GarmentFrame]) -> Tensor:
         """Scale the detail where an artist asked for more or less of it."""

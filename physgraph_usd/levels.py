@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .errors import StageError
 from .mesh.topology import edges_of
 from .scene import Frame, Garment, GarmentFrame, Scene
 
@@ -59,17 +60,25 @@ def choose_levels(scene: Scene, frame_at: Callable[[float | None], Frame]) -> li
     """
     picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
     times: list[float | None] = [scene.times[i] for i in picks] or [None]
-    frames = [frame_at(time) for time in times]
+    frames = [frame for time in times if (frame := _readable(frame_at, time)) is not None]
     return [
         _choose(garment, [frame.garments[index] for frame in frames]) for index, garment in enumerate(scene.garments)
     ]
 
 
+def _readable(frame_at: Callable[[float | None], Frame], time: float | None) -> Frame | None:
+    """A frame, or None where the stage is broken: its turn to be refined will name what is wrong."""
+    try:
+        return frame_at(time)
+    except StageError:
+        return None
+
+
 def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     ends = edges_of(garment.mesh.triangulate(garment.rest).triangles, garment.mesh.vertex_count).vertices
-    if not len(ends):
+    if not len(ends) or not frames:
         level = 0 if garment.level == AUTO else garment.level
-        return LevelChoice(level, "the garment has no faces", 0.0, 0.0, "")
+        return LevelChoice(level, "there are no faces or no readable frames to go by", 0.0, 0.0, "")
     rest = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
     strain, edge = _compression(rest, ends, frames), float(rest.mean())
     fabric = frames[0].fabric
