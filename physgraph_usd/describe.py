@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from .errors import StageError
-from .levels import LevelChoice
 from .mesh.defects import defects
 from .options import RefineOptions
 from .report import RefineReport
+from .resolution import LevelChoice
 from .scene import Frame, Garment, GarmentFrame
 from .usd.reader import Shot
 from .usd.stage import GarmentSource
@@ -37,7 +37,6 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.warnings = [str(notice) for notice in opened.warnings]
-    report.warnings += [choice.warning for choice in choices if choice.warning]
     return report
 
 

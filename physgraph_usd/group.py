@@ -28,6 +28,7 @@ from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .mesh.subdivide import Refinement
+from .resolution import sharp_folds
 from .scene import Garment, GarmentFrame
 
 COARSE_STEPS = 4
@@ -285,6 +286,7 @@ class Group:
                 "output": module.energies(x),
             },
             "strain": edge_strain(finest, x),
+            "sharp_folds": sharp_folds(finest, x),
         }
 
     def _blame(self, lasting: _LevelForces, coarse: Tensor, error: SolveError, at: float | None) -> str:
