@@ -1,6 +1,6 @@
 """The pictures of README and docs: each sample coarse and refined.
 
-    python -m benchmarks.pictures docs/pictures
+python -m benchmarks.pictures docs/pictures
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ class SolveSettings:
     tolerance: float = 2e-3
     budget_ms: float | None = None
     temporal: str = "tether"
-    tether: float = 400.0
+    tether: float = 2000.0
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
 

@@ -33,6 +33,7 @@ class Refiner:
 
     Attributes:
         refinements: The subdivisions of each garment, coarsest first.
+        groups: Garments solved together, in the order of the garments.
     """
 
     def __init__(
@@ -64,11 +65,11 @@ class Refiner:
         self.refinements = self.subdivide(scene, chosen)
         self._settings = settings
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
-        self._groups = [
+        self.groups = [
             Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device, lanes=lanes)
             for garment, chain in zip(scene.garments, self.refinements, strict=True)
         ]
-        self._last: list[_Known | None] = [None] * len(self._groups)
+        self._last: list[_Known | None] = [None] * len(self.groups)
         self._time: float | None = None
 
     @staticmethod
@@ -78,7 +79,7 @@ class Refiner:
 
     def forget(self) -> None:
         """Start the next frame cold."""
-        self._last = [None] * len(self._groups)
+        self._last = [None] * len(self.groups)
         self._time = None
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
@@ -124,7 +125,7 @@ class Refiner:
         """Solve one garment apart and keep what its next frame needs; returns its points and telemetry."""
         known = self._last[index]
         kept = None if gap or known is None else known.carried
-        solved, carried, entry = self._groups[index].solve([garment], kept, at=time)
+        solved, carried, entry = self.groups[index].solve([garment], kept, at=time)
         self._last[index] = _Known(garment, solved[0], carried)
         if gap:
             entry["start"] = "cold: the time between samples is too long"
