@@ -2,8 +2,8 @@
 
     python -m benchmarks.artist_loop [docs/pictures/bending.png]
 
-Prints the folds' wavelength, 2 pi sqrt(mean |grad d|^2 / mean |laplacian d|^2) of the detail d, for each stiffness; draws
-both. Slopes and curvatures are weighed, not heights: heights are those of the sag and of the sleeve's lift.
+Prints the folds' wavelength, 2 pi sqrt(mean |grad d|^2 / mean |laplacian d|^2) of the detail d, for each stiffness, and
+draws both. Slopes and curvatures are weighed, not heights: heights are those of the sag and of the sleeve's lift.
 """
 
 from __future__ import annotations

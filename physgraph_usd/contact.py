@@ -9,7 +9,7 @@ have changed sides.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 
 import numpy as np
 import torch
@@ -45,6 +45,18 @@ class ContactSettings:
     rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
+
+    def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
+        """The same settings with k_c itself as their stiffness, [N/m^3], or [N] in the linear form.
+
+        Args:
+            cage: The cage.
+            stretch: Stretch stiffness of the cloth [N/m].
+            weight: Its weight per area [N/m^2].
+        """
+        if self.form == "linear":
+            return replace(self, stiffness=self.pressure * weight * float(cage.vertex_area.sum()))
+        return replace(self, stiffness=self.stiffness * stretch / float(cage.spacing.mean()) ** 2)
 
 
 @dataclass(frozen=True, eq=False)

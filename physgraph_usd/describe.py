@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from .levels import LevelChoice
+from .errors import StageError
 from .mesh.defects import defects
 from .options import RefineOptions
 from .report import RefineReport
-from .scene import Garment, GarmentFrame
+from .resolution import LevelChoice
+from .scene import Frame, Garment, GarmentFrame
 from .usd.reader import Shot
 from .usd.stage import GarmentSource
 from .usd.survey import survey
@@ -30,13 +31,12 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
         A report without frames.
     """
     report = RefineReport(opened.path, None, options.plain())
-    first = opened.frame(opened.scene.times[0] if opened.scene.times else None)
+    first = _first_frame(opened)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
     report.garments = [_garment(*part) for part in parts]
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.warnings = [str(notice) for notice in opened.warnings]
-    report.warnings += [choice.warning for choice in choices if choice.warning]
     return report
 
 
@@ -84,6 +84,21 @@ def describe_meshes(path: str, problem: str) -> dict[str, Any]:
         ],
         "warnings": [str(notice) for notice in found.notices],
     }
+
+
+def _first_frame(opened: Shot) -> Frame:
+    """The first frame that can be read.
+
+    Raises:
+        StageError: No frame can be read.
+    """
+    *others, last = opened.scene.times or (None,)
+    for time in others:
+        try:
+            return opened.frame(time)
+        except StageError:
+            continue
+    return opened.frame(last)
 
 
 def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choice: LevelChoice) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .mesh.subdivide import Refinement
+from .resolution import sharp_folds
 from .rounds import solve_rounds
 from .scene import Garment, GarmentFrame
 
@@ -40,6 +41,8 @@ LEAST_STRAIN = 1e-2
 """Strain of the whole garment under which that ratio is not looked at."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
+COARSE_TOLERANCE = 0.1
+"""Tolerance of a coarse level over the finest's: folds grow slowly at first, and what is not there is not refined."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class SolveSettings:
     tolerance: float = 2e-3
     budget_ms: float | None = None
     temporal: str = "tether"
-    tether: float = 400.0
+    tether: float = 2000.0
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
@@ -268,16 +271,9 @@ class Group:
         """The bodies of a frame, or None when there are none."""
         if not touching or not len(coarse):
             return None
-        settings = replace(self._settings.contact, stiffness=self._contact_stiffness(frames))
+        weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
+        settings = self._settings.contact.scaled(self.levels[0], stretch=self._stretch, weight=weight)
         return FrameContact.begin(self.levels, touching, coarse, origin=origin, settings=settings)
-
-    def _contact_stiffness(self, frames: Sequence[GarmentFrame]) -> float:
-        """Stiffness of contact that the fabrics' own stiffness or weight, and the cage's edges, ask for."""
-        cage, settings = self.levels[0], self._settings.contact
-        if settings.form == "linear":
-            weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
-            return settings.pressure * weight * float(cage.vertex_area.sum())
-        return settings.stiffness * self._stretch / float(cage.spacing.mean()) ** 2
 
     def _descend(
         self,
@@ -343,8 +339,9 @@ class Group:
         deadline = None
         if settings.budget_ms is not None:
             deadline = clock + 1e-3 * settings.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
-        steps = settings.steps * (COARSE_STEPS if below else 1)
-        return Budget(steps, settings.tolerance, deadline)
+        if not below:
+            return Budget(settings.steps, settings.tolerance, deadline)
+        return Budget(COARSE_STEPS * settings.steps, COARSE_TOLERANCE * settings.tolerance, deadline)
 
     def _finish(self, x: Tensor, coarse: Tensor, frames: Sequence[GarmentFrame]) -> Tensor:
         """Scale the detail where an artist asked for more or less of it."""
@@ -367,6 +364,7 @@ class Group:
                 "output": module.energies(x),
             },
             "strain": edge_strain(finest, x),
+            "sharp_folds": sharp_folds(finest, x),
         }
 
     def _blame(self, lasting: _LevelForces, coarse: Tensor, error: SolveError, at: float | None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -175,8 +175,7 @@ def build_levels(
                 for chain, part in zip(refinements, parts, strict=True)
             ]
             below = Stencil(sp.csr_matrix(sp.block_diag(maps)), dtype=dtype, device=device, lanes=lanes)
-        level = _join(index, parts, below, dtype=dtype, device=device)
-        levels.append(replace(level, lanes=lanes))
+        levels.append(_join(index, parts, below, dtype=dtype, device=device, lanes=lanes))
     return tuple(levels)
 
 
@@ -240,7 +239,7 @@ def _sound(split: TriangleSplit, rest: np.ndarray) -> TriangleSplit:
 
 
 def _join(
-    index: int, parts: Sequence[_GarmentLevel], below: Stencil | None, *, dtype: torch.dtype, device: str
+    index: int, parts: Sequence[_GarmentLevel], below: Stencil | None, *, dtype: torch.dtype, device: str, lanes: int
 ) -> Level:
     """Concatenate garments into one level and measure its rest shape."""
     counts = [part.vertex_count for part in parts]
@@ -261,6 +260,7 @@ def _join(
         from_coarse=sp.csr_matrix(sp.block_diag([part.linear for part in parts])),
         smooth_from_coarse=sp.csr_matrix(sp.block_diag([part.smooth for part in parts])),
         from_below=below,
+        lanes=lanes,
     )
 
 

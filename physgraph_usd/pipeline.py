@@ -36,6 +36,7 @@ class Refiner:
 
     Attributes:
         refinements: The subdivisions of each garment, coarsest first.
+        groups: Garments solved together, in the order of the garments.
     """
 
     def __init__(
@@ -67,13 +68,13 @@ class Refiner:
         self.refinements = self.subdivide(scene, chosen)
         self._settings = settings
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
-        self._groups = [
+        self.groups = [
             Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device, lanes=lanes)
             for garment, chain in zip(scene.garments, self.refinements, strict=True)
         ]
         self._scene = scene
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
-        self._last: list[_Known | None] = [None] * len(self._groups)
+        self._last: list[_Known | None] = [None] * len(self.groups)
         self._time: float | None = None
 
     @staticmethod
@@ -83,7 +84,7 @@ class Refiner:
 
     def forget(self) -> None:
         """Start the next frame cold."""
-        self._last = [None] * len(self._groups)
+        self._last = [None] * len(self.groups)
         self._time = None
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
@@ -133,7 +134,7 @@ class Refiner:
         near = self._near(index, frame)
         while True:
             touching = self._bodies.touching(near, [frame.offset])
-            solved, carried, entry = self._groups[index].solve([frame], kept, at=time, touching=touching)
+            solved, carried, entry = self.groups[index].solve([frame], kept, at=time, touching=touching)
             more = self._reached(index, frame, solved[0])
             if more <= set(near):
                 break

@@ -20,10 +20,10 @@ from . import __version__
 from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
 from .describe import begin_report, describe, describe_meshes
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
-from .levels import choose_levels
 from .options import RefineOptions
 from .pipeline import Refiner
 from .report import RefineReport
+from .resolution import choose_levels, too_coarse
 from .usd.provenance import file_hashes, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
@@ -226,7 +226,7 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
         start = clock.perf_counter()
         writer.close()
         report.seconds["close"] = clock.perf_counter() - start
-        report.warnings += [str(notice) for notice in writer.notices]
+        report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report)
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
@@ -243,6 +243,16 @@ def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
     start = clock.perf_counter()
     writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused])
     return clock.perf_counter() - start
+
+
+def _coarse_garments(report: RefineReport) -> list[str]:
+    """A warning for each garment whose level was too coarse for its folds."""
+    said = []
+    for index, garment in enumerate(report.garments):
+        entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
+        shares = {time: entry["sharp_folds"] for time, entry in entries.items() if "sharp_folds" in entry}
+        said.append(too_coarse(garment["path"], garment["level"], shares))
+    return [warning for warning in said if warning]
 
 
 def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:

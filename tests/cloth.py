@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ from physgraph_usd.integrate.base import System
 from physgraph_usd.level import refine_garments
 from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene, State
+from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
 
 DOWN = np.array([0.0, -9.81, 0.0])
 FABRIC = Fabric(30.0, 4.7e-6, 0.187)
@@ -29,9 +31,34 @@ def sheet(columns: int, rows: int, edge: float = 0.05, *, kind: str = "triangles
     return mesh, edge * points
 
 
-def settings_of(**options: object) -> SolveSettings:
-    """Settings with an integrator named by ``integrator``."""
-    return SolveSettings(method_named(str(options.pop("integrator", "quasi-newton"))), **options)  # type: ignore[arg-type]
+def settings_of(*, integrator: str = "quasi-newton", **options: Any) -> SolveSettings:
+    """Settings with a method by its name."""
+    return SolveSettings(method_named(integrator), **options)
+
+
+class Answer(NamedTuple):
+    """A state of which every garment was solved."""
+
+    time: float | None
+    points: tuple[np.ndarray, ...]
+    telemetry: tuple[dict[str, Any], ...]
+    reused: tuple[bool, ...]
+
+
+class Solver:
+    """A refiner whose answers are complete."""
+
+    def __init__(self, refiner: Refiner) -> None:
+        self.refinements, self.forget, self._refiner = refiner.refinements, refiner.forget, refiner
+
+    def solve(self, frame: Frame) -> Answer:
+        state = self._refiner.solve(frame)
+        points = tuple(points for points in state.points if points is not None)
+        assert len(points) == len(state.points)
+        return Answer(state.time, points, state.telemetry, state.reused)
+
+    def refine(self, frames: Iterable[Frame]) -> Iterator[Answer]:
+        return (self.solve(frame) for frame in frames)
 
 
 def refiner_of(
@@ -42,11 +69,11 @@ def refiner_of(
     gravity: np.ndarray = DOWN,
     dtype: torch.dtype = torch.float64,
     lanes: int = 1,
-    **options: object,
-) -> Refiner:
+    **options: Any,
+) -> Solver:
     """A refiner of garments, all at one level."""
     scene = Scene(tuple(garments), gravity, tuple(times))
-    return Refiner(scene, settings_of(**options), levels=[level] * len(garments), dtype=dtype, lanes=lanes)
+    return Solver(Refiner(scene, settings_of(**options), levels=[level] * len(garments), dtype=dtype, lanes=lanes))
 
 
 def frame_of(points: np.ndarray, time: float | None = None, *, fabric: Fabric = FABRIC, guide: float = GUIDE) -> Frame:
@@ -60,11 +87,12 @@ def solved(
     points: np.ndarray,
     *,
     fabric: Fabric = FABRIC,
-    painted: dict[str, np.ndarray] | None = None,
-    **options: object,
-) -> State:
+    painted: dict[str, Any] | None = None,
+    **options: Any,
+) -> Answer:
     """One garment's frame, solved from cold."""
-    return refiner_of([garment_of(mesh, rest, **(painted or {}))], **options).solve(frame_of(points, fabric=fabric))
+    garment = replace(garment_of(mesh, rest), **(painted or {}))
+    return refiner_of([garment], **options).solve(frame_of(points, fabric=fabric))
 
 
 def base_of(mesh: PolygonMesh, points: np.ndarray, level: int) -> np.ndarray:
@@ -81,7 +109,7 @@ def group_of(
     level: int = 1,
     gravity: np.ndarray = DOWN,
     dtype: torch.dtype = torch.float64,
-    **options: object,
+    **options: Any,
 ) -> Group:
     """One garment's group."""
     garments = [garment_of(mesh, rest)]
@@ -108,11 +136,6 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt((np.asarray(values) ** 2).sum(axis=-1).mean())) if np.size(values) else 0.0
 
 
-def total(telemetry: dict[str, object], which: str) -> float:
+def total(telemetry: dict[str, Any], which: str) -> float:
     """Total energy of the "input" or the "output" of a frame [J]."""
-    return sum(telemetry["energy_joules"][which].values())  # type: ignore[index]
-
-
-def moving(points: np.ndarray, path: Callable[[float], np.ndarray], times: Sequence[float]) -> list[Frame]:
-    """Frames of one garment whose points at each time a function gives."""
-    return [frame_of(path(time) if callable(path) else points, time) for time in times]
+    return sum(telemetry["energy_joules"][which].values())

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from layers import errors, open_over, world_metres
@@ -19,7 +20,7 @@ from physgraph_usd.shot import refine_shot
 CLOTH = "/World/cloth"
 EDGE = 0.05
 TIMES = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-FAST = {"level": 1, "steps": 6}
+FAST: dict[str, Any] = {"level": 1, "steps": 6}
 
 
 def cloth_shot(
@@ -41,9 +42,9 @@ def cloth_shot(
     return Path(save(stage))
 
 
-def refine(shot: Path, out: Path, **options: object) -> RefineReport:
+def refine(shot: Path, out: Path, **options: Any) -> RefineReport:
     """Refine fast and small."""
-    return refine_shot(shot, out, RefineOptions(**FAST | options))  # type: ignore[arg-type]
+    return refine_shot(shot, out, RefineOptions(**FAST | options))
 
 
 def sample_times(layer: Path, prim: str = CLOTH) -> tuple[float, ...]:
@@ -51,7 +52,7 @@ def sample_times(layer: Path, prim: str = CLOTH) -> tuple[float, ...]:
     return tuple(Sdf.Layer.FindOrOpen(str(layer)).ListTimeSamplesForPath(f"{prim}.points"))
 
 
-def fine(shot: Path, layer: Path, time: float | None, prim: str = CLOTH) -> np.ndarray:
+def fine(shot: Path, layer: Path, time: float | None, *, prim: str = CLOTH) -> np.ndarray:
     """World points [m] of a refined mesh at a time code."""
     return world_metres(open_over(shot, layer), prim, time)
 
@@ -61,7 +62,7 @@ def faults(layer: Path, shot: Path) -> list[str]:
     return errors(layer, shot)
 
 
-def command(*args: object, **options: object) -> subprocess.CompletedProcess[str]:
+def command(*args: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own."""
     line = [sys.executable, "-m", "physgraph_usd", *map(str, args)]
-    return subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, **options)  # type: ignore[call-overload]
+    return subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, **options)

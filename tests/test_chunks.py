@@ -35,7 +35,7 @@ def test_order_and_run_up():
     times = [float(t) for t in range(8)]
     outcomes = list(solve_in_chunks(Counting(), times, workers=2, run_up=3))
     assert [outcome.time for outcome in outcomes] == times
-    assert [int(outcome.points[0][0, 0]) for outcome in outcomes] == [0, 1, 2, 3, 3, 4, 5, 6]
+    assert [int(np.asarray(outcome.points[0])[0, 0]) for outcome in outcomes] == [0, 1, 2, 3, 3, 4, 5, 6]
     assert [outcome.reused for outcome in outcomes] == [(n % 2 == 1,) for n in (0, 1, 2, 3, 3, 4, 5, 6)]
     assert os.getpid() not in {outcome.record["pid"] for outcome in outcomes}
 

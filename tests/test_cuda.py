@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -20,7 +22,7 @@ pytestmark = [
 ]
 
 
-def cloth(device: str, dtype: torch.dtype, **options: object) -> tuple[Group, list[GarmentFrame]]:
+def cloth(device: str, dtype: torch.dtype, **options: Any) -> tuple[Group, list[GarmentFrame]]:
     """A waved sheet at level 2."""
     mesh, rest = sheet(8, 8, EDGE)
     garments = [garment_of(mesh, rest)]

@@ -22,7 +22,6 @@ from layers import (
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from physgraph_usd.errors import LayerError
-from physgraph_usd.usd.provenance import write_root
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.writer import LayerWriter
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from cloth import DOWN, FABRIC, base_of, frame_of, refiner_of, rms, settings_of, sheet, solved, total, wave
+from cloth import DOWN, FABRIC, Solver, base_of, frame_of, refiner_of, rms, settings_of, sheet, solved, total, wave
 from sheets import garment_of
 
 from physgraph_usd.errors import SolveError
@@ -21,7 +22,7 @@ MESH, REST = sheet(6, 4, EDGE)
 OTHER, OTHER_REST = sheet(3, 5, EDGE, kind="quads")
 
 
-def refiner(**options: object) -> Refiner:
+def refiner(**options: Any) -> Solver:
     return refiner_of([garment_of(MESH, REST)], dtype=torch.float32, **options)
 
 

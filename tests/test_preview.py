@@ -15,8 +15,11 @@ from PIL import Image, ImageSequence
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from physgraph_usd.errors import StageError, UsageError
+from physgraph_usd.options import RefineOptions
 from physgraph_usd.preview import preview
 from physgraph_usd.raycast import Surface, draw, encode_color, fit_view
+from physgraph_usd.samples import write_sample
+from physgraph_usd.shot import refine_shot
 from physgraph_usd.usd.meshes import DrawnStage, refined_in, shot_of
 
 SIZE = (320, 160)
@@ -219,3 +222,12 @@ def test_stage_without_meshes_says_so(tmp_path: Path) -> None:
     stage.Save()
     with pytest.raises(StageError, match="shows no mesh"):
         preview(tmp_path / "empty.usda", tmp_path / "a.png")
+
+
+def test_a_layer_of_some_frames_is_drawn_within_them(tmp_path: Path) -> None:
+    shot = write_sample("swatch", tmp_path)
+    layer = tmp_path / "some.usdc"
+    refine_shot(shot, layer, RefineOptions(frames=(3, 5), level=1))
+    stage = DrawnStage(shot, layer)
+    assert stage.times(stage.garments()) == (3.0, 4.0, 5.0)
+    assert max(DrawnStage(shot).times(())) > 5.0

@@ -34,9 +34,8 @@ def refiner(
 ) -> Refiner:
     """A refiner of one sheet that feels some colliders, all by default."""
     mesh, rest = cloth
-    painted = {} if pin is None else {"pin": pin}
     feels = tuple(range(len(kinds)) if felt is None else felt)
-    garment = replace(garment_of(mesh, rest, **painted), colliders=feels)
+    garment = replace(garment_of(mesh, rest, pin=np.zeros(mesh.vertex_count) if pin is None else pin), colliders=feels)
     colliders = tuple(Collider(f"/World/Body{index}", kind) for index, kind in enumerate(kinds))
     settings = settings_of(contact=ContactSettings(form), **options)
     return Refiner(Scene((garment,), gravity, (), colliders), settings, levels=[level], dtype=dtype)

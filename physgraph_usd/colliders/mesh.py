@@ -173,7 +173,7 @@ class MeshSurface:
     def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Whether faces have a corner inside the surface; each corner is asked for once a pose."""
         count = len(self.mesh.points)
-        if self._buried is None:
+        if self._buried is None or self._asked is None:
             self._asked, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
         corners = self._corners[face.long()]
         needed = torch.zeros(count, dtype=torch.bool, device=face.device)

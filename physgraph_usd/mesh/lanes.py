@@ -38,11 +38,11 @@ class Launch:
         # On CUDA kernels queue behind torch's own work on the same stream.
         self._stream = None if device == "cpu" else wp.stream_from_torch(torch.cuda.current_stream(device))
         bounds = np.linspace(0, size, lanes + 1).astype(int).tolist()
-        self._commands = [
-            wp.launch(kernel, dim=b - a, inputs=[a, *inputs], device=device, record_cmd=True)
-            for a, b in pairwise(bounds)
-            if b > a
-        ]
+        self._commands: list[wp.Launch] = []
+        for a, b in pairwise(bounds):
+            command = wp.launch(kernel, dim=b - a, inputs=[a, *inputs], device=device, record_cmd=True)
+            if b > a and command is not None:
+                self._commands.append(command)
 
     def __call__(self, changed: Mapping[int, wp.array]) -> None:
         """Run with some inputs replaced, by their place in ``inputs``."""

@@ -59,6 +59,7 @@ class DrawnStage:
     def __init__(self, shot: Path, over: Path | None = None) -> None:
         """Compose and open."""
         base = _open_layer(shot)
+        self._refined = _refined_times(over) if over is not None else ()
         layers = [_open_layer(path) for path in (over, shot) if path is not None]
         self._root = root_over(base, [layer.identifier for layer in layers])
         with pxr_errors(f"cannot open {shot}"), quiet():
@@ -69,7 +70,10 @@ class DrawnStage:
         self._turn = Z_UP if up_vector(self.stage)[0][2] == 1.0 else np.eye(3)
 
     def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
-        """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons."""
+        """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons.
+
+        Under a refined layer only those from its first sample to its last: outside it holds still.
+        """
         found: list[float] = []
         for prim in traverse(self.stage):
             if (UsdGeom.Mesh(prim) and not paths) or str(prim.GetPath()) in paths:
@@ -77,6 +81,8 @@ class DrawnStage:
             elif animation := UsdSkel.Animation(prim):
                 for attribute in (animation.GetRotationsAttr(), animation.GetTranslationsAttr()):
                     found.extend(attribute.GetTimeSamples())
+        if self._refined:
+            found = [time for time in found if self._refined[0] <= time <= self._refined[-1]]
         return merge(found)
 
     def bake(self, times: tuple[float, ...]) -> None:
@@ -145,6 +151,12 @@ def refined_in(layer: Path) -> tuple[str, ...]:
 
     opened.Traverse(Sdf.Path.absoluteRootPath, visit)
     return tuple(sorted(found))
+
+
+def _refined_times(layer: Path) -> tuple[float, ...]:
+    """Time codes at which a refined layer has points."""
+    opened = _open_layer(layer)
+    return merge(time for path in refined_in(layer) for time in opened.ListTimeSamplesForPath(f"{path}.points"))
 
 
 def _open_layer(path: Path) -> Sdf.Layer:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from cloth import frame_of, refiner_of, rms, sheet, solved, wave
+from cloth import Solver, frame_of, refiner_of, rms, sheet, solved, wave
 from sheets import garment_of, rotation
 
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, State
+from physgraph_usd.scene import Frame
 
 EDGE = 0.05
 MESH, REST = sheet(8, 6, EDGE)
 SPIN = np.diag([-1.0, 1.0, -1.0])
 
 
-def refiner(times: tuple[float, ...], **options: object) -> Refiner:
+def refiner(times: tuple[float, ...], **options: Any) -> Solver:
     return refiner_of([garment_of(MESH, REST)], level=1, times=times, dtype=torch.float32, **options)
 
 
@@ -89,7 +90,7 @@ def test_s31_a_gap_starts_cold_and_an_even_spacing_of_any_size_does_not(times: t
 def test_s31_after_a_gap_the_frame_is_its_cold_start_to_the_bit():
     times = (1.0, 2.0, 7.0, 8.0)
     states = list(refiner(times).refine([frame_of(still(time), time) for time in times]))
-    cold: State = refiner(times).solve(frame_of(still(7.0), 7.0))
+    cold = refiner(times).solve(frame_of(still(7.0), 7.0))
     assert states[2].points[0].tobytes() == cold.points[0].tobytes()
     assert "time between samples" in str(states[2].telemetry[0]["start"])
 

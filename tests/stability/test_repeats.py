@@ -78,14 +78,15 @@ def test_s35_a_hundred_equal_frames_are_one(temporal: str):
 def test_s36_ten_passes_over_its_own_output_do_not_drift(temporal: str, steps: int):
     group = group_of(MESH, REST, level=2, temporal=temporal, steps=steps, tolerance=0.0)
     frame = GarmentFrame(wave(REST), FABRIC, GUIDE)
-    kept, outputs, energies = None, [], []
+    kept, outputs, energies, inputs = None, [], [], []
     for _ in range(11):
         points, kept, telemetry = group.solve([frame], kept, at=None)
         outputs.append(points[0])
         energies.append(total(telemetry, "output"))
+        inputs.append(total(telemetry, "input"))
     changes = [rms(after - before) / (0.05 / 4) for before, after in pairwise(outputs)]
     assert all(after <= before + 1e-9 * abs(before) for before, after in pairwise(energies)), energies
     assert changes[-1] < 0.5 * changes[0], changes
     assert max(changes[5:]) <= max(changes[:5]), changes
-    assert total(telemetry, "output") <= total(telemetry, "input")
+    assert energies[-1] <= inputs[-1]
     assert np.isfinite(outputs[-1]).all()

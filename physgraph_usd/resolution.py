@@ -1,18 +1,22 @@
-"""How many subdivisions a garment needs: no more than its wrinkles (DESIGN section 5).
+"""How fine a garment must be: no more than its wrinkles (DESIGN section 5), and whether it was fine enough.
 
 The buckling wavelength is 2 pi sqrt(D / (Y strain)), with the compression of the cage's edges, 90th percentile over
-a few frames. A level resolves it when its mean edge is under a fifth of it; over a quarter, wrinkles of the mesh's own
-size appear instead of the fabric's (STABILITY S39).
+a few frames. A level resolves it when its mean edge is under a fifth of it. That is for the choice beforehand.
+Afterwards the folds tell: on too coarse a mesh wrinkles of its own size appear, and edges fold sharply (S39).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
+from torch import Tensor
 
+from .errors import StageError
+from .level import Level, hinge_geometry
 from .mesh.topology import edges_of
 from .scene import Frame, Garment, GarmentFrame, Scene
 
@@ -21,7 +25,9 @@ MOST = 4
 SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
 EDGES_PER_WAVE = 5.0
-FEWEST_EDGES_PER_WAVE = 4.0
+SHARP_FOLD = math.radians(45.0)
+SHARP_SHARE = 0.01
+"""Share of sharp folds above which the mesh shows: 0.1% on the T-shirt at level 3, 1.1% at level 2, where it does."""
 LEAST_TENSION = 1e-9
 """[N/m]; cloth without stiffness does not buckle."""
 SHORTEST_WAVE = 1e-3
@@ -37,14 +43,12 @@ class LevelChoice:
         reason: Why, in words.
         wavelength: Buckling wavelength [m].
         edge: Mean rest edge at that level [m].
-        warning: What is too coarse, or "".
     """
 
     level: int
     reason: str
     wavelength: float
     edge: float
-    warning: str
 
 
 def choose_levels(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[LevelChoice]:
@@ -59,17 +63,25 @@ def choose_levels(scene: Scene, frame_at: Callable[[float | None], Frame]) -> li
     """
     picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
     times: list[float | None] = [scene.times[i] for i in picks] or [None]
-    frames = [frame_at(time) for time in times]
+    frames = [frame for time in times if (frame := _readable(frame_at, time)) is not None]
     return [
         _choose(garment, [frame.garments[index] for frame in frames]) for index, garment in enumerate(scene.garments)
     ]
 
 
+def _readable(frame_at: Callable[[float | None], Frame], time: float | None) -> Frame | None:
+    """A frame, or None where the stage is broken: its turn to be refined will name what is wrong."""
+    try:
+        return frame_at(time)
+    except StageError:
+        return None
+
+
 def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     ends = edges_of(garment.mesh.triangulate(garment.rest).triangles, garment.mesh.vertex_count).vertices
-    if not len(ends):
+    if not len(ends) or not frames:
         level = 0 if garment.level == AUTO else garment.level
-        return LevelChoice(level, "the garment has no faces", 0.0, 0.0, "")
+        return LevelChoice(level, "there are no faces or no readable frames to go by", 0.0, 0.0)
     rest = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
     strain, edge = _compression(rest, ends, frames), float(rest.mean())
     fabric = frames[0].fabric
@@ -80,14 +92,7 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     if level == AUTO:
         level = min(needed, MOST)
         reason = f"auto: {said}" + (f"; {needed} needed, {MOST} is the most" if needed > MOST else "")
-    fine = edge / 2**level
-    warning = ""
-    if wave < FEWEST_EDGES_PER_WAVE * fine:
-        warning = (
-            f"<{garment.path}>: {said}; at level {level} edges of {1e3 * fine:.1f} mm are too coarse for them and show "
-            f"wrinkles of their own size; use level {needed} or raise bendStiffness"
-        )
-    return LevelChoice(level, reason, wave, fine, warning)
+    return LevelChoice(level, reason, wave, edge / 2**level)
 
 
 def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame]) -> float:
@@ -95,3 +100,30 @@ def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame])
     lengths = [np.linalg.norm(f.points[ends[:, 1]] - f.points[ends[:, 0]], axis=1) for f in frames]
     ratios = np.concatenate(lengths) / np.tile(np.maximum(rest, 1e-12), len(frames))
     return max(float(np.percentile(1.0 - ratios, 90)), LEAST_STRAIN)
+
+
+def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
+    """Share of the hinges that fold by more than 45 degrees; every fourth hinge is looked at."""
+    hinges = level.hinges[::4].cpu().numpy()
+    if not len(hinges):
+        return 0.0
+    angle = hinge_geometry(x.double().cpu().numpy(), hinges)[0]
+    return float((np.abs(angle) > SHARP_FOLD).mean())
+
+
+def too_coarse(path: str, level: int, shares: Mapping[float | None, float]) -> str:
+    """A warning where the mesh was too coarse for the folds, or "".
+
+    Args:
+        path: The garment.
+        level: Its number of subdivisions.
+        shares: Share of sharp folds at each time code.
+    """
+    if not shares or max(shares.values()) <= SHARP_SHARE:
+        return ""
+    worst = max(shares, key=lambda time: shares[time])
+    at = "" if worst is None else f" at time code {worst:g}"
+    return (
+        f"<{path}>{at}: {shares[worst]:.2g} of the edges fold by more than 45 degrees: level {level} is too coarse for "
+        f"this fabric and shows wrinkles of the mesh's own size; use level {level + 1} or raise bendStiffness"
+    )

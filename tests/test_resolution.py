@@ -1,4 +1,4 @@
-"""How many subdivisions a garment gets: by the formula for its buckling wavelength."""
+"""How many subdivisions a garment gets, by the formula for its buckling wavelength; and whether they were enough."""
 
 from __future__ import annotations
 
@@ -7,12 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from cloth import DOWN, FABRIC, frame_of, sheet
-from meshes import mesh_of
+from meshes import grid, mesh_of
 from sheets import garment_of
 
 from physgraph_usd.fabric import Fabric
-from physgraph_usd.levels import AUTO, EDGES_PER_WAVE, LEAST_STRAIN, MOST, LevelChoice, choose_levels
+from physgraph_usd.level import build_levels
+from physgraph_usd.resolution import (
+    AUTO,
+    EDGES_PER_WAVE,
+    LEAST_STRAIN,
+    MOST,
+    SHARP_SHARE,
+    LevelChoice,
+    choose_levels,
+    sharp_folds,
+    too_coarse,
+)
 from physgraph_usd.scene import Frame, Scene
 
 EDGE = 0.05
@@ -63,12 +75,32 @@ def test_no_more_than_the_most():
     assert "is the most" in choice.reason
 
 
-def test_a_level_that_was_asked_for_is_kept_with_a_word_when_it_is_too_coarse():
+def test_a_level_that_was_asked_for_is_kept():
     choice, _ = choose(0.3, level=1, fabric=replace(FABRIC, bend=1e-7))
     assert choice.level == 1
     assert choice.reason == "as authored or asked for"
-    assert "too coarse" in choice.warning
-    assert not choose(0.3, level=1, fabric=replace(FABRIC, bend=1e-2))[0].warning
+
+
+def pleated(fold: float) -> float:
+    """Share of sharp folds of a sheet pleated by an angle at every column of vertices."""
+    mesh, rest = grid(12, 12)
+    rise = (rest[:, 0].round().astype(int) % 2) * np.tan(fold / 2.0)
+    level = build_levels([garment_of(mesh, rest)], [()], dtype=torch.float64)[0]
+    return sharp_folds(level, torch.as_tensor(rest + rise[:, None] * [0.0, 0.0, 1.0]))
+
+
+def test_sharp_folds_are_counted():
+    assert pleated(0.0) == 0.0
+    assert pleated(np.radians(30.0)) == 0.0
+    assert 0.2 < pleated(np.radians(70.0)) < 0.5
+
+
+def test_a_word_when_folds_are_too_sharp_for_the_mesh():
+    assert not too_coarse("/coat", 2, {})
+    assert not too_coarse("/coat", 2, {1.0: SHARP_SHARE})
+    said = too_coarse("/coat", 2, {1.0: 0.0, 7.0: 0.03, 9.0: 0.02})
+    assert "</coat> at time code 7" in said
+    assert "use level 3" in said
 
 
 def test_few_frames_are_read_first_and_last_among_them():

@@ -1,0 +1,35 @@
+"""The pictures of README and docs: each sample coarse and refined.
+
+python -m benchmarks.pictures docs/pictures
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks.sleeve import say
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.preview import preview
+from physgraph_usd.samples import write_sample
+from physgraph_usd.shot import refine_shot
+
+SHOWN = {"sleeve": 24.0, "skirt": 24.0, "flag": 24.0, "tshirt": 36.0}
+"""Time code to draw, by sample."""
+
+
+def main() -> None:
+    """Refine each sample up to its time code and draw it."""
+    out = Path(sys.argv[1])
+    out.mkdir(parents=True, exist_ok=True)
+    for name, time in SHOWN.items():
+        with tempfile.TemporaryDirectory() as folder:
+            shot = write_sample(name, Path(folder))
+            layer = Path(folder) / "refined.usdc"
+            refine_shot(shot, layer, RefineOptions(frames=(time - 12.0, time)))
+            say(str(preview(layer, out / f"{name}.png", times=[time], size=(1280, 640))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""How still the detail is from frame to frame, and what stillness costs in energy.
+
+    python -m benchmarks.temporal
+
+The detail is the fine cloth minus the upsampled cage; its jerk is the RMS of its third difference over 24 frames, in
+mean fine edges. Energies are means over the frames, without the tether's own.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.sleeve import CORES, say
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.samples import write_sample
+from physgraph_usd.shot import prepare_device
+from physgraph_usd.usd.reader import Shot, open_shot
+
+FRAMES = 24
+RUNS = (("off", 0.0), ("warm", 0.0), ("tether", 400.0), ("tether", 2000.0), ("tether", 10000.0))
+
+
+def main() -> None:
+    """Print a row per sample and way of using the last frame."""
+    prepare_device("cpu")
+    say("| sample | temporal | tether [1/s^2] | jerk [edges] | energy [J] |\n|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("sleeve", "skirt", "flag"):
+            shot = open_shot(write_sample(name, Path(folder)))
+            for temporal, stiffness in RUNS:
+                jerk, energy = measure(shot, temporal, stiffness)
+                say(f"| {name} | {temporal} | {stiffness:g} | {jerk:.3f} | {energy:.5f} |")
+
+
+def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
+    """Jerk of the detail [mean fine edges] and mean energy [J] of a shot's first frames."""
+    settings = replace(RefineOptions(temporal=temporal).solve_settings(), tether=stiffness)
+    refiner = Refiner(shot.scene, settings, lanes=CORES)
+    level = refiner.groups[0].levels[-1]
+    details, energies = [], []
+    for time in shot.scene.times[:FRAMES]:
+        frame = shot.frame(time)
+        state = refiner.solve(frame)
+        details.append(np.asarray(state.points[0]) - level.from_coarse @ frame.garments[0].points)
+        entry = state.telemetry[0]
+        if "energy_joules" in entry:
+            energies.append(sum(entry["energy_joules"]["output"].values()))  # type: ignore[index]
+    jerk = np.diff(np.array(details), 3, axis=0)
+    return float(np.sqrt((jerk**2).sum(axis=-1).mean()) / float(level.spacing.mean())), float(np.mean(energies))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""Shots that are broken: frames that fail, points that are repaired, files that are no stage."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from pxr import Usd, UsdGeom
+from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_times
+
+from physgraph_usd.cli import main
+from physgraph_usd.errors import PhysGraphError, SolveError
+from physgraph_usd.shot import inspect_shot
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    return cloth_shot(tmp_path / "shot.usdc")
+
+
+def only(folder: Path, *names: str) -> bool:
+    return sorted(file.name for file in folder.iterdir()) == sorted(names)
+
+
+class TestFramesThatFail:
+    """Points of 1e25 m: finite in the file, not in the energy."""
+
+    def test_one_is_named_and_the_others_are_written(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        out, told = tmp_path / "fine.usdc", tmp_path / "fine.json"
+        report = refine(shot, out, report=told)
+        assert report.exit_code == 3
+        assert list(report.failed) == ["3"]
+        assert CLOTH in report.failed["3"]
+        assert "time code 3" in report.failed["3"]
+        assert sample_times(out) == (1.0, 2.0, 4.0, 5.0, 6.0)
+        assert json.loads(told.read_text())["failed"].keys() == {"3"}
+        assert faults(out, shot) == []
+
+    def test_the_frame_after_it_is_a_cold_start(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        report = refine(shot, tmp_path / "fine.usdc")
+        assert str(report.frames[3]["garments"][0]["start"]).startswith("cold")
+
+    def test_several_workers_name_the_same(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        report = refine(shot, tmp_path / "fine.usdc", workers=2)
+        assert (report.exit_code, list(report.failed)) == (3, ["3"])
+
+    def test_the_first_one(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={1.0: 1e25})
+        report = refine(shot, tmp_path / "fine.usdc", rest_frame=2.0)
+        assert (report.exit_code, list(report.failed)) == (3, ["1"])
+        assert sample_times(tmp_path / "fine.usdc") == TIMES[1:]
+
+    def test_all_of_them_leave_no_layer(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken=dict.fromkeys(TIMES, 1e25))
+        with pytest.raises(SolveError, match="time code 1"):
+            refine(shot, tmp_path / "fine.usdc")
+        assert only(tmp_path, "shot.usdc")
+
+    def test_a_frame_that_cannot_be_read_fails_alone(self, tmp_path: Path):
+        """More than a tenth of the points NaN in the middle of the shot."""
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={4.0: float("nan")})
+        report = refine(shot, tmp_path / "fine.usdc")
+        assert (report.exit_code, list(report.failed)) == (3, ["4"])
+        assert "NaN" in report.failed["4"]
+
+    def test_the_command_ends_with_3(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
+        line = ["refine", str(shot), "-o", str(tmp_path / "fine.usdc"), "--level", "1", "--steps", "4"]
+        result = CliRunner().invoke(main, line)
+        assert result.exit_code == 3
+        assert "time code 3" in result.stderr
+
+    def test_an_exception_nobody_foresaw_leaves_nothing(
+        self, shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        def fail(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("physgraph_usd.pipeline.Refiner.solve", fail)
+        with pytest.raises(KeyboardInterrupt):
+            refine(shot, tmp_path / "fine.usdc")
+        assert only(tmp_path, "shot.usdc")
+
+
+class TestS5:
+    @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+    def test_s5_a_broken_point_leaves_other_frames_bitwise_alone(self, tmp_path: Path, bad: float):
+        clean = cloth_shot(tmp_path / "clean.usdc")
+        dirty = cloth_shot(tmp_path / "dirty.usdc")
+        stage = Usd.Stage.Open(str(dirty))
+        attribute = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr()
+        points = np.array(attribute.Get(3.0))
+        points[11, 1] = bad
+        attribute.Set(type(attribute.Get(3.0)).FromNumpy(points), 3.0)
+        stage.Save()
+        report = refine(dirty, tmp_path / "d.usdc", temporal="off")
+        refine(clean, tmp_path / "c.usdc", temporal="off")
+        assert report.exit_code == 0
+        assert any("points[11]" in warning for warning in report.warnings)
+        for time in TIMES:
+            same = np.array_equal(fine(clean, tmp_path / "c.usdc", time), fine(dirty, tmp_path / "d.usdc", time))
+            assert same == (time != 3.0), time
+        assert np.isfinite(fine(dirty, tmp_path / "d.usdc", 3.0)).all()
+        assert np.abs(fine(clean, tmp_path / "c.usdc", 3.0) - fine(dirty, tmp_path / "d.usdc", 3.0)).max() < EDGE
+
+
+class TestBrokenShots:
+    def test_s32_topology_that_varies_is_refused_by_name_and_time(self, shot: Path, tmp_path: Path):
+        stage = Usd.Stage.Open(str(shot))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+        points = mesh.GetPointsAttr().Get(4.0)
+        mesh.GetPointsAttr().Set(points[:-1], 4.0)
+        stage.Save()
+        report = refine(shot, tmp_path / "fine.usdc")
+        assert (report.exit_code, list(report.failed)) == (3, ["4"])
+        assert CLOTH in report.failed["4"]
+        assert "from 35 to 34" in report.failed["4"]
+        assert sample_times(tmp_path / "fine.usdc") == (1.0, 2.0, 3.0, 5.0, 6.0)
+        assert faults(tmp_path / "fine.usdc", shot) == []
+
+    @pytest.mark.parametrize("text", [b"", b"not a stage", b"PXR-USDC" + bytes(200)])
+    def test_files_that_are_no_stage(self, tmp_path: Path, text: bytes):
+        path = tmp_path / "shot.usdc"
+        path.write_bytes(text)
+        with pytest.raises(PhysGraphError, match=r"shot\.usdc"):
+            refine(path, tmp_path / "fine.usdc")
+        with pytest.raises(PhysGraphError):
+            inspect_shot(path)
+        assert only(tmp_path, "shot.usdc")
