@@ -20,8 +20,10 @@ from .colliders.base import Nearest, Surface
 from .colliders.sign import MARGIN, signed_distances
 from .forces.contact import Contact, Planes
 from .level import Level
-from .measure import penetration
+from .measure import penetration, pinched
 
+PINCHED = 0.5
+"""Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
 
@@ -85,6 +87,7 @@ class _Track:
         side: Start side of each vertex, of open surfaces, shape (V,); zeros for closed ones.
         at: Positions at which distances were found [m], shape (V, 3).
         known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
+        longest: Longest way out from between overlapping parts that a vertex is sent [m].
     """
 
     surface: Surface
@@ -93,12 +96,14 @@ class _Track:
     side: Tensor
     at: Tensor
     known: Tensor
+    longest: float
 
     def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Find anew what may be nearer than a distance that each vertex has [m].
 
         Returns:
-            Numbers of those vertices, their unit normals away from the surface, and the signed distances.
+            Numbers of those vertices, their unit normals away from the surface, and the signed distances; without
+            those that are pinched.
         """
         moved = (x - self.at).norm(dim=1)
         which = torch.nonzero(self.known - moved < within).squeeze(1)
@@ -110,13 +115,17 @@ class _Track:
         self.at[which], self.known[which] = x[which], found.distance * sign
         distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
         within = torch.nonzero(sign < 0).squeeze(1)
+        kept = torch.ones_like(sign, dtype=torch.bool)
         if len(within):
-            way = self.surface.exit(asked[within], _at(found, within))
+            near = _at(found, within)
+            way = self.surface.exit(asked[within], near)
             distance[within], point[within], outward[within] = way.distance, way.point, way.normal
+            kept[within] = ~pinched(near, way, self.longest)
         away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
         outward = outward * self._outward(which).unsqueeze(1)
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
-        return which, torch.nn.functional.normalize(normal, dim=1, eps=1e-30), distance * sign
+        normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+        return which[kept], normal[kept], (distance * sign)[kept]
 
     def _outward(self, which: Tensor) -> Tensor:
         """1 where a face's normal points away from the body, -1 where the start side is the other one."""
@@ -237,7 +246,8 @@ class FrameContact:
             reach = float(offset.max()) + float(levels[0].spacing.mean())
             known = signed_distances(each.surface, base + shift, finest.edges, reach=reach)
             side = _start_sides(each.surface, coarse + shift, finest)
-            tracks.append(_Track(each.surface, shift, offset, side, base, known))
+            longest = PINCHED * float(levels[0].spacing.mean())
+            tracks.append(_Track(each.surface, shift, offset, side, base, known, longest))
         return FrameContact(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
 
     def measure(
@@ -256,8 +266,8 @@ class FrameContact:
             after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {
-                "before": asdict(penetration(surface, finest, base + shift, before)),
-                "after": asdict(penetration(surface, finest, x + shift, after)),
+                "before": asdict(penetration(surface, finest, base + shift, before, track.longest)),
+                "after": asdict(penetration(surface, finest, x + shift, after, track.longest)),
             }
         return {"bodies": bodies}
 
@@ -269,7 +279,7 @@ class FrameContact:
         places = [torch.arange(fine.start, fine.start + own.stop - own.start) for own, fine in pairs]
         which = torch.cat(places).to(level.rest.device)
         tracks = [
-            _Track(t.surface, t.shift, t.offset[which], t.side[which], t.at[which].clone(), t.known[which].clone())
+            replace(t, **{name: getattr(t, name)[which].clone() for name in ("offset", "side", "at", "known")})
             for t in self._tracks
         ]
         self._views[level.index] = LevelContact(level, tracks, self._settings)

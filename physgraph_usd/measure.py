@@ -12,11 +12,13 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .colliders.base import Surface
+from .colliders.base import Nearest, Surface
 from .colliders.mesh import MeshSurface
 from .level import Level
 from .mesh.lanes import Launch
 
+DETOUR = 1.05
+"""The nearest face is buried where the way out is longer than this, over the distance to it."""
 COVER = 0.6
 """No point of a triangle is farther than this from its nearest corner, in longest sides (1 / sqrt(3), to spare)."""
 DEEP = 1e-4
@@ -28,10 +30,12 @@ class Penetration:
     """How far a garment is in one surface.
 
     Attributes:
-        inside: Free vertices deeper than `DEEP` in a closed surface.
+        inside: Free vertices deeper than `DEEP` in a closed surface, without those that are pinched.
         percent: Their part of all free vertices.
         deepest_mm: Depth of the deepest free vertex [mm].
         pinned: Pinned vertices deeper than `DEEP`: they stay.
+        pinched: Free vertices between parts of the body that overlap, farther from any way out than half a cage
+            edge: they stay too, out of sight; forced out, they would tear the cloth.
         crossings: Edges of the cloth through faces of the body, and edges of the body through faces of the cloth.
     """
 
@@ -39,11 +43,16 @@ class Penetration:
     percent: float
     deepest_mm: float
     pinned: int
+    pinched: int
     crossings: int
 
 
 def penetration(
-    surface: Surface, level: Level, x: Float[Tensor, "vertices 3"], signed: Float[Tensor, " vertices"]
+    surface: Surface,
+    level: Level,
+    x: Float[Tensor, "vertices 3"],
+    signed: Float[Tensor, " vertices"],
+    longest: float,
 ) -> Penetration:
     """Measure one garment group against one surface.
 
@@ -52,29 +61,45 @@ def penetration(
         level: The level that x belongs to.
         x: Positions in the surface's coordinates [m].
         signed: Signed distances at x, lower bounds where they are positive [m].
+        longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
     """
     free = level.free[:, 0]
-    depth = _depths(surface, x, signed)
-    deep = depth > DEEP
+    depth, held = _depths(surface, x, signed, longest)
+    deep = (depth > DEEP) & ~held
     inside = int((deep & free).sum())
-    deepest = float((depth * free).max()) if len(depth) else 0.0
+    deepest = float((depth * (free & ~held)).max()) if len(depth) else 0.0
     return Penetration(
         inside=inside,
         percent=round(100.0 * inside / max(int(free.sum()), 1), 4),
         deepest_mm=round(1e3 * deepest, 4),
         pinned=int((deep & ~free).sum()),
+        pinched=int((held & free).sum()),
         crossings=crossings(surface, level, x, signed.abs()),
     )
 
 
-def _depths(surface: Surface, x: Tensor, signed: Tensor) -> Float[Tensor, " vertices"]:
-    """How far each vertex is from where it could leave a closed surface [m]; 0 outside."""
-    depth = torch.zeros_like(signed)
+def _depths(
+    surface: Surface, x: Tensor, signed: Tensor, longest: float
+) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
+    """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched."""
+    depth, held = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
     within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
     if len(within):
         found = surface.closest(x[within], torch.full_like(signed[within], float("inf")))
-        depth[within] = surface.exit(x[within], found).distance
-    return depth
+        way = surface.exit(x[within], found)
+        depth[within], held[within] = way.distance, pinched(found, way, longest)
+    return depth, held
+
+
+def pinched(found: Nearest, way: Nearest, longest: float) -> Bool[Tensor, " points"]:
+    """Which points inside are between overlapping parts and too far from a way out.
+
+    Args:
+        found: The closest points.
+        way: The closest points on faces that lie bare.
+        longest: Longest way out [m].
+    """
+    return (way.distance > longest) & (way.distance > DETOUR * found.distance)
 
 
 @wp.kernel
