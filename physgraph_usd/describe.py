@@ -128,6 +128,8 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
         "gravity": f"{np.linalg.norm(opened.scene.gravity):.3g} m/s^2",
         "guide": "ties the local average to the coarse animation",
     }
+    if _touching(opened) and options.contact != "off":
+        modelled["contact"] = f"{options.contact} form, with {', '.join(_touching(opened))}, in frames where it is near"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
@@ -141,12 +143,20 @@ def _in_plane(report: RefineReport) -> dict[str, str]:
     return modelled | ({"membrane": f"triangle membrane for {', '.join(triangles)}"} if triangles else {})
 
 
+def _touching(opened: Shot) -> list[str]:
+    """Paths of the colliders that some garment feels."""
+    felt = {index for garment in opened.scene.garments for index in garment.colliders}
+    return [collider.path for index, collider in enumerate(opened.scene.colliders) if index in felt]
+
+
 def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
-        "contact": f"not in this version; {len(opened.colliders)} collider(s) found and ignored",
         "self contact": "not in this version",
         "network": "not in this version; quasi-Newton integrates",
     }
+    if "contact" not in report.modelled:
+        switched = "switched off by --contact" if _touching(opened) else "no collider is tagged or named"
+        left_out["contact"] = switched
     if "membrane" not in report.modelled:
         left_out["triangle membrane"] = "no garment authors shear stiffness: edge springs have G = 0.375 Y"
     return left_out

@@ -12,10 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .contact import ContactSettings, FrameContact, LevelContact, Touching
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
 from .forces.base import Force, ForceModule
 from .forces.bending import Bending
+from .forces.contact import Contact
 from .forces.gravity import Gravity
 from .forces.guide import Guide, GuideMap
 from .forces.membrane import in_plane_terms
@@ -29,8 +31,14 @@ from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .mesh.subdivide import Refinement
 from .resolution import sharp_folds
+from .rounds import solve_rounds
 from .scene import Garment, GarmentFrame
 
+WORTH = 2.0
+"""Elastic energy of carried detail, over that of the upsampled cage, beyond which a frame starts cold: detail that is
+worth carrying takes compression up and lowers it; carried by a crumpled cage it tears the cloth."""
+LEAST_STRAIN = 1e-2
+"""Strain of the whole garment under which that ratio is not looked at."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
 COARSE_TOLERANCE = 0.1
@@ -50,6 +58,7 @@ class SolveSettings:
         tether: Tether stiffness [1/s^2].
         potential: "continuum" or "paper".
         reset: When a frame starts cold.
+        contact: How contact is solved.
     """
 
     method: Method
@@ -60,6 +69,7 @@ class SolveSettings:
     tether: float = 2000.0
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
+    contact: ContactSettings = field(default_factory=ContactSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +125,15 @@ class Group:
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
         self._material: tuple[object, ...] = ()
         self._forces: list[_LevelForces] = []
+        self._stretch = 0.0
 
     def solve(
-        self, frames: Sequence[GarmentFrame], kept: Carried | None, *, at: float | None
+        self,
+        frames: Sequence[GarmentFrame],
+        kept: Carried | None,
+        *,
+        at: float | None,
+        touching: Sequence[Touching] = (),
     ) -> tuple[list[np.ndarray], Carried, dict[str, object]]:
         """Solve one frame.
 
@@ -125,6 +141,7 @@ class Group:
             frames: The garments at this time code.
             kept: The previous frame's result, or None for a cold start.
             at: The time code, for errors.
+            touching: Surfaces that the garments may touch.
 
         Returns:
             World positions [m] of each garment, what the next frame needs, and telemetry.
@@ -138,17 +155,26 @@ class Group:
         origin = world.mean(axis=0) if len(world) else np.zeros(3)
         coarse = self._tensor(world - origin)
         predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
+        contact = self._contact(touching, coarse, origin, frames)
         prepared = time.perf_counter()
         try:
-            x, reports, module = self._descend(forces, coarse, predicted, clock)
+            x, reports, module = self._descend(forces, coarse, predicted, clock, contact=contact)
         except SolveError as error:
             raise SolveError(self._blame(forces[-1], coarse, error, at)) from error
-        solved = time.perf_counter()
         result = self._finish(x, coarse, frames)
+        pushed = None
+        if contact is not None:
+            scaled = result is not x
+            result, pushed = contact.at(self.levels[-1], self.levels[-1]).project(result)
+            x = x if scaled else result
+        solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
         carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
+        if contact is not None:
+            start = self.levels[-1].base.apply(coarse)
+            telemetry["contact"] = contact.measure(self.levels[-1], start, result) | {"projected": pushed}
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -192,6 +218,7 @@ class Group:
                 for level, guide_map in zip(self.levels, self._guide_maps, strict=True)
             ]
             self._material = material
+            self._stretch = max(frame.fabric.stretch for frame in frames)
         return self._forces
 
     def _level_forces(self, level: Level, guide_map: GuideMap, frames: Sequence[GarmentFrame]) -> _LevelForces:
@@ -224,16 +251,41 @@ class Group:
         reset = self._settings.reset
         if motion > reset.move or turn > reset.turn:
             return None, f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees"
-        fixed = self.levels[-1].base.apply(coarse)
-        return torch.where(self.levels[-1].free, predicted, fixed), "warm"
+        finest = self.levels[-1]
+        base = finest.base.apply(coarse)
+        predicted = torch.where(finest.free, predicted, base)
+        carried, plain = (self._elastic_energy(x) for x in (predicted, base))
+        least = LEAST_STRAIN**2 * self._stretch * float(finest.vertex_area.sum())
+        if carried > WORTH * max(plain, least):
+            return None, f"cold: carried detail has {carried / max(plain, least):.3g} times the upsampled cage's energy"
+        return predicted, "warm"
+
+    def _elastic_energy(self, x: Tensor) -> float:
+        """Energy of the finest level's stretch and bending [J]."""
+        terms = [term for term in self._forces[-1].elastic if not isinstance(term, Gravity)]
+        return sum(ForceModule(terms).energies(x).values())
+
+    def _contact(
+        self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray, frames: Sequence[GarmentFrame]
+    ) -> FrameContact | None:
+        """The bodies of a frame, or None when there are none."""
+        if not touching or not len(coarse):
+            return None
+        weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
+        settings = self._settings.contact.scaled(self.levels[0], stretch=self._stretch, weight=weight)
+        return FrameContact.begin(self.levels, touching, coarse, origin=origin, settings=settings)
 
     def _descend(
-        self, forces: list[_LevelForces], coarse: Tensor, predicted: Tensor | None, clock: float
+        self,
+        forces: list[_LevelForces],
+        coarse: Tensor,
+        predicted: Tensor | None,
+        clock: float,
+        *,
+        contact: FrameContact | None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule]:
         """Walk the levels; a warm start goes straight to the finest."""
-        integrator = self._settings.method.build()
-        cold = predicted is None
-        first = 0 if cold and self._settings.method.nested else len(self.levels) - 1
+        first = 0 if predicted is None and self._settings.method.nested else len(self.levels) - 1
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
         module = ForceModule(())
@@ -246,13 +298,39 @@ class Group:
             if predicted is not None and self._settings.temporal == "tether":
                 density = torch.stack([force.density for force in lasting.elastic if isinstance(force, Gravity)])[0]
                 terms = ForceModule((*module.forces, Tether(level, density, self._settings.tether, predicted)))
-            system = System(terms, lasting.metric, free=level.free, spacing=level.spacing)
-            if cold:
-                x = leave_saddle(system, level, x, outward=self._outward)
             budget = self._budget(index, len(self.levels), clock)
-            x, report = solve_level(system, integrator, x, level=level.index, budget=budget)
-            reports.append(report)
+            view = None if contact is None else contact.at(level, self.levels[-1])
+            cold = predicted is None
+            x, made, touched = self._solve_level(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
+            reports += made
+            module = module if touched is None else ForceModule((*module.forces, touched))
         return x, reports, module
+
+    def _solve_level(
+        self,
+        terms: ForceModule,
+        metric: Metric,
+        level: Level,
+        *,
+        x: Tensor,
+        cold: bool,
+        view: LevelContact | None,
+        budget: Budget,
+    ) -> tuple[Tensor, list[LevelReport], Contact | None]:
+        """Solve one level, in rounds where bodies are near; returns the contact term too, where there is one."""
+
+        def system(touched: Contact | None) -> System:
+            module = terms if touched is None else ForceModule((*terms.forces, touched))
+            return System(module, metric, free=level.free, spacing=level.spacing)
+
+        integrator = self._settings.method.build()
+        touched = None if view is None else view.term(x)
+        if cold:
+            x = leave_saddle(system(touched), level, x, outward=self._outward)
+        if view is None:
+            x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
+            return x, [report], None
+        return solve_rounds(system, integrator, x, touched=touched, view=view, level=level.index, budget=budget)
 
     def _budget(self, index: int, count: int, clock: float) -> Budget:
         """Steps and deadline of one level."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .contact import ContactSettings
 from .errors import UsageError
 from .group import SolveSettings
 from .integrate import method_named
@@ -15,6 +16,8 @@ from .integrate import method_named
 TEMPORAL = ("tether", "warm", "off")
 POTENTIALS = ("continuum", "paper")
 MODES = ("over", "sibling")
+CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
+"""Forms of contact by their names on the command line."""
 _NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
 
 
@@ -36,6 +39,7 @@ class RefineOptions:
         mode: "over" or "sibling".
         temporal: "tether", "warm" or "off": how a frame uses the last one.
         potential: "continuum" or "paper".
+        contact: "quadratic", "paper" (its linear form) or "off".
         workers: Processes that share the frames.
         report: JSON file to write, or None.
         overwrite: Replace files that exist.
@@ -59,6 +63,7 @@ class RefineOptions:
     mode: str = "over"
     temporal: str = "tether"
     potential: str = "continuum"
+    contact: str = "quadratic"
     workers: int = 1
     report: Path | None = None
     overwrite: bool = False
@@ -82,6 +87,7 @@ class RefineOptions:
             budget_ms=self.budget_ms,
             temporal=self.temporal,
             potential=self.potential,
+            contact=ContactSettings(CONTACTS[self.contact]),
         )
 
     def check(self) -> None:
@@ -95,6 +101,7 @@ class RefineOptions:
             ("temporal", self.temporal, TEMPORAL),
             ("potential", self.potential, POTENTIALS),
             ("mode", self.mode, MODES),
+            ("contact", self.contact, tuple(CONTACTS)),
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")

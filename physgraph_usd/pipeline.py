@@ -9,6 +9,8 @@ from statistics import median
 import numpy as np
 import torch
 
+from .broad_phase import Bodies, bounds_of, reach_of
+from .colliders.pose import Pose
 from .detail import Carried
 from .errors import GarmentError
 from .group import Group, SolveSettings
@@ -19,11 +21,12 @@ from .scene import Frame, GarmentFrame, Scene, State
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """One garment's last solved frame."""
+    """One garment's last solved frame, and the bodies that it could touch there."""
 
     frame: GarmentFrame
     points: np.ndarray
     carried: Carried
+    near: dict[int, Pose | None]
 
 
 class Refiner:
@@ -69,6 +72,8 @@ class Refiner:
             Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device, lanes=lanes)
             for garment, chain in zip(scene.garments, self.refinements, strict=True)
         ]
+        self._scene = scene
+        self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
         self._last: list[_Known | None] = [None] * len(self.groups)
         self._time: float | None = None
 
@@ -99,12 +104,13 @@ class Refiner:
             wanted: For each garment, whether it is asked for; all when None.
         """
         gap = self._is_gap(frame.time)
+        self._bodies.pose(frame.colliders)
         points: list[np.ndarray | None] = []
         telemetry: list[dict[str, object]] = []
         reused: list[bool] = []
         for index, garment in enumerate(frame.garments):
             known = self._last[index]
-            same = known is not None and _same(garment, known.frame)
+            same = known is not None and _same(garment, known.frame) and self._same_bodies(index, garment, known)
             reused.append(same)
             if wanted is not None and not wanted[index]:
                 points.append(None)
@@ -120,16 +126,45 @@ class Refiner:
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
 
     def _solve_group(
-        self, index: int, garment: GarmentFrame, time: float | None, *, gap: bool
+        self, index: int, frame: GarmentFrame, time: float | None, *, gap: bool
     ) -> tuple[np.ndarray, dict[str, object]]:
         """Solve one garment apart and keep what its next frame needs; returns its points and telemetry."""
         known = self._last[index]
         kept = None if gap or known is None else known.carried
-        solved, carried, entry = self.groups[index].solve([garment], kept, at=time)
-        self._last[index] = _Known(garment, solved[0], carried)
+        near = self._near(index, frame)
+        while True:
+            touching = self._bodies.touching(near, [frame.offset])
+            solved, carried, entry = self.groups[index].solve([frame], kept, at=time, touching=touching)
+            more = self._reached(index, frame, solved[0])
+            if more <= set(near):
+                break
+            near = tuple(sorted({*near, *more}))
+        self._last[index] = _Known(frame, solved[0], carried, {each: self._bodies.pose_of(each) for each in near})
+        if self._scene.garments[index].colliders:
+            entry["near"] = [self._scene.colliders[each].path for each in near]
         if gap:
             entry["start"] = "cold: the time between samples is too long"
         return solved[0], entry
+
+    def _near(self, index: int, frame: GarmentFrame) -> tuple[int, ...]:
+        """Numbers of the bodies that a garment may touch."""
+        garment = self._scene.garments[index]
+        if not garment.colliders or self._settings.contact.form == "off":
+            return ()
+        return self._bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame))
+
+    def _reached(self, index: int, frame: GarmentFrame, points: np.ndarray) -> set[int]:
+        """Numbers of the bodies whose bounds the solved cloth meets."""
+        garment = self._scene.garments[index]
+        if not garment.colliders or self._settings.contact.form == "off":
+            return set()
+        return set(self._bodies.near(garment, bounds_of(points), frame.offset))
+
+    def _same_bodies(self, index: int, frame: GarmentFrame, known: _Known) -> bool:
+        """Whether the bodies that a garment may touch are where they were."""
+        near = self._near(index, frame)
+        poses = [(known.near.get(each), self._bodies.pose_of(each)) for each in near]
+        return set(near) == set(known.near) and all(a is not None and b is not None and a.equals(b) for a, b in poses)
 
     def _is_gap(self, time: float | None) -> bool:
         if time is None or self._time is None or not self._spacing:
@@ -139,7 +174,7 @@ class Refiner:
 
 def _same(a: GarmentFrame, b: GarmentFrame) -> bool:
     """Whether two frames would give the same answer, to the bit."""
-    settings = (a.fabric, a.guide, a.detail) == (b.fabric, b.guide, b.detail)
+    settings = (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
     return settings and a.points.shape == b.points.shape and bool(np.array_equal(a.points, b.points))
 
 

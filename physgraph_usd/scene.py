@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .colliders.pose import Collider, Pose
 from .fabric import Fabric
 from .mesh.topology import PolygonMesh
 
@@ -29,6 +30,7 @@ class Garment:
         guide_scale: Multiplier of the guide stiffness, shape (V,).
         detail_scale: Multiplier of the detail written out, shape (V,).
         pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,).
+        colliders: Numbers of the scene's colliders that the garment feels.
     """
 
     path: str
@@ -42,6 +44,7 @@ class Garment:
     guide_scale: np.ndarray
     detail_scale: np.ndarray
     pin: np.ndarray
+    colliders: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +56,14 @@ class GarmentFrame:
         fabric: Fabric at this time.
         guide: Guide stiffness [N/m^3].
         detail: Gain of the added detail, 1 writes the solution itself.
+        offset: Distance kept from colliders [m].
     """
 
     points: np.ndarray
     fabric: Fabric
     guide: float = 2000.0
     detail: float = 1.0
+    offset: float = 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +73,12 @@ class Frame:
     Attributes:
         time: The stage's own time code; None for a shot without samples.
         garments: One entry per garment of the scene, in its order.
+        colliders: One entry per collider of the scene, in its order; None where a collider has no shape at this time.
     """
 
     time: float | None
     garments: tuple[GarmentFrame, ...]
+    colliders: tuple[Pose | None, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +89,13 @@ class Scene:
         garments: The garments to refine.
         gravity: Gravity [m/s^2], shape (3,).
         times: Time codes to refine, ascending; empty for a shot without samples.
+        colliders: The bodies that garments may touch.
     """
 
     garments: tuple[Garment, ...]
     gravity: np.ndarray
     times: tuple[float, ...]
+    colliders: tuple[Collider, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

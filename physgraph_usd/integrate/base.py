@@ -109,3 +109,19 @@ class Integrator(Protocol):
     def step(self, system: System, carry: Carry) -> Carry:
         """Make one step."""
         ...
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """An integrator that can go on where it was when the forces change a little."""
+
+    def resume(self, system: System, carry: Carry) -> Carry:
+        """Evaluate the carry's positions under the system's forces, keeping what was learned of their curvature."""
+        ...
+
+
+def resumed(integrator: Integrator, system: System, carry: Carry) -> Carry:
+    """Go on from a carry under a system whose forces are a little different; start again where that is all one can."""
+    if isinstance(integrator, Resumable):
+        return integrator.resume(system, carry)
+    return integrator.start(system, carry.x)

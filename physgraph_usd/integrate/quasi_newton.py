@@ -58,6 +58,13 @@ class QuasiNewton:
         scale = None if self._use_metric else 1.0 / system.diagonal(x).unsqueeze(1)
         return self._carry(x, energy, force, _Memory((), scale, self._image(system, scale, force)))
 
+    def resume(self, system: System, carry: Carry) -> Carry:
+        """Evaluate x anew under forces that changed a little; the secants are kept."""
+        memory: _Memory = carry.memory
+        energy, force = system.energy_and_force(carry.x)
+        kept = _Memory(memory.pairs, memory.scale, self._image(system, memory.scale, force))
+        return self._carry(carry.x, energy, force, kept)
+
     def step(self, system: System, carry: Carry) -> Carry:
         """One secant step with a backtracking line search; the energy never rises."""
         memory: _Memory = carry.memory

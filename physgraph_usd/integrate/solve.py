@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import SolveError
-from .base import Carry, Integrator, System
+from .base import Carry, Integrator, System, resumed
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ def solve_level(
     level: int,
     budget: Budget,
     observe: Callable[[Carry], None] | None = None,
+    resume: Carry | None = None,
 ) -> tuple[Float[Tensor, "vertices 3"], LevelReport]:
     """Step until the remaining move is under the tolerance or the budget is spent.
 
@@ -78,6 +79,7 @@ def solve_level(
         level: Index for the report.
         budget: When to stop.
         observe: Called with the carry after the start and after each step.
+        resume: The last carry of a solve under forces that differ a little, to go on from; None starts at x.
 
     Returns:
         Final positions [m] and the report.
@@ -88,7 +90,7 @@ def solve_level(
     began = time.perf_counter()
     report = LevelReport(level, x.shape[0])
     before = (system.evaluations, system.metric_solves)
-    carry = integrator.start(system, x)
+    carry = integrator.start(system, x) if resume is None else resumed(integrator, system, resume)
     _require_finite(carry, level)
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()

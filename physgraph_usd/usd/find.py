@@ -68,15 +68,23 @@ def find_colliders(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Seque
     Raises:
         StageError: When a named one is not there.
     """
+    chosen: set[Sdf.Path] = set()
+    for prim in garments:
+        chosen |= felt_by(stage, prim, wanted)
     own = {prim.GetPath() for prim in garments}
-    if wanted:
-        chosen = {path for item in wanted for path in _match(stage, item, UsdGeom.Gprim)}
-        return [prim for prim in traverse(stage) if prim.GetPath() in chosen - own]
-    targets = [_targets(prim) for prim in garments]
-    chosen = {path for item in targets for target in item for path in _match(stage, str(target), UsdGeom.Gprim)}
-    if not all(targets):
-        chosen |= {path for prim in traverse(stage) if _collides(prim) for path in _gprims_below(prim, UsdGeom.Gprim)}
     return [prim for prim in traverse(stage) if prim.GetPath() in chosen - own]
+
+
+def felt_by(stage: Usd.Stage, garment: Usd.Prim, wanted: Sequence[str] = ()) -> set[Sdf.Path]:
+    """Paths of the gprims that one garment may collide with; arguments as for ``find_colliders``.
+
+    Raises:
+        StageError: When a named one is not there.
+    """
+    named = wanted or [str(target) for target in _targets(garment)]
+    if named:
+        return {path for item in named for path in _match(stage, item, UsdGeom.Gprim)}
+    return {path for prim in traverse(stage) if _collides(prim) for path in _gprims_below(prim, UsdGeom.Gprim)}
 
 
 def instance_roots(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:

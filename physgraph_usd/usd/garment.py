@@ -78,8 +78,9 @@ class GarmentReader:
             The frame, and what was repaired in it.
         """
         local, notices = self.points.read(time, self.edges)
-        guide, detail = (self.values.number(name, time) for name in ("guide:stiffness", "refine:detail"))
-        return GarmentFrame(place(local, matrix), self.values.fabric(time), guide, detail), notices
+        names = ("guide:stiffness", "refine:detail", "contact:offset")
+        guide, detail, offset = (self.values.number(name, time) for name in names)
+        return GarmentFrame(place(local, matrix), self.values.fabric(time), guide, detail, offset), notices
 
 
 def all_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
@@ -119,6 +120,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         level=level,
         flipped=is_flipped(prim, matrix),
         bent_rest=rests_bent(prim),
+        colliders=(),
         **_painted(prim, points.count, notices),
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]

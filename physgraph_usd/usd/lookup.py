@@ -209,3 +209,5 @@ ENABLED = GARMENT["enabled"]
 """Whether a garment is refined."""
 COLLIDER_ENABLED = Property(COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None, "", True)
 """Whether a collider counts."""
+COLLIDER_OFFSET = Property(COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None, "")
+"""Distance kept from a collider, added to the garment's."""

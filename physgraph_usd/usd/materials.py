@@ -25,7 +25,7 @@ _PROPOSAL = {
     "density": "physics:density",
     "thickness": "physics:surfaceThickness",
 }
-_FRAME_VALUES = (*_PROPOSAL, "guide:stiffness", "refine:detail")
+_FRAME_VALUES = (*_PROPOSAL, "guide:stiffness", "refine:detail", "contact:offset")
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,8 @@ from pxr import Sdf, Usd
 
 from ..errors import SchemaError, StageError, UsageError
 from ..scene import Frame, Scene
-from .find import find_colliders, find_garments, instance_roots
+from .bodies import ColliderReader, read_collider
+from .find import felt_by, find_colliders, find_garments, instance_roots
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .placement import to_metres
@@ -65,6 +66,19 @@ class Shot:
         )
         self.scene = Scene(tuple(reader.garment for reader in readers), request.units.gravity, times)
         self._readers, self._request = tuple(readers), request
+        self._bodies: tuple[ColliderReader, ...] = ()
+
+    def add_colliders(self, bodies: Sequence[ColliderReader], felt: Sequence[tuple[int, ...]]) -> None:
+        """Take colliders into the scene.
+
+        Args:
+            bodies: The colliders.
+            felt: For each garment, the numbers of those that it feels.
+        """
+        self._bodies = tuple(bodies)
+        garments = (replace(garment, colliders=own) for garment, own in zip(self.scene.garments, felt, strict=True))
+        colliders = tuple(body.collider for body in bodies)
+        self.scene = replace(self.scene, garments=tuple(garments), colliders=colliders)
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
         """Matrix from a garment's local space to world metres.
@@ -94,12 +108,21 @@ class Shot:
             for index, reader in enumerate(self._readers):
                 garment, notices = reader.frame(self.to_metres(index, time), time)
                 garments.append(garment)
-                self.warnings.extend(notice for notice in notices if notice not in self.warnings)
-        return Frame(time, tuple(garments))
+                self._tell(notices)
+            poses = []
+            for body in self._bodies:
+                pose, notices = body.pose(time)
+                poses.append(pose)
+                self._tell(notices)
+        return Frame(time, tuple(garments), tuple(poses))
+
+    def _tell(self, notices: Sequence[Notice]) -> None:
+        """Add what was not said before to the warnings."""
+        self.warnings.extend(notice for notice in notices if notice not in self.warnings)
 
     def close(self) -> None:
         """Let go of the stage; nothing can be read afterwards."""
-        self._readers = ()
+        self._readers, self._bodies = (), ()
         del self.stage, self._request
 
 
@@ -153,9 +176,11 @@ def open_shot(
             prim for prim in prims if is_on(prim, ENABLED, asked) or notices.append(_left_out(prim, "is disabled"))
         ]
         request = Request(units, Bake(stage), frames, level, asked, rest_frame, assumed)
-        readers = _read(stage, prims, request, notices=notices, skip_invisible=skip_invisible)
+        bodies = [prim.GetPath() for prim in found]
+        readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
         shot = Shot(str(path), stage, request, readers=readers)
-    shot.colliders = tuple(str(prim.GetPath()) for prim in found)
+        _add_colliders(shot, bodies, colliders, notices=notices)
+    shot.colliders = tuple(str(path) for path in bodies)
     read_notices = [notice for reader in readers for notice in reader.notices]
     shot.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
     return shot
@@ -184,12 +209,32 @@ def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) 
         raise StageError(f"{error}; missing: {'; '.join(notice.message for notice in notices)}") from error
 
 
+def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str], *, notices: list[Notice]) -> None:
+    """Read the colliders and which garment feels which."""
+    bodies = []
+    for path in paths:
+        body, odd = read_collider(shot.stage.GetPrimAtPath(path), shot.metres_per_unit)
+        notices += odd
+        bodies += [body] if body is not None else []
+    felt = []
+    for source in shot.sources:
+        own = {str(path) for path in felt_by(shot.stage, shot.stage.GetPrimAtPath(source.path), wanted)}
+        felt.append(tuple(index for index, body in enumerate(bodies) if body.collider.path in own))
+    shot.add_colliders(bodies, felt)
+
+
 def _read(
-    stage: Usd.Stage, prims: Sequence[Usd.Prim], request: Request, *, notices: list[Notice], skip_invisible: bool
+    stage: Usd.Stage,
+    prims: Sequence[Usd.Prim],
+    request: Request,
+    *,
+    bodies: Sequence[Sdf.Path],
+    notices: list[Notice],
+    skip_invisible: bool,
 ) -> list[GarmentReader]:
-    """Bake skinning and read every garment that is not left out."""
+    """Bake the skinning of garments and bodies and read every garment that is not left out."""
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in prims}
-    notices += request.bake.add(list(roots), request.frames if request.rest_frame is None else None)
+    notices += request.bake.add([*roots, *bodies], request.frames if request.rest_frame is None else None)
     readers, every = [], []
     for path, held in roots.items():
         prim = stage.GetPrimAtPath(path)

@@ -1,0 +1,116 @@
+"""Which bodies a garment can touch in a frame, and their surfaces, posed once a frame for all garments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .colliders.base import Surface
+from .colliders.mesh import MeshBody
+from .colliders.pose import Collider, MeshPose, Pose, ShapePose
+from .colliders.primitives import ShapeSurface
+from .contact import Touching
+from .scene import Garment, GarmentFrame
+
+REACH = 2.0
+"""How far the cloth is expected to leave its cage's bounds, in mean cage edges."""
+
+
+class Bodies:
+    """The colliders of a scene, posed lazily.
+
+    Attributes:
+        colliders: Their identities.
+    """
+
+    def __init__(self, colliders: Sequence[Collider], *, device: str, lanes: int) -> None:
+        """Prepare one body for each collider; nothing is built before something is near it."""
+        self.colliders = tuple(colliders)
+        self._device = device
+        self._meshes = [MeshBody(device=device, lanes=lanes) if c.kind == "mesh" else None for c in colliders]
+        self._poses: Sequence[Pose | None] = ()
+        self._surfaces: dict[int, tuple[Surface, ...]] = {}
+        self._bounds: dict[int, np.ndarray] = {}
+
+    def pose(self, poses: Sequence[Pose | None]) -> None:
+        """Take the poses of one frame, one entry a collider."""
+        self._poses, self._surfaces, self._bounds = poses, {}, {}
+
+    def pose_of(self, index: int) -> Pose | None:
+        """The pose of a collider in this frame."""
+        return self._poses[index] if index < len(self._poses) else None
+
+    def near(self, garment: Garment, bounds: np.ndarray, margin: float) -> tuple[int, ...]:
+        """Numbers of the garment's colliders whose bounds meet given ones.
+
+        Args:
+            garment: The garment.
+            bounds: Least and greatest corner [m], world space, shape (2, 3).
+            margin: How far apart they may be besides the collider's own offset [m].
+        """
+        return tuple(index for index in garment.colliders if self._meets(index, bounds, margin))
+
+    def _meets(self, index: int, bounds: np.ndarray, margin: float) -> bool:
+        pose = self.pose_of(index)
+        if pose is None:
+            return False
+        if index not in self._bounds:
+            self._bounds[index] = _bounds(pose)
+        grow = margin + self.colliders[index].offset
+        low, high = self._bounds[index]
+        if isinstance(pose, ShapePose) and pose.kind == "plane":
+            normal = pose.turn[:, 2]
+            lowest = float(np.where(normal > 0, bounds[0], bounds[1]) @ normal)
+            return bool(lowest <= pose.centre @ normal + grow)
+        return bool((bounds[0] - grow <= high).all() and (low <= bounds[1] + grow).all())
+
+    def touching(self, indices: Sequence[int], offsets: Sequence[float]) -> tuple[Touching, ...]:
+        """Posed surfaces of colliders.
+
+        Args:
+            indices: Numbers of the colliders.
+            offsets: Distance that each garment keeps from colliders [m].
+        """
+        found = []
+        for index in indices:
+            collider = self.colliders[index]
+            offset = tuple(each + collider.offset for each in offsets)
+            found += [Touching(collider.path, surface, offset) for surface in self._posed(index)]
+        return tuple(found)
+
+    def _posed(self, index: int) -> tuple[Surface, ...]:
+        if index not in self._surfaces:
+            pose, mesh = self._poses[index], self._meshes[index]
+            if isinstance(pose, ShapePose):
+                self._surfaces[index] = (ShapeSurface(pose, device=self._device),)
+            elif isinstance(pose, MeshPose):
+                mesh = mesh or MeshBody(device=self._device, lanes=1)
+                self._surfaces[index] = mesh.pose(pose)
+            else:
+                self._surfaces[index] = ()
+        return self._surfaces[index]
+
+
+def reach_of(garment: Garment, frame: GarmentFrame) -> float:
+    """How far from the cage's bounds a body counts as near [m]: its offset and the move expected of the cloth."""
+    ends = garment.mesh.half_edges.edges
+    if not len(ends):
+        return frame.offset
+    lengths = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
+    return frame.offset + REACH * float(lengths.mean())
+
+
+def bounds_of(points: np.ndarray) -> np.ndarray:
+    """Least and greatest corner, shape (2, 3); an empty box that meets nothing when there are no points."""
+    if not len(points):
+        return np.stack([np.full(3, np.inf), np.full(3, -np.inf)])
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _bounds(pose: Pose) -> np.ndarray:
+    """World bounds of a pose [m], shape (2, 3)."""
+    if isinstance(pose, ShapePose):
+        return ShapeSurface(pose).bounds + pose.centre
+    finite = pose.points[np.isfinite(pose.points).all(axis=1)]
+    return bounds_of(finite)

@@ -1,0 +1,267 @@
+"""Closest points on a moving triangle mesh, by Warp's bounding volume hierarchy, refitted for each pose."""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..mesh.lanes import Launch
+from .base import Nearest
+from .orient import Pieces, pieces_of
+from .pose import MeshPose
+
+Rim = tuple[np.ndarray, np.ndarray]
+"""Rim edges and rim corners of open triangles, as `Pieces` has them."""
+LIFT = 1e-4
+"""How far above a vertex it is looked whether the surface is buried there, relative to the surface's size."""
+ON_EDGE = 1e-4
+"""Barycentric coordinate under which a point is on an edge."""
+
+
+@wp.kernel
+def _closest(
+    first: wp.int32,
+    mesh: wp.uint64,
+    x: wp.array(dtype=wp.vec3f),
+    reach: wp.array(dtype=wp.float32),
+    distance: wp.array(dtype=wp.float32),
+    point: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+    face: wp.array(dtype=wp.int32),
+    weight: wp.array(dtype=wp.vec3f),
+    side: wp.array(dtype=wp.float32),
+):
+    i = first + wp.tid()
+    query = wp.mesh_query_point_sign_normal(mesh, x[i], reach[i])
+    if query.result:
+        place = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+        point[i] = place
+        distance[i] = wp.length(x[i] - place)
+        normal[i] = wp.mesh_eval_face_normal(mesh, query.face)
+        face[i] = query.face
+        weight[i] = wp.vec3f(query.u, query.v, 1.0 - query.u - query.v)
+        side[i] = query.sign
+
+
+@wp.kernel
+def _winding(
+    first: wp.int32,
+    mesh: wp.uint64,
+    x: wp.array(dtype=wp.vec3f),
+    reach: wp.float32,
+    side: wp.array(dtype=wp.float32),
+):
+    i = first + wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(mesh, x[i], reach)
+    if query.result:
+        side[i] = query.sign
+
+
+class MeshSurface:
+    """The closed or the open pieces of one mesh.
+
+    Attributes:
+        closed: Whether it has an inside.
+        origin: World position of its coordinates' origin [m], shape (3,), float64.
+        bounds: Least and greatest corner [m], shape (2, 3), float64.
+        triangles: Corners, shape (T, 3), int32.
+        edges: Their sides, each once, shape (E, 2), int32.
+    """
+
+    def __init__(
+        self,
+        pose: MeshPose,
+        triangles: np.ndarray,
+        rim: tuple[np.ndarray, np.ndarray] | None,
+        *,
+        device: str,
+        lanes: int,
+    ) -> None:
+        """Build the hierarchy on one pose.
+
+        Args:
+            pose: Any pose.
+            triangles: The pieces' triangles, shape (T, 3).
+            rim: Rim edges and rim corners of open pieces, or None for closed ones.
+            device: "cpu" or a CUDA device.
+            lanes: Most threads that a query uses on the CPU.
+        """
+        self.closed = rim is None
+        self.triangles = triangles
+        self.edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        self._device, self._lanes = device, lanes
+        self._used = np.unique(triangles)
+        self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
+        self._corners = torch.as_tensor(triangles, device=device).long()
+        self._asked: Tensor | None = None
+        self._buried: Tensor | None = None
+        self._skin: tuple[wp.Mesh, Tensor] | None = None
+        self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
+        self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
+
+    def repose(self, pose: MeshPose) -> None:
+        """Move the surface to another pose of the same topology."""
+        wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
+        self.mesh.refit()
+        self._buried, self._skin = None, None
+
+    def _place(self, pose: MeshPose) -> np.ndarray:
+        """Recentre a pose; vertices that no face uses are put on one that a face does."""
+        used = pose.points[self._used]
+        used = np.where(np.isfinite(used), used, 0.0)
+        self.origin = 0.5 * (used.min(axis=0) + used.max(axis=0))
+        local = np.zeros((len(pose.points), 3), np.float32)
+        local[self._used] = used - self.origin
+        self.bounds = np.stack([used.min(axis=0), used.max(axis=0)]) - self.origin
+        return local
+
+    def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
+        """The closest points within reach [m].
+
+        The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface that is right unless the face
+        is buried in another part of the surface; there it is left to `inside`.
+        """
+        found = self._closest(self.mesh, x, reach)
+        if self.closed and len(x):
+            found.side[self._is_buried(found.face)] = 0.0
+        return found
+
+    def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
+        count = len(x)
+        asked, limit = x.to(torch.float32).contiguous(), reach.to(torch.float32).contiguous()
+        distance = torch.full((count,), float("inf"), dtype=torch.float32, device=x.device)
+        point, normal, weight = (torch.zeros_like(asked) for _ in range(3))
+        face = torch.zeros(count, dtype=torch.int32, device=x.device)
+        side = torch.zeros_like(distance)
+        if count:
+            outputs = [wp.from_torch(distance), *(_vectors(each) for each in (point, normal)), wp.from_torch(face)]
+            outputs += [_vectors(weight), wp.from_torch(side)]
+            self._run(_closest, mesh, count, [_vectors(asked), wp.from_torch(limit), *outputs])
+        rim = self._on_rim(face.long(), weight) & distance.isfinite()
+        return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
+
+    def inside(self, x: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
+        """Whether the generalised winding number is over a half (Barill et al. 2018); nowhere for open surfaces."""
+        side = torch.ones(len(x), dtype=torch.float32, device=x.device)
+        if self.closed and len(x):
+            far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
+            asked = x.to(torch.float32).contiguous()
+            self._run(_winding, self.mesh, len(x), [_vectors(asked), wp.float32(far), wp.from_torch(side)])
+        return side < 0
+
+    def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
+        """The closest points on faces that lie bare; where body parts overlap, the nearest face may be deep inside.
+
+        A face lies bare when none of its corners is inside the surface.
+        """
+        if not self.closed or not len(x) or not bool(self._is_buried(found.face).any()):
+            return found
+        skin = self._bare()
+        if skin is None:
+            return found
+        mesh, faces = skin
+        bare = self._closest(mesh, x, torch.full_like(found.distance, float("inf")))
+        return replace(bare, face=faces[bare.face.long()])
+
+    def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
+        """Whether faces have a corner inside the surface; each corner is asked for once a pose."""
+        count = len(self.mesh.points)
+        if self._buried is None or self._asked is None:
+            self._asked, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
+        corners = self._corners[face.long()]
+        needed = torch.zeros(count, dtype=torch.bool, device=face.device)
+        needed[corners.ravel()] = True
+        new = torch.nonzero(needed & ~self._asked).squeeze(1)
+        self._buried[new] = self._lifted_inside(new)
+        self._asked[new] = True
+        return self._buried[corners].any(dim=1)
+
+    def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
+        """Whether points just above vertices are inside."""
+        if not len(vertices):
+            return torch.zeros(0, dtype=torch.bool, device=vertices.device)
+        points = wp.to_torch(self.mesh.points)
+        a, b, c = (points[self._corners[:, corner]] for corner in range(3))
+        area = torch.linalg.cross(b - a, c - a)
+        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
+        normal = torch.zeros_like(points)
+        for corner in range(3):
+            normal.index_put_((self._corners[:, corner],), area, accumulate=True)
+        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
+        up = torch.nn.functional.normalize(normal[vertices], dim=1, eps=1e-30)
+        return self.inside(points[vertices] + lift * up)
+
+    def _bare(self) -> tuple[wp.Mesh, Tensor] | None:
+        """The faces that lie bare and their numbers; None when there are none."""
+        if self._skin is None:
+            every = torch.arange(len(self._corners), device=self._device)
+            faces = torch.nonzero(~self._is_buried(every)).squeeze(1)
+            if len(faces):
+                triangles = self.triangles[faces.cpu().numpy()]
+                self._skin = (_hierarchy(self.mesh.points, triangles, False), faces.to(torch.int32))
+        return self._skin
+
+    def _run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
+        """Launch over points in slices on several threads."""
+        Launch(kernel, count, [mesh.id, *inputs], device=self._device, lanes=self._lanes)({})
+
+    def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
+        """Whether closest points lie on a rim edge or a rim vertex."""
+        if self._rim is None:
+            return torch.zeros(len(face), dtype=torch.bool, device=face.device)
+        edges, corners = (each[face] for each in self._rim)
+        low = weight < ON_EDGE
+        at_corner = weight > 1.0 - 2.0 * ON_EDGE
+        return (edges & low).any(dim=1) | (corners & at_corner).any(dim=1)
+
+
+class MeshBody:
+    """One mesh collider over the shot: its surfaces, kept while the topology stays the same."""
+
+    def __init__(self, *, device: str, lanes: int) -> None:
+        """Remember where to build."""
+        self._device, self._lanes = device, lanes
+        self._triangles: np.ndarray | None = None
+        self._count = 0
+        self._surfaces: tuple[MeshSurface, ...] = ()
+
+    def pose(self, pose: MeshPose) -> tuple[MeshSurface, ...]:
+        """The closed and the open part at one time code; those without faces are left out."""
+        same = self._triangles is not None and (
+            pose.triangles is self._triangles or np.array_equal(pose.triangles, self._triangles)
+        )
+        finite = bool(np.isfinite(pose.points).all())
+        if same and len(pose.points) == self._count and finite:
+            for surface in self._surfaces:
+                surface.repose(pose)
+            return self._surfaces
+        pieces = pieces_of(pose.points, pose.triangles)
+        self._surfaces = tuple(self._build(pose, pieces))
+        self._triangles, self._count = (pose.triangles if finite else None), len(pose.points)
+        return self._surfaces
+
+    def _build(self, pose: MeshPose, pieces: Pieces) -> list[MeshSurface]:
+        options = {"device": self._device, "lanes": self._lanes}
+        made = []
+        if len(pieces.closed):
+            made.append(MeshSurface(pose, pieces.closed, None, **options))
+        if len(pieces.open):
+            made.append(MeshSurface(pose, pieces.open, (pieces.rim, pieces.rim_vertex), **options))
+        return made
+
+
+def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh:
+    """Warp's mesh; winding numbers only where there is an inside."""
+    indices = wp.array(triangles.ravel(), dtype=wp.int32, device=points.device)
+    return wp.Mesh(points=points, indices=indices, support_winding_number=closed)
+
+
+def _vectors(tensor: Tensor) -> wp.array:
+    return wp.from_torch(tensor, dtype=wp.vec3f, requires_grad=False)

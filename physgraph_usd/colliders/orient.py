@@ -1,0 +1,133 @@
+"""What of a mesh is closed, and which way its faces look, whatever the file says.
+
+Vertices at one place are one (exporters split them at seams), the winding is made consistent from face to face, and
+each closed piece is turned so that its volume is positive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+
+WELD = 1e-6
+"""Vertices closer than this are one, relative to the mesh's size."""
+HOLES = 0.03
+"""Part of a piece's area that its holes may have for it to count as closed: the winding number closes them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """A mesh's sound faces.
+
+    Attributes:
+        closed: Triangles of closed pieces, wound outward, shape (T, 3), int32.
+        open: Triangles of the others, wound consistently where they can be, shape (U, 3), int32.
+        rim: Whether the edge opposite each corner of an open triangle is on the rim, shape (U, 3).
+        rim_vertex: Whether each corner of an open triangle is on the rim, shape (U, 3).
+    """
+
+    closed: np.ndarray
+    open: np.ndarray
+    rim: np.ndarray
+    rim_vertex: np.ndarray
+
+
+def pieces_of(points: np.ndarray, triangles: np.ndarray) -> Pieces:
+    """Sort a mesh's triangles into closed and open pieces and turn them.
+
+    Args:
+        points: Positions [m], shape (V, 3); those that are not finite take their faces with them.
+        triangles: Corners, shape (T, 3).
+
+    Returns:
+        The pieces. Corners are welded: they use the first vertex at each place.
+    """
+    first = _welded(points)
+    faces = first[np.asarray(triangles, np.int64).reshape(-1, 3)]
+    distinct = np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    faces = faces[distinct & np.asarray(np.isfinite(points[faces]).all(axis=(1, 2)))]
+    if not len(faces):
+        empty = np.zeros((0, 3), np.int32)
+        return Pieces(empty, empty, empty.astype(bool), empty.astype(bool))
+    edge, forward, count = _edges(faces, len(points))
+    piece, turned, sound = _orientation(edge, forward, count, faces=len(faces))
+    faces[turned] = faces[turned][:, ::-1]
+    edge = np.where(turned[:, None], edge[:, [1, 0, 2]], edge)  # reversed corners: sides 2-1, 1-0, 0-2
+    closed = sound & _is_closed(points, faces, edge, count=count, piece=piece)
+    volume = np.bincount(piece, _volumes(points, faces), piece.max() + 1)
+    inward = closed[piece] & (volume[piece] < 0)
+    faces[inward] = faces[inward][:, ::-1]
+    edge = np.where(inward[:, None], edge[:, [1, 0, 2]], edge)
+    outer = ~closed[piece]
+    on_rim = count[edge[outer]] == 1  # of the sides 0-1, 1-2, 2-0
+    rim_vertices = np.zeros(len(points), bool)
+    sides = np.stack([faces[outer], np.roll(faces[outer], -1, axis=1)], axis=2)
+    rim_vertices[sides[on_rim].ravel()] = True
+    return Pieces(
+        closed=np.ascontiguousarray(faces[~outer], np.int32),
+        open=np.ascontiguousarray(faces[outer], np.int32),
+        rim=np.ascontiguousarray(np.roll(on_rim, -1, axis=1)),  # opposite corner 0 is the side 1-2
+        rim_vertex=rim_vertices[faces[outer]],
+    )
+
+
+def _welded(points: np.ndarray) -> np.ndarray:
+    """First vertex at each vertex's place, shape (V,)."""
+    finite = np.asarray(np.isfinite(points).all(axis=1))
+    if not finite.any():
+        return np.arange(len(points))
+    low = points[finite].min(axis=0)
+    size = max(float(np.ptp(points[finite], axis=0).max()), 1e-12)
+    cell = np.where(finite[:, None], np.round((np.where(finite[:, None], points, low) - low) / (WELD * size)), -1.0)
+    _, first, where = np.unique(cell, axis=0, return_index=True, return_inverse=True)
+    return np.where(finite, first[where.reshape(-1)], np.arange(len(points)))
+
+
+def _edges(faces: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edge of each side (0-1, 1-2, 2-0) of each face, whether it runs upwards, and the faces at each edge."""
+    here, there = faces, np.roll(faces, -1, axis=1)
+    keys = np.minimum(here, there) * vertex_count + np.maximum(here, there)
+    _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
+    return edge.reshape(-1, 3), here < there, count
+
+
+def _orientation(
+    edge: np.ndarray, forward: np.ndarray, count: np.ndarray, *, faces: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Piece of each face, whether to turn it, and per piece whether it has two sides.
+
+    Each face stands twice in a graph, as it is and turned; neighbours that agree link like to like, others crosswise.
+    """
+    order = np.argsort(edge.ravel(), kind="stable")
+    starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
+    one, two = order[starts], order[starts + 1]
+    agree = forward.ravel()[one] != forward.ravel()[two]
+    a, b = one // 3, two // 3
+    rows = np.concatenate([a, a + faces])
+    columns = np.concatenate([np.where(agree, b, b + faces), np.where(agree, b + faces, b)])
+    graph = sparse.coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * faces, 2 * faces))
+    _, label = csgraph.connected_components(graph, directed=False)
+    as_is, reverse = label[:faces], label[faces:]
+    _, piece = np.unique(np.minimum(as_is, reverse), return_inverse=True)
+    one_sided = np.bincount(piece.reshape(-1), as_is == reverse) > 0
+    return piece.reshape(-1), as_is > reverse, ~one_sided
+
+
+def _is_closed(
+    points: np.ndarray, faces: np.ndarray, edge: np.ndarray, *, count: np.ndarray, piece: np.ndarray
+) -> np.ndarray:
+    """Per piece, whether what its rims could span is small beside its own area."""
+    corners = points[faces]
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    rim = np.bincount(piece, (sides * (count[edge] != 2)).sum(axis=1), piece.max() + 1)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return rim**2 / (4.0 * np.pi) <= HOLES * np.bincount(piece, area, piece.max() + 1)
+
+
+def _volumes(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Signed volume under each face, about the mesh's middle."""
+    corners = points[faces] - points[faces].mean(axis=(0, 1))
+    return np.einsum("fc,fc->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0

@@ -1,0 +1,75 @@
+"""What a collider is, and how it is posed at one time code; numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+KINDS = ("mesh", "sphere", "capsule", "cylinder", "cube", "plane")
+
+
+@dataclass(frozen=True)
+class Collider:
+    """What stays the same over the shot.
+
+    Attributes:
+        path: Prim path, its name in reports.
+        kind: One of `KINDS`.
+        offset: Distance kept from it [m], added to the garment's.
+    """
+
+    path: str
+    kind: str
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPose:
+    """A mesh at one time code.
+
+    Attributes:
+        points: Positions [m], world space, shape (V, 3), float64.
+        triangles: Corners, as authored, shape (T, 3), int32; the same array while the topology stays the same.
+    """
+
+    points: np.ndarray
+    triangles: np.ndarray
+
+    def equals(self, other: Pose) -> bool:
+        """Whether both are the same to the bit."""
+        return (
+            isinstance(other, MeshPose)
+            and np.array_equal(self.triangles, other.triangles)
+            and np.array_equal(self.points, other.points)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ShapePose:
+    """A primitive at one time code.
+
+    Attributes:
+        kind: "sphere", "capsule", "cylinder", "cube" or "plane".
+        turn: Rotation whose columns are the shape's axes in the world; the third is the axis of a capsule, a cylinder
+            and a plane (its outer normal), shape (3, 3), float64.
+        centre: [m], world space, shape (3,), float64.
+        size: Half sizes along its axes [m]: (r, r, r) of a sphere, (r, r, half height without caps) of a capsule or a
+            cylinder, zero for a plane, shape (3,), float64.
+    """
+
+    kind: str
+    turn: np.ndarray
+    centre: np.ndarray
+    size: np.ndarray
+
+    def equals(self, other: Pose) -> bool:
+        """Whether both are the same to the bit."""
+        return (
+            isinstance(other, ShapePose)
+            and self.kind == other.kind
+            and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("turn", "centre", "size"))
+        )
+
+
+Pose = MeshPose | ShapePose

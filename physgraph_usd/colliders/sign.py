@@ -1,0 +1,85 @@
+"""Signed distances of a whole garment with as few winding numbers as possible.
+
+If a and b lie on different sides, the segment between them meets the surface, so d(a) + d(b) <= |a - b|. Along edges
+that are shorter than the distances of their ends the sign cannot change: one winding number answers for all vertices
+that such edges join.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse import csgraph
+from torch import Tensor
+
+from .base import Surface
+
+MARGIN = 1.001
+"""Distances are float32: a segment counts as clear of the surface with this to spare."""
+
+
+def signed_distances(
+    surface: Surface, x: Float[Tensor, "vertices 3"], edges: Int[Tensor, "edges 2"], *, reach: float
+) -> Float[Tensor, " vertices"]:
+    """Distances to a surface [m], negative inside closed ones; a lower bound over ``reach`` for points farther away.
+
+    Args:
+        surface: The surface.
+        x: Points in the surface's coordinates [m].
+        edges: Pairs of points that are near each other.
+        reach: Distance from the surface's bounds over which nothing is asked [m].
+    """
+    low, high = (torch.as_tensor(corner, dtype=x.dtype, device=x.device) for corner in surface.bounds)
+    away = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
+    out = away.clone()
+    near = torch.nonzero(away <= reach).squeeze(1)
+    if not len(near):
+        return out
+    found = surface.closest(x[near], torch.full_like(near, float("inf"), dtype=x.dtype))
+    out[near] = found.distance
+    if surface.closed:
+        out[near] *= _sides(surface, x, out, near=near, told=found.side, edges=edges)
+    return out
+
+
+def _sides(
+    surface: Surface, x: Tensor, distance: Tensor, *, near: Tensor, told: Tensor, edges: Tensor
+) -> Float[Tensor, " near"]:
+    """1 outside and -1 inside for vertices of one closed surface.
+
+    Taken from the closest points where they tell. Where that contradicts a neighbour that no surface divides it from,
+    as it does where a face is buried in part only, and where they do not tell, the winding number does.
+    """
+    ends = edges.long()
+    length = (x[ends[:, 0]] - x[ends[:, 1]]).norm(dim=1)
+    clear = ends[distance[ends].sum(dim=1) > MARGIN * length]
+    side = torch.ones(len(x), dtype=x.dtype, device=x.device)
+    side[near] = told
+    settled = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    unsure = (side == 0) | _contradicted(side, clear)
+    while bool(unsure.any()):
+        which = torch.nonzero(unsure).squeeze(1)
+        group, first = _joined(which, clear[unsure[clear].all(dim=1)], len(x))
+        inside = surface.inside(x[which[first]])
+        side[which] = 1.0 - 2.0 * inside.to(x.dtype)[group]
+        settled |= unsure
+        unsure = _contradicted(side, clear) & ~settled
+    return side[near]
+
+
+def _contradicted(side: Tensor, clear: Tensor) -> Bool[Tensor, " vertices"]:
+    """Vertices told to be on the other side of a neighbour that no surface divides them from."""
+    out = torch.zeros(len(side), dtype=torch.bool, device=side.device)
+    out[clear[side[clear].prod(dim=1) < 0].ravel()] = True
+    return out
+
+
+def _joined(which: Tensor, pairs: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Group of each of some vertices that pairs join, and the place of the first of each group."""
+    ends = pairs.cpu().numpy()
+    graph = sparse.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, label = csgraph.connected_components(graph, directed=False)
+    _, first, group = np.unique(label[which.cpu().numpy()], return_index=True, return_inverse=True)
+    return torch.as_tensor(group.reshape(-1), device=which.device), torch.as_tensor(first, device=which.device)

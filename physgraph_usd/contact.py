@@ -1,0 +1,295 @@
+"""Contact of one group of garments with the bodies of one frame: who is near, the planes they see, a last projection.
+
+Closest points cost about as much as a force evaluation, so they are asked for seldom and for few vertices. Distances
+change no faster than vertices move: a vertex that was d away and has moved by m is at least d - m away, and only those
+for which that is less than the offset and the move expected of a round are asked again. The same bound tells which may
+have changed sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .colliders.base import Nearest, Surface
+from .colliders.sign import MARGIN, signed_distances
+from .forces.contact import Contact, Planes
+from .level import Level
+from .measure import penetration, pinched
+
+PINCHED = 0.5
+"""Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
+ON_SURFACE = 1e-6
+"""Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """How contact is solved.
+
+    Attributes:
+        form: "quadratic", "linear" as in the paper, or "off".
+        stiffness: k_c of the quadratic form, in stretch stiffnesses over the square of the cage's mean edge.
+        pressure: k_c over the garment's area of the linear form, in weights of the cloth.
+        rounds: How often in a level's steps closest points are found anew.
+        clearance: Part of the offset that the last projection leaves at least.
+        projections: Most passes of the last projection.
+    """
+
+    form: str = "quadratic"
+    stiffness: float = 15.0
+    pressure: float = 5.0
+    rounds: int = 3
+    clearance: float = 0.25
+    projections: int = 10
+
+    def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
+        """The same settings with k_c itself as their stiffness, [N/m^3], or [N] in the linear form.
+
+        Args:
+            cage: The cage.
+            stretch: Stretch stiffness of the cloth [N/m].
+            weight: Its weight per area [N/m^2].
+        """
+        if self.form == "linear":
+            return replace(self, stiffness=self.pressure * weight * float(cage.vertex_area.sum()))
+        return replace(self, stiffness=self.stiffness * stretch / float(cage.spacing.mean()) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """A surface that a group may touch.
+
+    Attributes:
+        path: Its collider's prim path.
+        surface: The posed surface.
+        offset: Distance kept by each garment of the group [m].
+    """
+
+    path: str
+    surface: Surface
+    offset: tuple[float, ...]
+
+
+@dataclass(eq=False)
+class _Track:
+    """What is known of the distances between one level and one surface.
+
+    Attributes:
+        surface: The surface.
+        shift: From the group's coordinates to the surface's [m], shape (3,).
+        offset: Distance to keep [m], shape (V,).
+        side: Start side of each vertex, of open surfaces, shape (V,); zeros for closed ones.
+        at: Positions at which distances were found [m], shape (V, 3).
+        known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
+        longest: Longest way out from between overlapping parts that a vertex is sent [m].
+    """
+
+    surface: Surface
+    shift: Tensor
+    offset: Tensor
+    side: Tensor
+    at: Tensor
+    known: Tensor
+    longest: float
+
+    def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Find anew what may be nearer than a distance that each vertex has [m].
+
+        Returns:
+            Numbers of those vertices, their unit normals away from the surface, and the signed distances; without
+            those that are pinched.
+        """
+        moved = (x - self.at).norm(dim=1)
+        which = torch.nonzero(self.known - moved < within).squeeze(1)
+        if not len(which):
+            return which, x[which], moved[which]
+        asked = x[which] + self.shift
+        found = self.surface.closest(asked, torch.full_like(moved[which], float("inf")))
+        sign = self._signs(which, found, asked, moved[which])
+        self.at[which], self.known[which] = x[which], found.distance * sign
+        distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
+        within = torch.nonzero(sign < 0).squeeze(1)
+        kept = torch.ones_like(sign, dtype=torch.bool)
+        if len(within):
+            near = _at(found, within)
+            way = self.surface.exit(asked[within], near)
+            distance[within], point[within], outward[within] = way.distance, way.point, way.normal
+            kept[within] = ~pinched(near, way, self.longest)
+        away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
+        outward = outward * self._outward(which).unsqueeze(1)
+        normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
+        normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+        return which[kept], normal[kept], (distance * sign)[kept]
+
+    def _outward(self, which: Tensor) -> Tensor:
+        """1 where a face's normal points away from the body, -1 where the start side is the other one."""
+        side = self.side[which]
+        return torch.where(side < 0, side, torch.ones_like(side))
+
+    def _signs(self, which: Tensor, found: Nearest, asked: Tensor, moved: Tensor) -> Tensor:
+        """1 outside, or on the start side of an open surface; -1 inside or behind it."""
+        if not self.surface.closed:
+            behind = (found.side * self.side[which] < 0) & ~found.rim
+            return torch.where(behind, -torch.ones_like(moved), torch.ones_like(moved))
+        known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
+        may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
+        ask = may_have_crossed & (found.side != known)
+        sign = known.clone()
+        if bool(ask.any()):
+            sign[ask] = 1.0 - 2.0 * self.surface.inside(asked[ask]).to(sign)
+        return sign
+
+
+def _at(found: Nearest, which: Tensor) -> Nearest:
+    """Some of the closest points."""
+    return Nearest(**{each.name: getattr(found, each.name)[which] for each in fields(found)})
+
+
+class LevelContact:
+    """One level's view of the bodies.
+
+    Attributes:
+        rounds: How often in the level's steps closest points are found anew.
+    """
+
+    def __init__(self, level: Level, tracks: Sequence[_Track], settings: ContactSettings) -> None:
+        """Keep what is known of the distances."""
+        self._level, self._tracks, self._settings = level, tuple(tracks), settings
+        self._reach = float(level.spacing.mean())
+        self.rounds = settings.rounds
+
+    def term(self, x: Float[Tensor, "vertices 3"]) -> Contact | None:
+        """The contact force near positions x [m], or None where nothing can touch."""
+        planes = []
+        for track in self._tracks:
+            vertex, normal, signed = track.refresh(x, track.offset + self._reach)
+            near = signed < track.offset[vertex] + self._reach
+            vertex, normal, signed = vertex[near], normal[near], signed[near]
+            height = (normal * x[vertex]).sum(dim=1) - signed + track.offset[vertex]
+            planes.append(Planes(vertex.to(torch.int32), normal.contiguous(), height))
+        if not any(len(each.vertex) for each in planes):
+            return None
+        return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form)
+
+    def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, int | float]]:
+        """Move free vertices that are under the least clearance to it.
+
+        Returns:
+            Positions [m]; x itself when none had to move; and how many moved, how far at most [mm] and in how many
+            passes.
+        """
+        out, passes = x, 0
+        for _ in range(self._settings.projections):
+            moved = False
+            for track in self._tracks:
+                least = self._settings.clearance * track.offset
+                vertex, normal, signed = track.refresh(out, least)
+                lack = least[vertex] - signed
+                push = (lack > 1e-7) & self._level.free[vertex, 0]
+                if bool(push.any()):
+                    out = out.clone() if not moved else out
+                    out[vertex[push]] += lack[push].unsqueeze(1) * normal[push]
+                    moved = True
+            if not moved:
+                break
+            passes += 1
+        shifts = (out - x).norm(dim=1)
+        far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
+        return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
+
+
+@dataclass(eq=False)
+class FrameContact:
+    """A group's bodies in one frame.
+
+    Attributes:
+        touching: The surfaces.
+        distances: Signed distances of the upsampled cage to each [m], shape (V,).
+    """
+
+    touching: tuple[Touching, ...]
+    distances: list[Float[Tensor, " vertices"]]
+    _tracks: list[_Track] = field(default_factory=list)
+    _settings: ContactSettings = field(default_factory=ContactSettings)
+    _views: dict[int, LevelContact] = field(default_factory=dict)
+
+    @staticmethod
+    def begin(
+        levels: Sequence[Level],
+        touching: Sequence[Touching],
+        coarse: Float[Tensor, "coarse 3"],
+        *,
+        origin: np.ndarray,
+        settings: ContactSettings,
+    ) -> FrameContact:
+        """Find the distances of the upsampled cage.
+
+        Args:
+            levels: The group's levels.
+            touching: The surfaces.
+            coarse: Cage positions [m], recentred.
+            origin: World position of the group's origin [m], shape (3,).
+            settings: How contact is solved, with k_c itself as its stiffness.
+        """
+        finest = levels[-1]
+        base = finest.base.apply(coarse)
+        tracks = []
+        for each in touching:
+            shift = torch.as_tensor(origin - each.surface.origin).to(base)
+            offset = torch.as_tensor(each.offset).to(base)[finest.vertex_garment.long()]
+            reach = float(offset.max()) + float(levels[0].spacing.mean())
+            known = signed_distances(each.surface, base + shift, finest.edges, reach=reach)
+            side = _start_sides(each.surface, coarse + shift, finest)
+            longest = PINCHED * float(levels[0].spacing.mean())
+            tracks.append(_Track(each.surface, shift, offset, side, base, known, longest))
+        return FrameContact(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
+
+    def measure(
+        self, finest: Level, base: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+    ) -> dict[str, object]:
+        """What is in each body and what crosses it, before and after, as plain values.
+
+        Args:
+            finest: The finest level.
+            base: The upsampled cage [m].
+            x: The result [m].
+        """
+        bodies: dict[str, object] = {}
+        for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
+            surface, shift = each.surface, track.shift
+            after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
+            name = each.path if surface.closed else f"{each.path} (open part)"
+            bodies[name] = {
+                "before": asdict(penetration(surface, finest, base + shift, before, track.longest)),
+                "after": asdict(penetration(surface, finest, x + shift, after, track.longest)),
+            }
+        return {"bodies": bodies}
+
+    def at(self, level: Level, finest: Level) -> LevelContact:
+        """The view of one level, the same at each call; its vertices come first among each garment's finest ones."""
+        if level.index in self._views:
+            return self._views[level.index]
+        pairs = zip(level.spans, finest.spans, strict=True)
+        places = [torch.arange(fine.start, fine.start + own.stop - own.start) for own, fine in pairs]
+        which = torch.cat(places).to(level.rest.device)
+        tracks = [
+            replace(t, **{name: getattr(t, name)[which].clone() for name in ("offset", "side", "at", "known")})
+            for t in self._tracks
+        ]
+        self._views[level.index] = LevelContact(level, tracks, self._settings)
+        return self._views[level.index]
+
+
+def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"], finest: Level) -> Float[Tensor, " vertices"]:
+    """The side on which the cage around each fine vertex lies: 1 or -1, 0 where it is undecided or has no meaning."""
+    if surface.closed:
+        return torch.zeros(finest.vertex_count, dtype=cage.dtype, device=cage.device)
+    found = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
+    side = torch.where(found.rim, torch.zeros_like(found.side), found.side)
+    return finest.base.apply(side.unsqueeze(1).expand(-1, 3).contiguous())[:, 0].sign()

@@ -1,0 +1,161 @@
+"""Contact: pushes vertices out of bodies, each body seen as a plane near each vertex.
+
+    E = 1/2 sum_v k_c a_v phi_v^2                        (form="quadratic")
+    E = (k_c / A) sum_v a_v phi_v,  A = sum_{phi_v > 0} a_v   (form="linear", PAPER P9)
+
+| symbol | here | meaning |
+|---|---|---|
+| phi_v | max(offset - n_v . (x_v - c_v), 0) | how far v is inside the body grown by the offset [m] |
+| c_v, n_v | ``Planes`` | closest point of the body and its outward normal, found by whoever makes this term |
+| k_c | ``stiffness`` | [N/m^3]; of the linear form [N] |
+
+The planes stay while the term lives, so it is a function of x alone. A is piecewise constant; its jumps are no forces
+and are left out of the linear form's (PAPER A12).
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..level import Level
+from ..mesh.lanes import Launch
+from ..mesh.stencil import SCALAR, VECTOR, vectors
+
+FORMS = ("quadratic", "linear")
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """One body as some vertices see it; each vertex occurs once.
+
+    Attributes:
+        vertex: Vertex of each plane, ascending, shape (N,), int32.
+        normal: Outward unit normals, shape (N, 3).
+        height: n . c + offset [m], shape (N,).
+    """
+
+    vertex: Int[Tensor, " planes"]
+    normal: Float[Tensor, "planes 3"]
+    height: Float[Tensor, " planes"]
+
+
+@wp.kernel
+def _push(
+    first: wp.int32,
+    x: wp.array(dtype=Any),
+    vertex: wp.array(dtype=wp.int32),
+    normal: wp.array(dtype=Any),
+    height: wp.array(dtype=Any),
+    weight: wp.array(dtype=Any),
+    energy: wp.array(dtype=Any),
+    force: wp.array(dtype=Any),
+):
+    i = first + wp.tid()
+    v = vertex[i]
+    depth = height[i] - wp.dot(normal[i], x[v])
+    zero = depth - depth
+    depth = wp.max(depth, zero)
+    pull = weight[i] * depth
+    energy[i] = pull * depth
+    force[v] = force[v] + pull * normal[i]
+
+
+_PUSH = {
+    dtype: wp.overload(
+        _push,
+        [
+            wp.int32,
+            wp.array(dtype=VECTOR[dtype]),
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=VECTOR[dtype]),
+            *[wp.array(dtype=SCALAR[dtype])] * 3,
+            wp.array(dtype=VECTOR[dtype]),
+        ],
+    )
+    for dtype in VECTOR
+}
+
+
+class Contact:
+    """Springs between vertices and the planes that stand for bodies.
+
+    Attributes:
+        planes: What the vertices see, one entry a body.
+    """
+
+    name = "contact"
+
+    def __init__(self, level: Level, planes: Sequence[Planes], stiffness: float, *, form: str = "quadratic") -> None:
+        """Weigh the planes.
+
+        Args:
+            level: The level.
+            planes: One entry a body.
+            stiffness: k_c.
+            form: "quadratic" or "linear".
+        """
+        self.planes = tuple(each for each in planes if len(each.vertex))
+        self._form, self._stiffness = form, stiffness
+        self._areas = [level.vertex_area[each.vertex.long()] for each in self.planes]
+        self._buffers = [torch.zeros_like(each) for each in self._areas]
+        self._weights = [stiffness * area for area in self._areas]
+        self._launches = [
+            self._prepare(level, *parts) for parts in zip(self.planes, self._weights, self._buffers, strict=True)
+        ]
+
+    @staticmethod
+    def _prepare(level: Level, planes: Planes, weight: Tensor, energy: Tensor) -> Launch:
+        wp.init()  # Views of tensors do not start Warp by themselves.
+        x = vectors(torch.zeros_like(level.rest))
+        own = [wp.from_torch(planes.vertex), vectors(planes.normal), wp.from_torch(planes.height)]
+        inputs = [x, *own, wp.from_torch(weight), wp.from_torch(energy), x]
+        return Launch(_PUSH[level.dtype], len(planes.vertex), inputs, device=level.device, lanes=level.lanes)
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the force [N] in place and return the energy [J]."""
+        if self._form == "linear":
+            return self._add_linear(x, force)
+        energy = torch.zeros((), dtype=torch.float64, device=x.device)
+        for launch, buffer in zip(self._launches, self._buffers, strict=True):
+            launch({0: vectors(x), 6: vectors(force)})
+            energy = energy + 0.5 * buffer.sum(dtype=torch.float64)
+        return energy
+
+    def _add_linear(self, x: Tensor, force: Tensor) -> Float[Tensor, ""]:
+        depths = self.depths(x)
+        touching = [area * (depth > 0) for area, depth in zip(self._areas, depths, strict=True)]
+        area = sum((each.sum() for each in touching), torch.zeros_like(x[0, 0]))
+        if not float(area) > 0:
+            return torch.zeros((), dtype=torch.float64, device=x.device)
+        energy = torch.zeros((), dtype=torch.float64, device=x.device)
+        for planes, depth, share in zip(self.planes, depths, touching, strict=True):
+            weight = self._stiffness / area * share
+            force[planes.vertex.long()] += weight.unsqueeze(1) * planes.normal
+            energy = energy + (weight * depth).sum(dtype=torch.float64)
+        return energy
+
+    def depths(self, x: Float[Tensor, "vertices 3"]) -> list[Float[Tensor, " planes"]]:
+        """How far each vertex is behind each of its planes [m], not below zero; one entry a body."""
+        return [(each.height - (each.normal * x[each.vertex.long()]).sum(dim=1)).clamp_min(0.0) for each in self.planes]
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """k_c a_v / 3 where a plane pushes [N/m]; the linear form has none."""
+        out = torch.zeros_like(x[:, 0])
+        if self._form == "quadratic":
+            for planes, weight, depth in zip(self.planes, self._weights, self.depths(x), strict=True):
+                out[planes.vertex.long()] += torch.where(depth > 0, weight / 3.0, torch.zeros_like(weight))
+        return out
+
+    def rest_matrix(self) -> sp.csr_matrix | None:
+        """None: at rest nothing touches."""
+        return None

@@ -1,0 +1,178 @@
+"""Measures contact from positions alone, without the forces: vertices in bodies, and edges through faces."""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .colliders.base import Nearest, Surface
+from .colliders.mesh import MeshSurface
+from .level import Level
+from .mesh.lanes import Launch
+
+DETOUR = 1.05
+"""The nearest face is buried where the way out is longer than this, over the distance to it."""
+COVER = 0.6
+"""No point of a triangle is farther than this from its nearest corner, in longest sides (1 / sqrt(3), to spare)."""
+DEEP = 1e-4
+"""Depth from which a vertex counts as inside [m]."""
+
+
+@dataclass(frozen=True)
+class Penetration:
+    """How far a garment is in one surface.
+
+    Attributes:
+        inside: Free vertices deeper than `DEEP` in a closed surface, without those that are pinched.
+        percent: Their part of all free vertices.
+        deepest_mm: Depth of the deepest free vertex [mm].
+        pinned: Pinned vertices deeper than `DEEP`: they stay.
+        pinched: Free vertices between parts of the body that overlap, farther from any way out than half a cage
+            edge: they stay too, out of sight; forced out, they would tear the cloth.
+        crossings: Edges of the cloth through faces of the body, and edges of the body through faces of the cloth.
+    """
+
+    inside: int
+    percent: float
+    deepest_mm: float
+    pinned: int
+    pinched: int
+    crossings: int
+
+
+def penetration(
+    surface: Surface,
+    level: Level,
+    x: Float[Tensor, "vertices 3"],
+    signed: Float[Tensor, " vertices"],
+    longest: float,
+) -> Penetration:
+    """Measure one garment group against one surface.
+
+    Args:
+        surface: The surface.
+        level: The level that x belongs to.
+        x: Positions in the surface's coordinates [m].
+        signed: Signed distances at x, lower bounds where they are positive [m].
+        longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
+    """
+    free = level.free[:, 0]
+    depth, held = _depths(surface, x, signed, longest)
+    deep = (depth > DEEP) & ~held
+    inside = int((deep & free).sum())
+    deepest = float((depth * (free & ~held)).max()) if len(depth) else 0.0
+    return Penetration(
+        inside=inside,
+        percent=round(100.0 * inside / max(int(free.sum()), 1), 4),
+        deepest_mm=round(1e3 * deepest, 4),
+        pinned=int((deep & ~free).sum()),
+        pinched=int((held & free).sum()),
+        crossings=crossings(surface, level, x, signed.abs()),
+    )
+
+
+def _depths(
+    surface: Surface, x: Tensor, signed: Tensor, longest: float
+) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
+    """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched."""
+    depth, held = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
+    within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
+    if len(within):
+        found = surface.closest(x[within], torch.full_like(signed[within], float("inf")))
+        way = surface.exit(x[within], found)
+        depth[within], held[within] = way.distance, pinched(found, way, longest)
+    return depth, held
+
+
+def pinched(found: Nearest, way: Nearest, longest: float) -> Bool[Tensor, " points"]:
+    """Which points inside are between overlapping parts and too far from a way out.
+
+    Args:
+        found: The closest points.
+        way: The closest points on faces that lie bare.
+        longest: Longest way out [m].
+    """
+    return (way.distance > longest) & (way.distance > DETOUR * found.distance)
+
+
+@wp.kernel
+def _pierce(
+    first: wp.int32,
+    mesh: wp.uint64,
+    start: wp.array(dtype=wp.vec3f),
+    end: wp.array(dtype=wp.vec3f),
+    hit: wp.array(dtype=wp.int32),
+):
+    i = first + wp.tid()
+    along = end[i] - start[i]
+    length = wp.length(along)
+    if length > 0.0:
+        query = wp.mesh_query_ray(mesh, start[i], along / length, length)
+        if query.result:
+            hit[i] = 1
+
+
+def crossings(
+    surface: Surface, level: Level, x: Float[Tensor, "vertices 3"], distance: Float[Tensor, " vertices"]
+) -> int:
+    """Number of edges that pass through a face: the cloth's through the body's and the body's through the cloth's.
+
+    Of a primitive, the cloth's edges with one end inside. Edges and faces that are farther from the surface than they
+    are long are not looked at.
+
+    Args:
+        surface: The surface.
+        level: The level.
+        x: Positions in the surface's coordinates [m].
+        distance: Unsigned distances at x, or lower bounds [m].
+    """
+    ends = level.edges.long()
+    start, end = x[ends[:, 0]], x[ends[:, 1]]
+    near = distance[ends].sum(dim=1) <= (end - start).norm(dim=1)
+    if not bool(near.any()):
+        return 0
+    if not isinstance(surface, MeshSurface):
+        inside = surface.inside(x)[ends[near]]
+        return int((inside[:, 0] != inside[:, 1]).sum())
+    through = _pierced(surface.mesh, start[near], end[near], lanes=level.lanes)
+    return through + _through_cloth(surface, level, x, distance)
+
+
+def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tensor) -> int:
+    """Number of the body's edges through the cloth's faces."""
+    corners = x[level.triangles.long()]
+    sides = (corners - corners.roll(1, dims=1)).norm(dim=2)
+    near: Bool[Tensor, " triangles"] = distance[level.triangles.long()].amin(dim=1) <= COVER * sides.amax(dim=1)
+    if not bool(near.any()):
+        return 0
+    place, index = np.unique(level.triangles[near].cpu().numpy(), return_inverse=True)
+    points = x[torch.as_tensor(place, device=x.device).long()].to(torch.float32).contiguous()
+    device = str(x.device)
+    cloth = wp.Mesh(
+        points=wp.from_torch(points, dtype=wp.vec3f),
+        indices=wp.array(index.ravel().astype(np.int32), dtype=wp.int32, device=device),
+        bvh_constructor="median" if device == "cpu" else None,  # Built once and asked once: building must be cheap.
+    )
+    body = wp.to_torch(surface.mesh.points)
+    edges = torch.as_tensor(surface.edges, device=x.device)
+    start, end = body[edges[:, 0]], body[edges[:, 1]]
+    low, high = points.amin(dim=0), points.amax(dim=0)
+    meets = ((torch.maximum(start, end) >= low) & (torch.minimum(start, end) <= high)).all(dim=1)
+    return _pierced(cloth, start[meets], end[meets], lanes=level.lanes)
+
+
+def _pierced(mesh: wp.Mesh, start: Tensor, end: Tensor, *, lanes: int) -> int:
+    """Number of segments that meet a mesh."""
+    if not len(start):
+        return 0
+    hit = torch.zeros(len(start), dtype=torch.int32, device=start.device)
+    points = [wp.from_torch(each.to(torch.float32).contiguous(), dtype=wp.vec3f) for each in (start, end)]
+    Launch(_pierce, len(start), [mesh.id, *points, wp.from_torch(hit)], device=str(start.device), lanes=lanes)({})
+    return int(hit.sum())

@@ -1,0 +1,151 @@
+"""Colliders, read from meshes and primitives and posed in world metres.
+
+A collider never stops the work: a pose that cannot be used at some time is left out there, with a notice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
+from ..mesh.topology import PolygonMesh
+from .lookup import COLLIDER_OFFSET, find_value
+from .placement import place, timecode
+from .shapes import UPRIGHT, tessellated
+from .stage import Notice
+
+_EVEN = 1e-4
+"""Relative difference under which two scales count as the same."""
+_KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
+
+
+@dataclass(eq=False)
+class ColliderReader:
+    """A collider with what is needed to pose it.
+
+    Attributes:
+        prim: Its prim.
+        collider: Its constant data.
+        metres: Length of one stage unit [m].
+    """
+
+    prim: Usd.Prim
+    collider: Collider
+    metres: float
+    _topology: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def pose(self, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        """Pose the collider at a time code, between its own samples as USD interpolates them.
+
+        Args:
+            time: Time code, or None for the default.
+
+        Returns:
+            The pose, or None where there is none, and why.
+        """
+        matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(self.prim), dtype=np.float64).T
+        matrix[:3] *= self.metres
+        if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            return None, (self._out(time, "its transform to the world is not an affine one"),)
+        if self.collider.kind != "mesh":
+            return self._shape(matrix, time)
+        return self._mesh(matrix, time)
+
+    def _mesh(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        mesh = UsdGeom.Mesh(self.prim)
+        points, counts, indices = (
+            _array(attribute, time)
+            for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+        )
+        usable = points.ndim == 2 and points.shape[1] == 3 and len(indices) and counts.sum() == len(indices)
+        if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
+            return None, (self._out(time, "its points and faces do not fit together"),)
+        return MeshPose(place(points.astype(np.float64), matrix), self._triangles(points, counts, indices)), ()
+
+    def _triangles(self, points: np.ndarray, counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+        """Triangles of the faces; the same array as last time while the topology is the same."""
+        known = self._topology
+        if known is None or not (np.array_equal(known[0], counts) and np.array_equal(known[1], indices)):
+            split = PolygonMesh(counts, indices, len(points)).triangulate(np.nan_to_num(points))
+            self._topology = (counts, indices, split.triangles)
+            return split.triangles
+        return known[2]
+
+    def _shape(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        kind, size, axes = _measures(self.prim, time)
+        linear = matrix[:3, :3] @ axes
+        if kind == "plane":
+            normal = np.cross(linear[:, 0], linear[:, 1]) * np.sign(np.linalg.det(linear) or 1.0)
+            if not np.linalg.norm(normal) > 0:
+                return None, (self._out(time, "its transform flattens it"),)
+            return ShapePose(kind, _frame_about(normal), matrix[:3, 3], np.zeros(3)), ()
+        stretch = np.linalg.norm(linear, axis=0)
+        turn = linear / np.maximum(stretch, 1e-300)
+        square = np.allclose(turn.T @ turn, np.eye(3), atol=_EVEN)
+        even = {"sphere": (0, 1, 2), "capsule": (0, 1, 2), "cylinder": (0, 1), "cube": ()}.get(kind)
+        same = even is not None and np.allclose(stretch[list(even)], stretch[0] if even else 1.0, rtol=_EVEN)
+        if square and same:
+            return ShapePose(kind, turn, matrix[:3, 3], size * stretch), ()
+        points, triangles = tessellated(kind, size)
+        return MeshPose(points @ linear.T + matrix[:3, 3], triangles), ()
+
+    def _out(self, time: float | None, why: str) -> Notice:
+        return Notice(self.collider.path, time, f"this collider is left out here: {why}")
+
+
+def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None, tuple[Notice, ...]]:
+    """Read a collider's identity.
+
+    Args:
+        prim: A gprim.
+        metres: Length of one stage unit [m].
+
+    Returns:
+        Its reader, or None for a kind of prim that cloth cannot touch, and notices.
+
+    Raises:
+        SchemaError: When its offset cannot be used.
+    """
+    path, kind = str(prim.GetPath()), str(prim.GetTypeName()).removesuffix("_1")
+    if not UsdGeom.Mesh(prim) and kind not in _KINDS:
+        return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
+    kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
+    offset = find_value(prim, COLLIDER_OFFSET).at(None) or 0.0
+    return ColliderReader(prim, Collider(path, kind, offset), metres), ()
+
+
+def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
+    """An array at a time code; what has samples only gives its first for the default."""
+    value = attribute.Get(timecode(time))
+    if value is None:
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    return np.zeros(0, np.int32) if value is None else np.asarray(value)
+
+
+def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.ndarray]:
+    """Kind, half sizes in stage units, and the matrix whose columns are the shape's axes in the prim's space."""
+
+    def number(name: str, fallback: float) -> float:
+        attribute = prim.GetAttribute(name)
+        value = attribute.Get(timecode(time)) if attribute else None
+        return fallback if value is None else float(value)
+
+    kind = str(prim.GetTypeName()).removesuffix("_1").lower()
+    half_height = 0.5 * number("height", 1.0 if kind == "capsule" else 2.0)
+    top, bottom = number("radiusTop", -1.0), number("radiusBottom", -1.0)
+    radius = max(top, bottom) if top >= 0 else number("radius", 0.5 if kind == "capsule" else 1.0)
+    half = 0.5 * number("size", 2.0)
+    size = {"sphere": [radius] * 3, "cube": [half] * 3}.get(kind, [radius, radius, half_height])
+    axis = prim.GetAttribute("axis").Get() if prim.GetAttribute("axis") else "Z"
+    return kind, np.array(size, dtype=np.float64), UPRIGHT[str(axis or "Z")]
+
+
+def _frame_about(normal: np.ndarray) -> np.ndarray:
+    """A rotation whose third column is a direction."""
+    third = normal / np.linalg.norm(normal)
+    first = np.cross(np.eye(3)[np.abs(third).argmin()], third)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(third, first), third], axis=1)

@@ -1,0 +1,81 @@
+"""Small bodies for contact tests, and distances to them by another library."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+import torch
+import trimesh
+
+from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.colliders.pose import MeshPose
+
+Soup = tuple[np.ndarray, np.ndarray]
+"""Points, shape (V, 3), and triangles, shape (T, 3)."""
+
+
+def ball(radius: float = 0.2, *, level: int = 3, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Soup:
+    """A closed sphere wound outward."""
+    mesh = trimesh.creation.icosphere(subdivisions=level, radius=radius)
+    return np.asarray(mesh.vertices) + np.array(at), np.asarray(mesh.faces, np.int32)
+
+
+def box(size: tuple[float, float, float] = (0.2, 0.2, 0.2)) -> Soup:
+    """A closed box of twelve triangles about the origin."""
+    mesh = trimesh.creation.box(size)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+
+
+def tube(radius: float = 0.1, length: float = 0.4, *, around: int = 32, rows: int = 9) -> Soup:
+    """An open tube about z, wound outward."""
+    a = 2 * np.pi * np.arange(around) / around
+    z = np.linspace(-0.5 * length, 0.5 * length, rows)
+    points = np.array([[radius * np.cos(t), radius * np.sin(t), h] for h in z for t in a])
+    ids = np.arange(rows * around).reshape(rows, around)
+    here, there = ids, np.roll(ids, -1, axis=1)
+    quads = np.stack([here[:-1], there[:-1], there[1:], here[1:]], axis=-1).reshape(-1, 4)
+    return points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
+
+
+def together(*soups: Soup) -> Soup:
+    """Several bodies as one mesh."""
+    starts = np.cumsum([0, *(len(points) for points, _ in soups)])
+    faces = [triangles + start for (_, triangles), start in zip(soups, starts, strict=False)]
+    return np.concatenate([points for points, _ in soups]), np.concatenate(faces).astype(np.int32)
+
+
+def flipped(soup: Soup, part: float = 1.0, seed: int = 0) -> Soup:
+    """The same body with some or all of its faces turned."""
+    points, triangles = soup
+    turned = triangles.copy()
+    which = np.random.default_rng(seed).random(len(triangles)) < part
+    turned[which] = turned[which][:, ::-1]
+    return points, turned
+
+
+def split(soup: Soup) -> Soup:
+    """The same body with three vertices of its own for each face, as exporters split them at seams."""
+    points, triangles = soup
+    return points[triangles.ravel()], np.arange(triangles.size, dtype=np.int32).reshape(-1, 3)
+
+
+def surfaces(soup: Soup) -> tuple[MeshSurface, ...]:
+    """The closed and the open part, posed."""
+    return MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))
+
+
+def distances(soup: Soup, x: np.ndarray) -> np.ndarray:
+    """Unsigned distances by libigl."""
+    return np.sqrt(igl.point_mesh_squared_distance(x, soup[0], soup[1].astype(np.int64))[0])
+
+
+def around(soup: Soup, count: int = 400, seed: int = 1) -> np.ndarray:
+    """Random points in and around a body."""
+    rng = np.random.default_rng(seed)
+    low, high = soup[0].min(axis=0), soup[0].max(axis=0)
+    return rng.uniform(low - 0.3 * (high - low), high + 0.3 * (high - low), (count, 3))
+
+
+def endless(count: int) -> torch.Tensor:
+    """A reach without end for each point."""
+    return torch.full((count,), float("inf"), dtype=torch.float64)

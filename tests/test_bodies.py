@@ -1,0 +1,204 @@
+"""Colliders read from stages: every kind of prim, unit, transform and animation, and which garment feels which."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bodies import box, surfaces
+from pxr import Gf, Usd, UsdGeom, UsdPhysics, Vt
+from stages import COLLIDER_API, add_sheet, add_skeleton, author, bind_skin, new_stage, save, set_matrix, vec3
+
+from physgraph_usd.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.colliders.primitives import ShapeSurface
+from physgraph_usd.scene import Frame, Scene
+from physgraph_usd.usd.reader import open_shot
+
+BODY = "/World/body"
+
+
+def add_box(stage: Usd.Stage, path: str = BODY, *, times: tuple[float, ...] = ()) -> UsdGeom.Mesh:
+    """A box of triangles tagged as a collider; it moves along x by its time."""
+    points, triangles = box((1.0, 2.0, 3.0))
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))
+    mesh.CreatePointsAttr(vec3(points))
+    for time in times:
+        mesh.GetPointsAttr().Set(vec3(points + np.array([time, 0.0, 0.0])), time)
+    mesh.GetPrim().AddAppliedSchema(COLLIDER_API)
+    return mesh
+
+
+def read(shot: str, time: float | None = 1.0, **options: object) -> tuple[Scene, Frame, list[str]]:
+    with contextlib.closing(open_shot(shot, **options)) as opened:  # type: ignore[arg-type]
+        frame = opened.frame(time)
+        return opened.scene, frame, [str(notice) for notice in opened.warnings]
+
+
+def mesh_of(frame: Frame, index: int = 0) -> MeshPose:
+    pose = frame.colliders[index]
+    assert isinstance(pose, MeshPose)
+    return pose
+
+
+def shape_of(frame: Frame, index: int = 0) -> ShapePose:
+    pose = frame.colliders[index]
+    assert isinstance(pose, ShapePose)
+    return pose
+
+
+def shot_with(path: Path, *, metres: float = 0.01) -> Usd.Stage:
+    stage = new_stage(path, metres=metres)
+    add_sheet(stage)
+    return stage
+
+
+class TestMeshes:
+    def test_points_are_world_metres(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda")
+        set_matrix(add_box(stage).GetPrim(), np.diag([2.0, 2.0, 2.0, 1.0]))
+        scene, frame, _ = read(save(stage))
+        assert (scene.colliders[0].path, scene.colliders[0].kind, scene.garments[0].colliders) == (BODY, "mesh", (0,))
+        np.testing.assert_allclose(np.ptp(mesh_of(frame).points, axis=0), [0.02, 0.04, 0.06])
+
+    def test_they_are_posed_at_the_cloths_time_between_their_own_samples(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        add_box(stage, times=(1.0, 5.0))
+        shot = save(stage)
+        for time in (1.0, 2.0, 3.0):
+            assert mesh_of(read(shot, time)[1]).points[:, 0].mean() == pytest.approx(time)
+
+    def test_a_moving_ancestor_moves_them(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        parent = UsdGeom.Xform.Define(stage, "/World/rig")
+        operation = parent.AddTranslateOp()
+        for time in (1.0, 3.0):
+            operation.Set(Gf.Vec3d(0.0, time, 0.0), time)
+        add_box(stage, "/World/rig/body")
+        assert mesh_of(read(save(stage), 2.0)[1]).points[:, 1].mean() == pytest.approx(2.0)
+
+    def test_the_topology_may_change(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        mesh = add_box(stage)
+        points, triangles = box()
+        for time, count in ((1.0, 12), (2.0, 6)):
+            mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.full(count, 3, np.int32)), time)
+            mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(triangles[:count].ravel()), time)
+            mesh.GetPointsAttr().Set(vec3(points), time)
+        shot = save(stage)
+        assert [len(mesh_of(read(shot, time)[1]).triangles) for time in (1.0, 2.0)] == [12, 6]
+
+    def test_skinned_bodies_are_baked(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        add_skeleton(stage, "/World/root", (1.0, 2.0, 3.0))
+        mesh = add_box(stage, "/World/root/body")
+        bind_skin(mesh, "/World/root", joints=[1] * 8)
+        first, last = (mesh_of(read(save(stage), time)[1]).points for time in (1.0, 3.0))
+        assert np.abs(first - last).max() > 0.1
+        sides = [np.linalg.norm(points[0] - points[1]) for points in (first, last)]
+        assert sides[0] == pytest.approx(sides[1], abs=1e-5)
+
+    def test_broken_faces_leave_it_out_with_a_word(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda")
+        add_box(stage).GetFaceVertexIndicesAttr().Set(Vt.IntArray([0, 1, 99]))
+        _, frame, said = read(save(stage))
+        assert frame.colliders == (None,)
+        assert any(BODY in line and "left out here" in line for line in said)
+
+    def test_a_body_squashed_flat_is_still_there(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda")
+        set_matrix(add_box(stage).GetPrim(), np.diag([1.0, 0.0, 1.0, 1.0]))
+        assert np.ptp(mesh_of(read(save(stage))[1]).points[:, 1]) == 0.0
+
+
+def define(stage: Usd.Stage, kind: str, **values: object) -> Usd.Prim:
+    """A primitive with the collision schema of UsdPhysics."""
+    prim = stage.DefinePrim(BODY, kind)
+    for name, value in values.items():
+        prim.GetAttribute(name).Set(value)
+    UsdPhysics.CollisionAPI.Apply(prim)
+    return prim
+
+
+class TestShapes:
+    @pytest.mark.parametrize(
+        ("kind", "values", "size"),
+        [
+            ("Sphere", {"radius": 2.0}, (2, 2, 2)),
+            ("Capsule", {"radius": 2.0, "height": 6.0, "axis": "X"}, (2, 2, 3)),
+            ("Cylinder", {"radius": 2.0, "height": 6.0, "axis": "Y"}, (2, 2, 3)),
+            ("Cube", {"size": 4.0}, (2, 2, 2)),
+            ("Plane", {"axis": "Y"}, (0, 0, 0)),
+        ],
+    )
+    def test_each_has_its_size_in_metres(self, tmp_path: Path, kind: str, values: dict, size: tuple):
+        stage = shot_with(tmp_path / "a.usda")
+        set_matrix(define(stage, kind, **values), np.diag([0.5, 0.5, 0.5, 1.0]))
+        pose = shape_of(read(save(stage))[1])
+        assert pose.kind == kind.lower()
+        np.testing.assert_allclose(pose.size, 0.5 * 0.01 * np.array(size, float), rtol=1e-6)
+        axis = np.eye(3)["XYZ".index(str(values.get("axis", "Z")))]
+        np.testing.assert_allclose(pose.turn[:, 2], axis, atol=1e-9)
+        np.testing.assert_allclose(pose.turn.T @ pose.turn, np.eye(3), atol=1e-9)
+
+    def test_extents_are_usds(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        prim = define(stage, "Capsule", radius=0.5, height=3.0, axis="X")
+        extent = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
+        pose = shape_of(read(save(stage))[1])
+        np.testing.assert_allclose(ShapeSurface(pose).bounds + pose.centre, np.asarray(extent), atol=1e-6)
+
+    def test_a_squashed_sphere_becomes_a_mesh(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        set_matrix(define(stage, "Sphere", radius=1.0), np.diag([1.0, 2.0, 1.0, 1.0]))
+        pose = mesh_of(read(save(stage))[1])
+        np.testing.assert_allclose(np.ptp(pose.points, axis=0), [2.0, 4.0, 2.0], rtol=2e-3)
+        assert [surface.closed for surface in surfaces((pose.points, pose.triangles))] == [True]
+
+    def test_a_cube_may_be_stretched(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        set_matrix(define(stage, "Cube", size=2.0), np.diag([1.0, 2.0, 3.0, 1.0]))
+        np.testing.assert_allclose(shape_of(read(save(stage))[1]).size, [1.0, 2.0, 3.0])
+
+    def test_a_cone_is_a_closed_mesh(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        define(stage, "Cone", radius=1.0, height=2.0)
+        pose = mesh_of(read(save(stage))[1])
+        assert [surface.closed for surface in surfaces((pose.points, pose.triangles))] == [True]
+
+    def test_a_mirrored_plane_still_looks_along_its_axis(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        set_matrix(define(stage, "Plane", axis="Y"), np.diag([-1.0, 1.0, 1.0, 1.0]))
+        np.testing.assert_allclose(shape_of(read(save(stage))[1]).turn[:, 2], [0.0, 1.0, 0.0], atol=1e-9)
+
+    def test_points_are_no_collider(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda")
+        UsdGeom.Points.Define(stage, BODY).GetPrim().AddAppliedSchema(COLLIDER_API)
+        scene, _, said = read(save(stage))
+        assert scene.colliders == ()
+        assert any("no collider that cloth can rest on" in line for line in said)
+
+
+class TestWhoFeelsWhat:
+    def test_a_relationship_leaves_the_others_out(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda")
+        add_sheet(stage, "/World/other")
+        for name in ("a", "b"):
+            add_box(stage, f"/World/{name}")
+        garment = stage.GetPrimAtPath("/World/other")
+        garment.CreateRelationship("physgraph:colliders").SetTargets(["/World/b"])
+        scene, _, _ = read(save(stage))
+        assert [collider.path for collider in scene.colliders] == ["/World/a", "/World/b"]
+        assert [garment.colliders for garment in scene.garments] == [(0, 1), (1,)]
+
+    def test_offsets_are_read(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda")
+        author(add_box(stage).GetPrim(), "physgraph:collider:offset", 0.003)
+        author(stage.GetPrimAtPath("/World/cloth"), "physgraph:contact:offset", 0.001)
+        scene, frame, _ = read(save(stage))
+        assert scene.colliders[0].offset == pytest.approx(0.003)
+        assert frame.garments[0].offset == pytest.approx(0.001)
+        assert read(str(tmp_path / "a.usda"), overrides=("contact:offset=0.005",))[1].garments[0].offset == 0.005

@@ -1,0 +1,179 @@
+"""Distances, sides and orientation of collider surfaces, against libigl and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from bodies import around, ball, box, distances, endless, flipped, split, surfaces, together, tube
+
+from physgraph_usd.colliders.mesh import MeshBody
+from physgraph_usd.colliders.orient import pieces_of
+from physgraph_usd.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.colliders.primitives import ShapeSurface
+from physgraph_usd.colliders.sign import signed_distances
+from physgraph_usd.usd.shapes import tessellated
+
+BODIES = {
+    "ball": ball(),
+    "box": box(),
+    "flipped": flipped(ball()),
+    "mixed": flipped(ball(), 0.5),
+    "split": split(ball()),
+    "two": together(ball(), flipped(ball(at=(0.6, 0.0, 0.0)))),
+}
+
+
+def signed_by(surface, x: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
+    pairs = torch.as_tensor(np.zeros((0, 2), np.int32) if edges is None else edges)
+    return signed_distances(surface, torch.as_tensor(x - surface.origin), pairs, reach=10.0).numpy()
+
+
+class TestMeshes:
+    @pytest.mark.parametrize("name", BODIES)
+    def test_closed_bodies_are_closed_whatever_their_winding(self, name: str):
+        (surface,) = surfaces(BODIES[name])
+        assert surface.closed
+        corners = BODIES[name][0][surface.triangles]
+        volume = np.einsum("tc,tc->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
+        assert volume > 0
+
+    @pytest.mark.parametrize("name", BODIES)
+    def test_distances_are_libigls(self, name: str):
+        soup = BODIES[name]
+        (surface,) = surfaces(soup)
+        x = around(soup)
+        found = surface.closest(torch.as_tensor(x - surface.origin), endless(len(x)))
+        np.testing.assert_allclose(found.distance.numpy(), distances(soup, x), atol=2e-6)
+        np.testing.assert_allclose(distances(soup, found.point.numpy() + surface.origin), 0.0, atol=2e-6)
+
+    @pytest.mark.parametrize("name", ["ball", "flipped", "mixed", "split"])
+    def test_inside_is_inside(self, name: str):
+        (surface,) = surfaces(BODIES[name])
+        x = around(BODIES[name])
+        radius = np.linalg.norm(x, axis=1)
+        clear = np.abs(radius - 0.2) > 2e-3
+        np.testing.assert_array_equal(signed_by(surface, x)[clear] < 0, radius[clear] < 0.2)
+
+    def test_signs_spread_along_edges_are_those_asked_one_by_one(self):
+        soup = together(ball(), ball(0.15, at=(0.25, 0.0, 0.0)))
+        (surface,) = surfaces(soup)
+        x = around(soup, 3000)
+        near = np.linalg.norm(x[:, None] - x[None, :500], axis=2) < 0.04
+        edges = np.argwhere(near).astype(np.int32)
+        np.testing.assert_array_equal(signed_by(surface, x, edges), signed_by(surface, x))
+
+    def test_a_tube_is_open_and_has_a_rim(self):
+        soup = tube()
+        (surface,) = surfaces(soup)
+        assert not surface.closed
+        x = torch.tensor([[0.12, 0.0, 0.0], [0.08, 0.0, 0.0], [0.1, 0.0, 0.25]], dtype=torch.float64)
+        found = surface.closest(x, endless(3))
+        assert found.side.tolist()[:2] == [1.0, -1.0]
+        assert found.rim.tolist() == [False, False, True]
+        assert not bool(surface.inside(x).any())
+
+    def test_a_ball_and_a_tube_in_one_mesh_part(self):
+        closed, opened = surfaces(together(ball(), tube()))
+        assert (closed.closed, opened.closed) == (True, False)
+        assert len(closed.triangles) == len(ball()[1])
+
+    def test_a_body_with_a_small_hole_is_closed(self):
+        points, triangles = ball(level=4)
+        assert [s.closed for s in surfaces((points, triangles[20:]))] == [True]
+
+    def test_faces_without_a_place_are_left_out(self):
+        points, triangles = ball()
+        points = points.copy()
+        points[5] = np.nan
+        pieces = pieces_of(points, triangles)
+        assert not (pieces.closed == 5).any()
+        assert len(pieces.closed) + len(pieces.open) == len(triangles) - (triangles == 5).any(axis=1).sum()
+
+    def test_three_faces_at_an_edge_do_not_fail(self):
+        points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], float)
+        pieces = pieces_of(points, np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [1, 1, 2]]))
+        assert len(pieces.open) == 3
+
+    def test_a_pose_moves_the_surface(self):
+        points, triangles = ball()
+        body = MeshBody(device="cpu", lanes=1)
+        body.pose(MeshPose(points, triangles))
+        (surface,) = body.pose(MeshPose(2.0 * points + 5.0, triangles))
+        x = np.array([[5.0, 5.0, 5.5]])
+        assert signed_by(surface, x)[0] == pytest.approx(0.1, abs=2e-3)
+
+    def test_the_topology_may_change(self):
+        body = MeshBody(device="cpu", lanes=1)
+        body.pose(MeshPose(*ball()))
+        (surface,) = body.pose(MeshPose(*box()))
+        assert signed_by(surface, np.zeros((1, 3)))[0] == pytest.approx(-0.1, abs=1e-6)
+
+    def test_far_from_the_world_origin_nothing_is_lost(self):
+        points, triangles = ball()
+        (surface,) = surfaces((points + 1e5, triangles))
+        x = around(ball())
+        np.testing.assert_allclose(np.abs(signed_by(surface, x + 1e5)), distances(ball(), x), atol=3e-6)
+
+
+class TestOverlap:
+    def test_the_way_out_of_overlapping_parts_is_on_a_bare_face(self):
+        """Between two balls 0.2 in radius and 0.2 apart the nearest faces are buried in the other ball."""
+        soup = together(ball(level=4), ball(level=4, at=(0.2, 0.0, 0.0)))
+        (surface,) = surfaces(soup)
+        x = torch.tensor([[0.1, 0.0, 0.0]], dtype=torch.float64)
+        asked = x - torch.as_tensor(surface.origin)
+        found = surface.closest(asked, endless(1))
+        assert float(found.distance) == pytest.approx(0.1, abs=2e-3)
+        way = surface.exit(asked, found)
+        # The balls meet in a ring of radius sqrt(0.2^2 - 0.1^2).
+        assert float(way.distance) == pytest.approx(np.sqrt(0.03), abs=0.02)
+
+    def test_without_overlap_it_is_the_closest_point(self):
+        (surface,) = surfaces(ball())
+        x = torch.tensor([[0.05, 0.0, 0.0]], dtype=torch.float64)
+        found = surface.closest(x, endless(1))
+        assert surface.exit(x, found) is found
+
+
+SHAPES = {
+    "sphere": np.array([0.2, 0.2, 0.2]),
+    "capsule": np.array([0.1, 0.1, 0.2]),
+    "cylinder": np.array([0.1, 0.1, 0.2]),
+    "cube": np.array([0.1, 0.15, 0.2]),
+}
+
+
+class TestShapes:
+    @pytest.mark.parametrize("kind", SHAPES)
+    def test_distances_are_those_of_a_fine_mesh(self, kind: str):
+        turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+        turn *= np.sign(np.linalg.det(turn))
+        centre = np.array([0.3, -0.2, 0.1])
+        points, triangles = tessellated(kind, SHAPES[kind])
+        soup = points @ turn.T + centre, triangles
+        x = around(soup)
+        surface = ShapeSurface(ShapePose(kind, turn, centre, SHAPES[kind]))
+        (mesh,) = surfaces(soup)
+        exact, meshed = signed_by(surface, x), signed_by(mesh, x)
+        np.testing.assert_allclose(exact, meshed, atol=1e-3)
+
+    @pytest.mark.parametrize("kind", [*SHAPES, "plane"])
+    def test_normals_are_the_gradient(self, kind: str):
+        size = SHAPES.get(kind, np.zeros(3))
+        surface = ShapeSurface(ShapePose(kind, np.eye(3), np.zeros(3), size))
+        x = torch.as_tensor(np.random.default_rng(4).uniform(-0.3, 0.3, (60, 3)))
+        found = surface.closest(x, endless(len(x)))
+        for axis in range(3):
+            step = torch.zeros(3, dtype=torch.float64)
+            step[axis] = 1e-6
+            ahead, behind = (surface.closest(x + sign * step, endless(len(x))) for sign in (1.0, -1.0))
+            slope = (ahead.distance * ahead.side - behind.distance * behind.side) / 2e-6
+            np.testing.assert_allclose(slope.numpy(), found.normal[:, axis].numpy(), atol=1e-6)
+
+    def test_s23_the_centre_of_a_sphere_has_a_direction(self):
+        for kind in ("sphere", "capsule", "cylinder"):
+            surface = ShapeSurface(ShapePose(kind, np.eye(3), np.zeros(3), SHAPES[kind]))
+            found = surface.closest(torch.zeros((1, 3), dtype=torch.float64), endless(1))
+            assert float(found.normal.norm()) == pytest.approx(1.0)
+            assert float(found.distance) == pytest.approx(SHAPES[kind][0])

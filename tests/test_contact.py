@@ -1,0 +1,250 @@
+"""Contact: the force, and sheets that rest on bodies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from bodies import Soup, ball, box, distances, flipped, together, tube
+from cloth import FABRIC, sheet
+from sheets import level_of
+from touching import frame, measured, mesh_pose, refiner
+
+import physgraph_usd.contact
+from physgraph_usd.colliders.mesh import MeshBody
+from physgraph_usd.colliders.pose import ShapePose
+from physgraph_usd.forces.contact import Contact, Planes
+
+MESH, REST = sheet(12, 12, 0.05)
+FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
+"""The sheet lying level: normals up, gravity is down y."""
+DEEP = 1e-4
+
+
+def random_planes(count: int, seed: int = 0) -> tuple[Planes, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    normal = rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    x = torch.as_tensor(rng.normal(size=(count, 3)))
+    height = (torch.as_tensor(normal) * x).sum(dim=1) + torch.as_tensor(rng.uniform(-0.1, 0.1, count))
+    return Planes(torch.arange(count, dtype=torch.int32), torch.as_tensor(normal), height), x
+
+
+class TestForce:
+    level = level_of(REST, MESH.indices.reshape(-1, 3))
+
+    @pytest.mark.parametrize("form", ["quadratic", "linear"])
+    def test_it_is_minus_the_gradient(self, form: str):
+        planes, x = random_planes(self.level.vertex_count)
+        other = random_planes(self.level.vertex_count, 1)[0]
+        contact = Contact(self.level, [planes, replace(other, height=other.height - 0.5)], 1e4, form=form)
+        clear = torch.stack([(each.height - (each.normal * x).sum(dim=1)).abs() > 1e-3 for each in contact.planes])
+        force = torch.zeros_like(x)
+        contact.add_force(x, force)
+        rng = np.random.default_rng(5)
+        for vertex in rng.choice(np.flatnonzero(clear.all(dim=0).numpy()), 12):
+            for axis in range(3):
+                step = torch.zeros_like(x)
+                step[vertex, axis] = 1e-6
+                ahead, behind = (contact.add_force(x + s * step, torch.zeros_like(x)) for s in (1, -1))
+                slope = float(ahead - behind) / 2e-6
+                assert -slope == pytest.approx(float(force[vertex, axis]), rel=1e-5, abs=1e-6)
+
+    def test_at_the_kink_the_quadratic_form_has_no_force(self):
+        planes, x = random_planes(self.level.vertex_count)
+        touching = replace(planes, height=(planes.normal * x).sum(dim=1))
+        force = torch.zeros_like(x)
+        assert float(Contact(self.level, [touching], 1e4).add_force(x, force)) == pytest.approx(0.0, abs=1e-20)
+        assert float(force.abs().max()) < 1e-10
+
+    def test_the_linear_form_pushes_alike_at_any_depth(self):
+        planes, x = random_planes(self.level.vertex_count)
+        along = (planes.normal * x).sum(dim=1)
+        pushes = []
+        for depth in (1e-3, 1e-2):
+            force = torch.zeros_like(x)
+            Contact(self.level, [replace(planes, height=along + depth)], 1.0, form="linear").add_force(x, force)
+            pushes.append(force)
+        torch.testing.assert_close(pushes[0], pushes[1])
+        assert float(pushes[0].norm(dim=1).sum()) == pytest.approx(1.0, rel=1e-6)
+
+    def test_its_diagonal_is_a_third_of_the_trace(self):
+        planes, x = random_planes(self.level.vertex_count)
+        contact = Contact(self.level, [planes], 1e4)
+        deep = planes.height > (planes.normal * x).sum(dim=1)
+        torch.testing.assert_close(contact.diagonal(x), 1e4 / 3.0 * self.level.vertex_area * deep)
+
+
+def draped(height: float) -> np.ndarray:
+    """The level sheet at a height."""
+    return FLAT + np.array([0.0, height, 0.0])
+
+
+def up(kind: str, size: tuple[float, float, float]) -> ShapePose:
+    """A primitive whose axis is up, at the origin."""
+    turn = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    return ShapePose(kind, turn, np.zeros(3), np.array(size))
+
+
+SHAPES = {
+    "sphere": (up("sphere", (0.2, 0.2, 0.2)), 0.19),
+    "plane": (up("plane", (0.0, 0.0, 0.0)), -0.004),
+    "cube": (up("cube", (0.15, 0.15, 0.1)), 0.095),
+    "cylinder": (up("cylinder", (0.15, 0.15, 0.1)), 0.095),
+    "capsule": (up("capsule", (0.15, 0.15, 0.1)), 0.24),
+}
+MESHES: dict[str, tuple[Soup, float]] = {
+    "ball": (ball(level=4), 0.19),
+    "block": (box((0.3, 0.2, 0.3)), 0.095),
+    "flipped": (flipped(ball(level=4)), 0.19),
+    "mixed": (flipped(ball(level=4), 0.5), 0.19),
+    "two": (together(ball(0.12, at=(-0.12, 0.0, 0.0)), ball(0.12, at=(0.14, 0.0, 0.0))), 0.11),
+}
+
+
+class TestRest:
+    @pytest.mark.parametrize("kind", SHAPES)
+    def test_on_a_primitive(self, kind: str):
+        pose, height = SHAPES[kind]
+        state = refiner((MESH, REST), [kind]).solve(frame(draped(height), pose))
+        assert measured(state, "before")["inside"] > 0
+        assert measured(state)["inside"] == 0
+        assert measured(state)["crossings"] <= measured(state, "before")["crossings"]
+
+    @pytest.mark.parametrize("name", MESHES)
+    def test_on_a_mesh(self, name: str):
+        soup, height = MESHES[name]
+        state = refiner((MESH, REST)).solve(frame(draped(height), mesh_pose(soup)))
+        assert measured(state, "before")["inside"] > 0
+        assert measured(state)["inside"] == 0
+        assert measured(state)["crossings"] <= measured(state, "before")["crossings"]
+        points = state.points[0]
+        assert points is not None
+        if name != "two":
+            above = points[np.linalg.norm(points[:, [0, 2]], axis=1) < 0.05]
+            assert (above[:, 1] > height).all()
+        assert distances(soup, points).min() > 2e-4
+
+    def test_energy_falls_in_every_round(self):
+        soup, height = MESHES["ball"]
+        state = refiner((MESH, REST)).solve(frame(draped(height), mesh_pose(soup)))
+        levels = state.telemetry[0]["levels"]
+        assert isinstance(levels, list)
+        assert len(levels) > 3
+        assert all(entry["energy_after"] <= entry["energy_before"] for entry in levels)
+
+    def test_the_offset_is_kept(self):
+        """Under its own weight alone the sheet sinks into the 2 mm by less than a tenth."""
+        pose = SHAPES["plane"][0]
+        state = refiner((MESH, REST), ["plane"], steps=60).solve(frame(draped(0.0), pose))
+        points = state.points[0]
+        assert points is not None
+        assert 0.0016 < points[:, 1].min() < points[:, 1].max() < 0.0021
+
+    def test_pinned_vertices_stay_and_are_told(self):
+        soup, height = MESHES["ball"]
+        pin = (np.linalg.norm(FLAT, axis=1) < 0.06).astype(float)
+        state = refiner((MESH, REST), pin=pin).solve(frame(draped(height), mesh_pose(soup)))
+        assert measured(state)["pinned"] > 0
+        assert measured(state)["inside"] == 0
+        points = state.points[0]
+        assert points is not None
+        np.testing.assert_allclose(points[np.flatnonzero(pin)], draped(height)[pin > 0], atol=1e-7)
+
+    def test_the_paper_form_is_projected_too(self):
+        soup, height = MESHES["ball"]
+        state = refiner((MESH, REST), form="linear").solve(frame(draped(height), mesh_pose(soup)))
+        assert measured(state)["inside"] == 0
+
+    @pytest.mark.parametrize("turn", [0.0, 0.5, 1.0])
+    def test_s18_an_open_surface_is_not_crossed(self, turn: float):
+        """The sheet starts above the flank of an open tube that lies down, whichever way its faces look."""
+        points, triangles = flipped(tube(0.15, 0.5), turn)
+        lying = points[:, [2, 0, 1]]
+        state = refiner((MESH, REST)).solve(frame(draped(0.152), mesh_pose((lying, triangles))))
+        fine = state.points[0]
+        assert fine is not None
+        over = (np.abs(fine[:, 0]) < 0.24) & (np.abs(fine[:, 2]) < 0.1)
+        assert (np.linalg.norm(fine[over][:, 1:], axis=1) > 0.149).all()
+
+    def test_a_sheet_that_starts_inside_an_open_tube_stays_inside(self):
+        points, triangles = tube(0.35, 2.0)
+        lying = points[:, [2, 0, 1]]
+        state = refiner((MESH, REST)).solve(frame(draped(-0.15), mesh_pose((lying, triangles))))
+        fine = state.points[0]
+        assert fine is not None
+        assert (np.linalg.norm(fine[:, 1:], axis=1) < 0.35).all()
+
+    def test_s20_deep_vertices_come_out(self):
+        """The middle of the sheet starts 15 cm inside."""
+        soup = ball(0.2, level=4)
+        state = refiner((MESH, REST)).solve(frame(draped(0.05), mesh_pose(soup)))
+        assert measured(state, "before")["deepest_mm"] > 100
+        assert measured(state)["inside"] == 0
+
+
+class TestLeftOut:
+    def test_a_far_body_changes_no_bit(self):
+        far = mesh_pose((ball()[0] + 10.0, ball()[1]))
+        alone = refiner((MESH, REST), felt=()).solve(frame(draped(0.0)))
+        beside = refiner((MESH, REST)).solve(frame(draped(0.0), far))
+        np.testing.assert_array_equal(alone.points[0], beside.points[0])
+        assert beside.telemetry[0]["near"] == []
+        assert "contact" not in beside.telemetry[0]
+
+    def test_a_body_near_the_bounds_that_nothing_reaches_changes_no_bit(self):
+        close = mesh_pose((ball()[0] + np.array([0.0, 0.33, 0.0]), ball()[1]))
+        alone = refiner((MESH, REST), felt=()).solve(frame(draped(0.0)))
+        beside = refiner((MESH, REST)).solve(frame(draped(0.0), close))
+        np.testing.assert_array_equal(alone.points[0], beside.points[0])
+
+    def test_without_bodies_no_contact_code_runs(self, monkeypatch: pytest.MonkeyPatch):
+        def refuse(*args: object, **options: object) -> None:
+            raise AssertionError("contact code ran")
+
+        monkeypatch.setattr(physgraph_usd.contact.FrameContact, "begin", refuse)
+        monkeypatch.setattr(MeshBody, "pose", refuse)
+        near = mesh_pose(ball())
+        assert refiner((MESH, REST), felt=()).solve(frame(draped(0.1), near)).points[0] is not None
+        assert refiner((MESH, REST), form="off").solve(frame(draped(0.1), near)).points[0] is not None
+        with pytest.raises(AssertionError, match="contact code ran"):
+            refiner((MESH, REST)).solve(frame(draped(0.1), near))
+
+    def test_a_moving_body_ends_reuse_only_where_it_is_near(self):
+        soup = ball()
+        one = refiner((MESH, REST), level=1)
+        here = mesh_pose(soup)
+        one.solve(frame(draped(0.19), here, time=1.0))
+        assert one.solve(frame(draped(0.19), mesh_pose((soup[0].copy(), soup[1])), time=2.0)).reused == (True,)
+        moved = mesh_pose((soup[0] + np.array([0.0, 0.01, 0.0]), soup[1]))
+        assert one.solve(frame(draped(0.19), moved, time=3.0)).reused == (False,)
+        far = [mesh_pose((soup[0] + shift, soup[1])) for shift in (10.0, 11.0)]
+        two = refiner((MESH, REST), level=1)
+        assert [two.solve(frame(draped(0.19), pose, time=float(t))).reused[0] for t, pose in enumerate(far)] == [
+            False,
+            True,
+        ]
+
+    def test_a_body_without_a_pose_is_not_there(self):
+        alone = refiner((MESH, REST), felt=()).solve(frame(draped(0.0)))
+        state = refiner((MESH, REST)).solve(frame(draped(0.0), None))
+        np.testing.assert_array_equal(alone.points[0], state.points[0])
+
+
+def test_the_same_frame_twice_is_the_same_to_the_bit():
+    soup, height = MESHES["two"]
+    made = [refiner((MESH, REST)).solve(frame(draped(height), mesh_pose(soup))).points[0] for _ in range(2)]
+    np.testing.assert_array_equal(made[0], made[1])
+
+
+def test_stiffer_cloth_is_pushed_harder():
+    """k_c follows the fabric, so that a stiff one does not cut in."""
+    soup, height = MESHES["ball"]
+    stiff = replace(FABRIC, stretch=3000.0, bend=1e-3)
+    base = frame(draped(height), mesh_pose(soup))
+    state = refiner((MESH, REST)).solve(replace(base, garments=(replace(base.garments[0], fabric=stiff),)))
+    assert measured(state)["inside"] == 0
+    projected = state.telemetry[0]["contact"]["projected"]  # type: ignore[index]
+    assert projected["largest_mm"] < 3.0
