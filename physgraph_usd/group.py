@@ -15,20 +15,16 @@ from torch import Tensor
 from .contact import ContactSettings, FrameContact, LevelContact, Touching
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
-from .forces.base import Force, ForceModule
-from .forces.bending import Bending
+from .forces.base import ForceModule
 from .forces.contact import Contact
-from .forces.gravity import Gravity
-from .forces.guide import Guide, GuideMap
-from .forces.membrane import in_plane_terms
-from .forces.stretch import PAPER_SPRING, garment_area
-from .forces.tether import Tether
+from .forces.guide import GuideMap
 from .integrate import Method
 from .integrate.base import System
-from .integrate.metric import Metric, kept_to_edges
+from .integrate.metric import Metric
 from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
+from .level_forces import LevelForces, build_forces
 from .mesh.subdivide import Refinement
 from .resolution import sharp_folds
 from .rounds import solve_rounds
@@ -70,15 +66,6 @@ class SolveSettings:
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
-
-
-@dataclass(frozen=True, eq=False)
-class _LevelForces:
-    """The terms of one level that last as long as the materials, and their metric."""
-
-    elastic: tuple[Force, ...]
-    guide: Guide
-    metric: Metric
 
 
 class Group:
@@ -124,7 +111,7 @@ class Group:
         self._fixed = np.flatnonzero(~finest.free.cpu().numpy().ravel())
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
         self._material: tuple[object, ...] = ()
-        self._forces: list[_LevelForces] = []
+        self._forces: list[LevelForces] = []
         self._stretch = 0.0
 
     def solve(
@@ -204,43 +191,29 @@ class Group:
         coarse = self._tensor(np.concatenate([f.points for f in frames]))
         coarse = coarse - coarse.mean(dim=0)
         forces = self._forces_for(frames)
-        return [ForceModule((*lasting.elastic, lasting.guide.retarget(coarse))) for lasting in forces], coarse
+        return [lasting.module(coarse) for lasting in forces], coarse
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)
 
-    def _forces_for(self, frames: Sequence[GarmentFrame]) -> list[_LevelForces]:
+    def _forces_for(self, frames: Sequence[GarmentFrame]) -> list[LevelForces]:
         """The lasting terms, rebuilt with their metrics when a material changes."""
         material = tuple((frame.fabric, frame.guide) for frame in frames)
         if material != self._material:
             self._forces = [
-                self._level_forces(level, guide_map, frames)
+                build_forces(
+                    level,
+                    guide_map,
+                    self.garments,
+                    frames=frames,
+                    gravity=self._gravity,
+                    potential=self._settings.potential,
+                )
                 for level, guide_map in zip(self.levels, self._guide_maps, strict=True)
             ]
             self._material = material
             self._stretch = max(frame.fabric.stretch for frame in frames)
         return self._forces
-
-    def _level_forces(self, level: Level, guide_map: GuideMap, frames: Sequence[GarmentFrame]) -> _LevelForces:
-        potential = self._settings.potential
-
-        def each(name: str) -> Tensor:
-            return torch.tensor([getattr(f.fabric, name) for f in frames], dtype=level.dtype, device=level.device)
-
-        guide_stiffness = np.concatenate(
-            [frame.guide * garment.guide_scale for frame, garment in zip(frames, self.garments, strict=True)]
-        )
-        relative = 1.0
-        if potential == "paper":
-            relative = PAPER_SPRING / 3.0 * float(level.rest_length.square().mean() / garment_area(level).mean())
-        elastic: tuple[Force, ...] = (
-            *in_plane_terms(level, [frame.fabric for frame in frames], potential=potential),
-            Bending(level, each("bend"), potential=potential),
-            Gravity(level, each("density"), self._gravity, potential=potential),
-        )
-        guide = Guide(level, guide_map, torch.as_tensor(guide_stiffness), relative_weight=relative)
-        matrix = kept_to_edges(ForceModule((*elastic, guide)).rest_matrix(), level.edges.cpu().numpy())
-        return _LevelForces(elastic, guide, Metric(matrix, free=level.free, dtype=level.dtype))
 
     def _predict(self, kept: Carried | None, coarse: Tensor, world: Tensor) -> tuple[Tensor | None, str]:
         """Where the last frame's detail would be now, unless the cage jumped."""
@@ -254,16 +227,11 @@ class Group:
         finest = self.levels[-1]
         base = finest.base.apply(coarse)
         predicted = torch.where(finest.free, predicted, base)
-        carried, plain = (self._elastic_energy(x) for x in (predicted, base))
+        carried, plain = (self._forces[-1].elastic_energy(x) for x in (predicted, base))
         least = LEAST_STRAIN**2 * self._stretch * float(finest.vertex_area.sum())
         if carried > WORTH * max(plain, least):
             return None, f"cold: carried detail has {carried / max(plain, least):.3g} times the upsampled cage's energy"
         return predicted, "warm"
-
-    def _elastic_energy(self, x: Tensor) -> float:
-        """Energy of the finest level's stretch and bending [J]."""
-        terms = [term for term in self._forces[-1].elastic if not isinstance(term, Gravity)]
-        return sum(ForceModule(terms).energies(x).values())
 
     def _contact(
         self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray, frames: Sequence[GarmentFrame]
@@ -277,7 +245,7 @@ class Group:
 
     def _descend(
         self,
-        forces: list[_LevelForces],
+        forces: list[LevelForces],
         coarse: Tensor,
         predicted: Tensor | None,
         clock: float,
@@ -293,15 +261,16 @@ class Group:
             level, lasting = self.levels[index], forces[index]
             if index > first and level.from_below is not None:
                 x = level.from_below.apply(x)
-            module = ForceModule((*lasting.elastic, lasting.guide.retarget(coarse)))
+            module = lasting.module(coarse)
             terms = module
             if predicted is not None and self._settings.temporal == "tether":
-                density = torch.stack([force.density for force in lasting.elastic if isinstance(force, Gravity)])[0]
-                terms = ForceModule((*module.forces, Tether(level, density, self._settings.tether, predicted)))
+                terms = ForceModule((*module.forces, lasting.tether(self._settings.tether, predicted)))
             budget = self._budget(index, len(self.levels), clock)
             view = None if contact is None else contact.at(level, self.levels[-1])
             cold = predicted is None
             x, made, touched = self._solve_level(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
+            if index < len(self.levels) - 1:
+                made[-1].energies = module.energies(x)
             reports += made
             module = module if touched is None else ForceModule((*module.forces, touched))
         return x, reports, module
@@ -367,10 +336,10 @@ class Group:
             "sharp_folds": sharp_folds(finest, x),
         }
 
-    def _blame(self, lasting: _LevelForces, coarse: Tensor, error: SolveError, at: float | None) -> str:
+    def _blame(self, lasting: LevelForces, coarse: Tensor, error: SolveError, at: float | None) -> str:
         """Name prim, time and the term that is not finite."""
         x = self.levels[-1].base.apply(coarse)
-        energies = ForceModule((*lasting.elastic, lasting.guide.retarget(coarse))).energies(x)
+        energies = lasting.module(coarse).energies(x)
         broken = [name for name, value in energies.items() if not np.isfinite(value)] or ["none at the input"]
         where = ", ".join(f"<{garment.path}>" for garment in self.garments)
         when = "" if at is None else f" at time code {at:g}"

@@ -45,6 +45,7 @@ class LevelReport:
         milliseconds: Wall time of the level.
         stopped: "tolerance", "steps", "budget" or "stalled".
         movers: How many steps each mover made.
+        energies: Energy of each term at the end [J], where the solver's caller asked for them.
     """
 
     level: int
@@ -58,6 +59,7 @@ class LevelReport:
     milliseconds: float = 0.0
     stopped: str = "steps"
     movers: dict[str, int] = field(default_factory=dict)
+    energies: dict[str, float] = field(default_factory=dict)
 
 
 def solve_level(

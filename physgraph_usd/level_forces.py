@@ -1,0 +1,86 @@
+"""The terms of one level that last as long as the materials, and their metric."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .forces import body_terms, elastic_terms
+from .forces.base import Force, ForceModule
+from .forces.guide import Guide, GuideMap
+from .forces.stretch import PAPER_SPRING, garment_area
+from .forces.tether import Tether
+from .integrate.metric import Metric, kept_to_edges
+from .level import Level
+from .scene import Garment, GarmentFrame
+
+
+@dataclass(frozen=True, eq=False)
+class LevelForces:
+    """What one level's cloth feels, frame after frame.
+
+    Attributes:
+        level: The level.
+        elastic: Stretch, membrane and bending.
+        body: Gravity.
+        guide: The guide, without a target.
+        metric: The factorised rest Hessian of all of them.
+        density: Areal density of each garment [kg/m^2].
+    """
+
+    level: Level
+    elastic: tuple[Force, ...]
+    body: tuple[Force, ...]
+    guide: Guide
+    metric: Metric
+    density: Float[Tensor, " garments"]
+
+    def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
+        """All terms of one frame, given its recentred coarse positions [m]."""
+        return ForceModule((*self.elastic, *self.body, self.guide.retarget(coarse)))
+
+    def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
+        """The tie to predicted positions [m], of stiffness [1/s^2]."""
+        return Tether(self.level, self.density, stiffness, predicted)
+
+    def elastic_energy(self, x: Float[Tensor, "vertices 3"]) -> float:
+        """Energy of the cloth itself [J]."""
+        return sum(ForceModule(self.elastic).energies(x).values())
+
+
+def build_forces(
+    level: Level,
+    guide_map: GuideMap,
+    garments: Sequence[Garment],
+    *,
+    frames: Sequence[GarmentFrame],
+    gravity: np.ndarray,
+    potential: str,
+) -> LevelForces:
+    """Weigh the terms of a level by the materials of a frame.
+
+    Args:
+        level: The level.
+        guide_map: Its averaging operator.
+        garments: The garments.
+        frames: Their values at one time code.
+        gravity: [m/s^2], shape (3,).
+        potential: "continuum" or "paper".
+    """
+    fabrics = [frame.fabric for frame in frames]
+    stiffness = np.concatenate([frame.guide * g.guide_scale for frame, g in zip(frames, garments, strict=True)])
+    relative = 1.0
+    if potential == "paper":
+        relative = PAPER_SPRING / 3.0 * float(level.rest_length.square().mean() / garment_area(level).mean())
+    elastic = elastic_terms(level, fabrics, potential=potential)
+    body = body_terms(level, fabrics, gravity=gravity, potential=potential)
+    guide = Guide(level, guide_map, torch.as_tensor(stiffness), relative_weight=relative)
+    matrix = kept_to_edges(ForceModule((*elastic, *body, guide)).rest_matrix(), level.edges.cpu().numpy())
+    metric = Metric(matrix, free=level.free, dtype=level.dtype)
+    density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
+    return LevelForces(level, elastic, body, guide, metric, density)
