@@ -299,7 +299,14 @@ class Group:
         if view is None:
             x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
             return x, [report], None
-        return solve_rounds(system, integrator, x, touched=touched, view=view, level=level.index, budget=budget)
+        alone: list[LevelReport] = []
+        if level is self.levels[-1]:
+            x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
+            alone, touched = [report], view.term(x)
+        x, made, touched = solve_rounds(
+            system, integrator, x, touched=touched, view=view, level=level.index, budget=budget
+        )
+        return x, alone + made, touched
 
     def _budget(self, index: int, count: int, clock: float) -> Budget:
         """Steps and deadline of one level."""
