@@ -2,8 +2,9 @@
 
     python -m benchmarks.artist_loop [docs/pictures/bending.png]
 
-Prints the folds' wavelength, 2 pi sqrt(mean |grad d|^2 / mean |laplacian d|^2) of the detail d, for each stiffness, and
-draws both. Slopes and curvatures are weighed, not heights: heights are those of the sag and of the sleeve's lift.
+Prints the folds' wavelength, 2 pi sqrt(|grad d|^2 / |laplacian d|^2) with both at the 90th percentile over the cloth,
+of the detail d, for each stiffness, and draws both. Slopes and curvatures are weighed, not heights: heights are those
+of the sag and of the lifted sleeve. The percentile takes the folds, not the armpit, pinched sharp at any stiffness.
 """
 
 from __future__ import annotations
@@ -68,8 +69,9 @@ def wavelength(level: Level, field: np.ndarray) -> float:
     np.add.at(pull, ends[:, 0], weight[:, None] * rise)
     np.add.at(pull, ends[:, 1], -weight[:, None] * rise)
     area = np.maximum(level.vertex_area.double().numpy(), 1e-12)
-    curvature = ((pull**2).sum(axis=1) / area).sum()
-    return float(2.0 * np.pi * np.sqrt((weight[:, None] * rise**2).sum() / curvature))
+    slope = np.bincount(ends.ravel(), np.repeat(0.5 * weight * (rise**2).sum(axis=1), 2), len(field)) / area
+    curvature = (pull**2).sum(axis=1) / area**2
+    return float(2.0 * np.pi * np.sqrt(np.percentile(slope, 90) / np.percentile(curvature, 90)))
 
 
 def stack(pictures: list[Path], out: Path) -> None:

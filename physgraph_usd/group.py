@@ -35,6 +35,9 @@ WORTH = 2.0
 worth carrying takes compression up and lowers it; carried by a crumpled cage it tears the cloth."""
 LEAST_STRAIN = 1e-2
 """Strain of the whole garment under which that ratio is not looked at."""
+UNSETTLED = 0.1
+"""Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
+pinched between bodies cannot settle and holds up the steps of all the rest."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
 COARSE_TOLERANCE = 0.1
@@ -299,14 +302,14 @@ class Group:
         if view is None:
             x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
             return x, [report], None
-        alone: list[LevelReport] = []
-        if level is self.levels[-1]:
-            x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
-            alone, touched = [report], view.term(x)
         x, made, touched = solve_rounds(
             system, integrator, x, touched=touched, view=view, level=level.index, budget=budget
         )
-        return x, alone + made, touched
+        if touched is not None and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
+            apart = System(terms, metric, free=level.free & ~touched.near(level), spacing=level.spacing)
+            x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
+            made.append(report)
+        return x, made, touched
 
     def _budget(self, index: int, count: int, clock: float) -> Budget:
         """Steps and deadline of one level."""

@@ -24,7 +24,7 @@ from typing import Any
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -147,6 +147,13 @@ class Contact:
     def depths(self, x: Float[Tensor, "vertices 3"]) -> list[Float[Tensor, " planes"]]:
         """How far each vertex is behind each of its planes [m], not below zero; one entry a body."""
         return [(each.height - (each.normal * x[each.vertex.long()]).sum(dim=1)).clamp_min(0.0) for each in self.planes]
+
+    def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
+        """Which vertices see a plane."""
+        seen = torch.zeros_like(level.free)
+        for each in self.planes:
+            seen[each.vertex.long()] = True
+        return seen
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """k_c a_v / 3 where a plane pushes [N/m]; the linear form has none."""

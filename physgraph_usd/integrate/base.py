@@ -59,7 +59,8 @@ class System:
     def apply_metric_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with."""
         self.metric_solves += 1
-        return self._metric.solve(force)
+        move = self._metric.solve(force)
+        return move if self._all_free else move * self.free
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each vertex's Hessian block [N/m], positive."""
