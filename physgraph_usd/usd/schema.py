@@ -67,7 +67,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
         )
 
     return (
-        row("stretchStiffness", _JERSEY.stretch, "N/m", 1e-3, "In-plane stiffness E h / (1 - nu^2)."),
+        row("stretchStiffness", _JERSEY.stretch, "N/m", 1e-3, "In-plane stiffness E h: Young's modulus of the sheet."),
         row("shearStiffness", None, "N/m", 0.0, "Shear stiffness G h; authoring it selects the triangle membrane."),
         row("bendStiffness", _JERSEY.bend, "N m", 0.0, "Bending stiffness E h^3 / 12 (1 - nu^2)."),
         row("density", _JERSEY.density, "kg/m^2", 1e-4, "Mass per area."),
