@@ -163,8 +163,8 @@ class Group:
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
         if contact is not None:
-            start = self.levels[-1].base.apply(coarse)
-            telemetry["contact"] = contact.measure(self.levels[-1], start, result) | {"projected": pushed}
+            upsampled = self.levels[-1].base.apply(coarse)
+            telemetry["contact"] = contact.measure(self.levels[-1], upsampled, result) | {"projected": pushed}
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),

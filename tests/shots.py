@@ -17,6 +17,25 @@ from physgraph_usd.options import RefineOptions
 from physgraph_usd.report import RefineReport
 from physgraph_usd.shot import refine_shot
 
+VALID = {
+    "01_newton_shirt_dab_cm.usdc": ["/shot/char/shirt_geo"],
+    "02_makehuman_usdskel_dm.usdc": ["/shot/char/top", "/shot/char/shorts"],
+    "06_torus_pull.usda": ["/shot/cloth"],
+    "07_flag_quads_nocollider.usda": ["/shot/flag"],
+    "08_sphere_spin_xformcollider.usdc": ["/shot/set/cloth"],
+    "09_cesiumman_kilt/shot.usda": ["/shot/kilt"],
+    "12_variants/a_lefthanded_consistent.usdc": ["/shot/shirt"],
+    "12_variants/b_winding_flipped_unflagged.usdc": ["/shot/shirt"],
+    "12_variants/c_zup_cm.usdc": ["/shot/shirt"],
+    "12_variants/d_mixed_quads_tris.usdc": ["/shot/shirt"],
+    "12_variants/e_sparse_samples.usdc": ["/shot/shirt"],
+    "12_variants/f_subframe_times_tcps48.usdc": ["/shot/shirt"],
+    "12_variants/g_nonuniform_scaled_parent.usdc": ["/shot/rig/shirt"],
+    "12_variants/h_holes_creases_normals.usdc": ["/shot/shirt"],
+    "12_variants/j_visibility_purpose.usdc": ["/shot/shirt"],
+    "12_variants/k_static_garment.usda": ["/shot/shirt"],
+}
+"""The real shots listed as valid, and their garments."""
 CLOTH = "/World/cloth"
 EDGE = 0.05
 TIMES = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)

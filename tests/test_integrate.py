@@ -344,3 +344,18 @@ def test_names():
     assert all(isinstance(method.build(), Integrator) for method in METHODS.values())
     with pytest.raises(UsageError, match=r"unknown integrator 'strech'; known integrators: .*quasi-newton"):
         method_named("strech")
+
+
+def test_a_part_of_the_cloth_is_solved_while_the_rest_is_held():
+    mesh, rest = sheet(4, 4, 0.05)
+    whole, x = finest_system(group_of(mesh, rest, level=1), wave(rest))
+    moving = torch.zeros_like(whole.free)
+    moving[: len(x) // 2] = True
+    part = System(whole._field, whole._metric, free=whole.free & moving, spacing=whole.spacing)
+    held = ~part.free[:, 0]
+    force = part.energy_and_force(x)[1]
+    assert not force[held].any()
+    assert not part.apply_metric_inverse(force)[held].any()
+    out, report = solve_level(part, QuasiNewton(), x, level=0, budget=Budget(20))
+    assert torch.equal(out[held], x[held])
+    assert report.energy_after < report.energy_before

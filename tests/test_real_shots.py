@@ -8,30 +8,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 from pxr import Sdf
-from shots import faults
+from shots import VALID, faults
 
 from physgraph_usd.cli import main
 
 pytestmark = pytest.mark.real_data
 
-VALID = {
-    "01_newton_shirt_dab_cm.usdc": ["/shot/char/shirt_geo"],
-    "02_makehuman_usdskel_dm.usdc": ["/shot/char/top", "/shot/char/shorts"],
-    "06_torus_pull.usda": ["/shot/cloth"],
-    "07_flag_quads_nocollider.usda": ["/shot/flag"],
-    "08_sphere_spin_xformcollider.usdc": ["/shot/set/cloth"],
-    "09_cesiumman_kilt/shot.usda": ["/shot/kilt"],
-    "12_variants/a_lefthanded_consistent.usdc": ["/shot/shirt"],
-    "12_variants/b_winding_flipped_unflagged.usdc": ["/shot/shirt"],
-    "12_variants/c_zup_cm.usdc": ["/shot/shirt"],
-    "12_variants/d_mixed_quads_tris.usdc": ["/shot/shirt"],
-    "12_variants/e_sparse_samples.usdc": ["/shot/shirt"],
-    "12_variants/f_subframe_times_tcps48.usdc": ["/shot/shirt"],
-    "12_variants/g_nonuniform_scaled_parent.usdc": ["/shot/rig/shirt"],
-    "12_variants/h_holes_creases_normals.usdc": ["/shot/shirt"],
-    "12_variants/j_visibility_purpose.usdc": ["/shot/shirt"],
-    "12_variants/k_static_garment.usda": ["/shot/shirt"],
-}
 FIRST = {"01_newton_shirt_dab_cm.usdc": "1001:1003", "02_makehuman_usdskel_dm.usdc": "0:2"}
 STAGES = ("stages/float_units", "stages/usd_wg", "stages/usdskel")
 
