@@ -115,6 +115,8 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "wavelength_mm": round(1e3 * choice.wavelength, 2),
         "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},
         "sources": dict(source.sources),
+        "self_contact": garment.self_contact,
+        "layer": garment.layer,
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),
     }
