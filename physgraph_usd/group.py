@@ -12,7 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .contact import ContactSettings, FrameContact, LevelContact, Touching
+from .contact.bodies import FrameContact, LevelContact, Touching
+from .contact.rounds import solve_rounds
+from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
 from .forces.base import ForceModule
@@ -27,7 +29,6 @@ from .level import Level, build_levels
 from .level_forces import LevelForces, build_forces
 from .mesh.subdivide import Refinement
 from .resolution import sharp_folds
-from .rounds import solve_rounds
 from .scene import Garment, GarmentFrame
 
 WORTH = 2.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .contact import ContactSettings
+from .contact.settings import ContactSettings
 from .errors import UsageError
 from .group import SolveSettings
 from .integrate import method_named

@@ -9,8 +9,8 @@ from statistics import median
 import numpy as np
 import torch
 
-from .broad_phase import Bodies, bounds_of, reach_of
 from .colliders.pose import Pose
+from .contact.broad_phase import Bodies, bounds_of, reach_of
 from .detail import Carried
 from .errors import GarmentError
 from .group import Group, SolveSettings

@@ -12,7 +12,7 @@ from cloth import DOWN, FABRIC, GUIDE, settings_of
 from sheets import garment_of
 
 from physgraph_usd.colliders.pose import Collider, MeshPose, Pose
-from physgraph_usd.contact import ContactSettings
+from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.scene import Frame, GarmentFrame, Scene, State

@@ -12,10 +12,10 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from .contact import LevelContact
-from .forces.contact import Contact
-from .integrate.base import Carry, Integrator, System
-from .integrate.solve import Budget, LevelReport, solve_level
+from ..forces.contact import Contact
+from ..integrate.base import Carry, Integrator, System
+from ..integrate.solve import Budget, LevelReport, solve_level
+from .bodies import LevelContact
 
 
 def solve_rounds(

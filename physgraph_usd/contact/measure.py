@@ -12,10 +12,10 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .colliders.base import Nearest, Surface
-from .colliders.mesh import MeshSurface
-from .level import Level
-from .mesh.lanes import Launch
+from ..colliders.base import Nearest, Surface
+from ..colliders.mesh import MeshSurface
+from ..level import Level
+from ..mesh.lanes import Launch
 
 DETOUR = 1.05
 """The nearest face is buried where the way out is longer than this, over the distance to it."""

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .colliders.base import Surface
-from .colliders.mesh import MeshBody
-from .colliders.pose import Collider, MeshPose, Pose, ShapePose
-from .colliders.primitives import ShapeSurface
-from .contact import Touching
-from .scene import Garment, GarmentFrame
+from ..colliders.base import Surface
+from ..colliders.mesh import MeshBody
+from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
+from ..colliders.primitives import ShapeSurface
+from ..scene import Garment, GarmentFrame
+from .bodies import Touching
 
 REACH = 2.0
 """How far the cloth is expected to leave its cage's bounds, in mean cage edges."""

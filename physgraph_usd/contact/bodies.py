@@ -16,49 +16,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .colliders.base import Nearest, Surface
-from .colliders.sign import MARGIN, signed_distances
-from .forces.contact import Contact, Planes
-from .level import Level
+from ..colliders.base import Nearest, Surface
+from ..colliders.sign import MARGIN, signed_distances
+from ..forces.contact import Contact, Planes
+from ..level import Level
 from .measure import penetration, pinched
+from .settings import ContactSettings
 
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
-
-
-@dataclass(frozen=True)
-class ContactSettings:
-    """How contact is solved.
-
-    Attributes:
-        form: "quadratic", "linear" as in the paper, or "off".
-        stiffness: k_c of the quadratic form, in stretch stiffnesses over the square of the cage's mean edge.
-        pressure: k_c over the garment's area of the linear form, in weights of the cloth.
-        rounds: How often in a level's steps closest points are found anew.
-        clearance: Part of the offset that the last projection leaves at least.
-        projections: Most passes of the last projection.
-    """
-
-    form: str = "quadratic"
-    stiffness: float = 15.0
-    pressure: float = 5.0
-    rounds: int = 3
-    clearance: float = 0.25
-    projections: int = 10
-
-    def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
-        """The same settings with k_c itself as their stiffness, [N/m^3], or [N] in the linear form.
-
-        Args:
-            cage: The cage.
-            stretch: Stretch stiffness of the cloth [N/m].
-            weight: Its weight per area [N/m^2].
-        """
-        if self.form == "linear":
-            return replace(self, stiffness=self.pressure * weight * float(cage.vertex_area.sum()))
-        return replace(self, stiffness=self.stiffness * stretch / float(cage.spacing.mean()) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
