@@ -33,6 +33,7 @@ class Garment:
         colliders: Numbers of the scene's colliders that the garment feels.
         self_contact: Whether it feels itself.
         layer: Place in the order of garments, lower is nearer to the body; None, or equal to another's: not ordered.
+        apart_from: Paths of the garments that it never touches; each of them names it too.
     """
 
     path: str
@@ -49,6 +50,7 @@ class Garment:
     colliders: tuple[int, ...] = ()
     self_contact: bool = True
     layer: int | None = None
+    apart_from: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -121,7 +122,6 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         level=level,
         flipped=is_flipped(prim, matrix),
         bent_rest=rests_bent(prim),
-        colliders=(),
         self_contact=own,
         layer=layer,
         **_painted(prim, points.count, notices),
@@ -173,7 +173,7 @@ def _feels_itself(prim: Usd.Prim, request: Request) -> tuple[bool, str]:
     return bool(found.at(None)), found.source
 
 
-def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, np.ndarray]:
+def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, Any]:
     """The painted arrays of a garment by field name; adds to the notices."""
     names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
     names |= {"detail_scale": "detailScale", "pin": "pin"}

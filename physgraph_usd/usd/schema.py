@@ -109,6 +109,10 @@ PROPERTIES: tuple[Property, ...] = (
         GARMENT_API, "physgraph:colliders", "rel", None, "", None, None,
         "Colliders of this garment; empty means every collider prim on the stage.",
     ),
+    Property(
+        GARMENT_API, "physgraph:contact:exclude", "rel", None, "", None, None,
+        "Colliders and garments that this garment never touches: prims, prims above them, or collections.",
+    ),
     _scale("stretchScale", 1.0, None, "Painted multiplier of the stretch stiffness; vertex or constant."),
     _scale("bendScale", 1.0, None, "Painted multiplier of the bending stiffness; vertex or constant."),
     _scale("detailScale", 1.0, None, "Painted multiplier of the added detail; vertex or constant."),
