@@ -55,6 +55,7 @@ class ClothMesh:
     Attributes:
         level: The level.
         beside: Adjacency of its vertices, shape (V, V).
+        opposite: Vertices opposite each edge in the first two of its faces, -1 where there is none, shape (E, 2).
     """
 
     def __init__(self, level: Level, meets: np.ndarray) -> None:
@@ -73,6 +74,7 @@ class ClothMesh:
         self._normal = torch.zeros_like(self._position)
         self.triangles = level.triangles.long()
         self._sides = _owned_sides(edges, triangles)
+        self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
         self._static = {
             "rest": _vectors(level.rest.to(torch.float32).contiguous()),
             "edges": wp.array(edges, dtype=wp.vec2i, device=level.device),
@@ -149,6 +151,14 @@ class ClothMesh:
         """Vertices of the edge and of the face of each crossing."""
         return torch.cat([self.level.edges.long()[crossings.edge], self.triangles[crossings.face]], dim=1)
 
+    def between(self, crossings: Crossings) -> np.ndarray:
+        """Number of listed crossings between garments, the lower number first, shape (G, G)."""
+        garment = self.level.vertex_garment.cpu().numpy()
+        ends = garment[self.corners_of(crossings)[:, [0, 2]].cpu().numpy()]
+        table = np.zeros((self._garments, self._garments), np.int64)
+        np.add.at(table, (ends.min(axis=1), ends.max(axis=1)), 1)
+        return table
+
     def _vertex_face(self, ask: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
         """Corners and weights of the pairs of a vertex and a face."""
         face = torch.full((len(ask), 2), -1, dtype=torch.int32, device=ask.device)
@@ -209,6 +219,18 @@ def _owned_sides(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     kept = np.unique(edge, return_index=True)[1]
     owned[kept] = edge[kept]
     return owned.reshape(-1, 3)
+
+
+def _opposite(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Vertices opposite each edge in the first two of its faces, shape (E, 2), -1 where there is none."""
+    edge = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
+    third = triangles[:, [2, 0, 1]].reshape(-1).astype(np.int64)
+    out = np.full((len(edges), 2), -1, np.int64)
+    for place in (1, 0):  # The first face is written last: an edge of one face has it in the first place.
+        kept = np.unique(edge[:: 1 - 2 * place], return_index=True)
+        out[kept[0], place] = third[:: 1 - 2 * place][kept[1]]
+    out[out[:, 0] == out[:, 1], 1] = -1
+    return out
 
 
 def _vectors(tensor: Tensor) -> wp.array:

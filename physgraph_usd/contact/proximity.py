@@ -21,7 +21,7 @@ SLOTS = 4
 
 
 @wp.func
-def closest_on_triangle(p: wp.vec3f, a: wp.vec3f, b: wp.vec3f, c: wp.vec3f):
+def closest_on_triangle(p: wp.vec3f, a: wp.vec3f, b: wp.vec3f, c: wp.vec3f):  # noqa: PLR0911 - one region each
     """Barycentric coordinates of the closest point (Ericson 2005, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
@@ -59,6 +59,19 @@ def is_beside(v: wp.int32, u: wp.int32, starts: wp.array(dtype=wp.int32), ring: 
         if ring[k] == u:
             found = True
     return found
+
+
+@wp.func
+def are_beside(e: wp.vec2i, g: wp.vec2i, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
+    """Whether two edges share a vertex or are joined by an edge."""
+    of_first = is_beside(e[0], g[0], starts, ring) or is_beside(e[0], g[1], starts, ring)
+    return of_first or is_beside(e[1], g[0], starts, ring) or is_beside(e[1], g[1], starts, ring)
+
+
+@wp.func
+def is_inside(s: float, t: float):
+    """Whether both places are inside their edges."""
+    return s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
 
 
 @wp.func
@@ -173,11 +186,9 @@ def edges_near(
                 continue
             found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[d], 1.0e-12)
             s, t, distance = found[0], found[1], found[2]
-            inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
-            if not inside or distance >= wp.max(best_up, best_down) or distance < LEAST:
+            if not is_inside(s, t) or distance >= wp.max(best_up, best_down) or distance < LEAST:
                 continue
-            beside = is_beside(a, c, starts, ring) or is_beside(a, d, starts, ring)
-            if beside or is_beside(b, c, starts, ring) or is_beside(b, d, starts, ring):
+            if are_beside(edges[e], edges[g], starts, ring):
                 continue
             way = (1.0 - s) * x[a] + s * x[b] - (1.0 - t) * x[c] - t * x[d]
             cosine = wp.dot(way, n) / distance

@@ -5,7 +5,7 @@
 
 | symbol | here | meaning |
 |---|---|---|
-| sum_i w_gi x_i | ``Gaps`` | from one material point to the other: a vertex and a face (1, -b0, -b1, -b2), or two edges (1-s, s, t-1, -t) |
+| sum_i w_gi x_i | ``Gaps`` | from one point to the other: vertex and face (1, -b0, -b1, -b2), two edges (1-s, s, t-1, -t) |
 | n_g | ``Gaps.normal`` | the side on which the first point lies, a unit vector |
 | k_g | ``Gaps.stiffness`` | k_c times the pair's area [N/m] |
 | A | sum of a_u + a_v over pairs nearer than R | [m^2]; its jumps are no forces (PAPER A12) |
@@ -23,7 +23,7 @@ from typing import Any
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -112,6 +112,12 @@ class SelfContact:
         out = torch.zeros_like(x[:, 0])
         return out.index_put_((self.gaps.corners.long().reshape(-1),), value.reshape(-1) / 3.0, accumulate=True)
 
+    def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
+        """Which vertices belong to a pair."""
+        seen = torch.zeros_like(level.free)
+        seen[self.gaps.corners.long().reshape(-1)] = True
+        return seen
+
     def rest_matrix(self) -> sp.csr_matrix | None:
         """None: at rest nothing touches."""
         return None
@@ -178,6 +184,12 @@ class Spheres:
         value = torch.where(distance < self._radius, 2.0 / 3.0 * self._weight, torch.zeros_like(distance))
         out = torch.zeros_like(x[:, 0])
         return out.index_put_((self._pairs.reshape(-1),), value.repeat_interleave(2), accumulate=True)
+
+    def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
+        """Which vertices belong to a pair."""
+        seen = torch.zeros_like(level.free)
+        seen[self._pairs.reshape(-1)] = True
+        return seen
 
     def rest_matrix(self) -> sp.csr_matrix | None:
         """None: at rest nothing touches."""
