@@ -81,13 +81,15 @@ def _meet(segments: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def depths(points: np.ndarray, body: PlainMesh, frame: int) -> np.ndarray:
     """How deep points are in the deepest of a body's closed parts [stage units], shape (V,); negative outside."""
-    import igl
-
     places, faces = place(body, frame), triangles_of(body)
     links = sparse.coo_matrix((np.ones(len(faces)), (faces[:, 0], faces[:, 1])), shape=(len(places), len(places)))
     links = links + sparse.coo_matrix((np.ones(len(faces)), (faces[:, 0], faces[:, 2])), shape=links.shape)
     count, part = connected_components(links, directed=False)
-    found = [
-        igl.signed_distance(points, places, faces[part[faces[:, 0]] == i].astype(np.int64))[0] for i in range(count)
-    ]
-    return -np.min(found, axis=0)
+    return -np.min([signed(points, places, faces[part[faces[:, 0]] == i]) for i in range(count)], axis=0)
+
+
+def signed(points: np.ndarray, places: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Distances to a closed surface, negative inside, by another library, shape (V,)."""
+    import igl
+
+    return np.asarray(igl.signed_distance(points, places, faces.astype(np.int64))[0])

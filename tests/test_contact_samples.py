@@ -13,8 +13,7 @@ import pytest
 
 pytest.importorskip("pxr", reason="samples are written with usd-core")
 
-import igl
-from piercing import depths, piercings, place, triangles_of
+from piercing import depths, piercings, place, signed, triangles_of
 from pxr import Usd
 from shots import faults, refine, sample_times
 
@@ -36,6 +35,7 @@ class Told:
 
 
 SHOTS = {
+    "crossing": Told(("Front", "Back"), (), 12),
     "layers": Told(("Trousers", "Shirt", "Belt"), ("Form",), 30),
     "block": Told(("Sheet",), ("Block",), 24),
 }
@@ -153,11 +153,25 @@ def test_layers_are_a_few_millimetres_apart_and_told_from_the_inside_out(sample:
         for outer, inner in ((belt, shirt), (shirt, trousers), (trousers, form)):
             points, height = place(outer, frame), belt.points[:, 1]
             at_waist = points[(outer.points[:, 1] > height.min() - 0.01) & (outer.points[:, 1] < height.max() + 0.01)]
-            distance = np.sqrt(
-                igl.point_mesh_squared_distance(at_waist, place(inner, frame), triangles_of(inner).astype(np.int64))[0]
-            )
+            distance = np.abs(signed(at_waist, place(inner, frame), triangles_of(inner)))
             assert len(at_waist) > 60
             assert 0.004 < distance.min() < distance.max() < 0.008, (outer.name, frame)
+
+
+def test_sheets_start_crossed_near_their_lower_edges() -> None:
+    front, back = sheets = of_role("crossing", "garment")
+    for frame in (0, 6, 11):
+        pairs = piercings(sheets, frame)
+        assert len(pairs) > 40
+        assert np.all(pairs[:, 0] != pairs[:, 1]), "no sheet crosses itself"
+        ahead = place(front, frame)[:, 2].reshape(26, 25)[:, 4:21].mean(axis=1)
+        behind = place(back, frame)[:, 2].reshape(25, 21)[:, 2:19].mean(axis=1)
+        assert np.all(ahead[:18] > behind[:18])
+        assert -0.05 < ahead[-1] - behind[-1] < -0.02, "a few centimetres past one another"
+    for mesh in sheets:
+        assert mesh.samples is not None
+        assert mesh.pin is not None
+        assert np.ptp(mesh.samples[:, mesh.pin == 1], axis=0).max() == 0.0
 
 
 def test_the_body_walks() -> None:
@@ -200,8 +214,8 @@ def test_solids_are_closed_and_points_are_pushed_to_them() -> None:
         (block, off_box(points, np.array([0.2, 0.1, 0.15]), 0.01), 0.01),
         (ring, off_torus(points, 0.2, 0.08), 0.0),
     ]:
-        faces = triangles_of(solid_mesh(solid.points, solid.counts, solid.indices)).astype(np.int64)
-        before, after = (igl.signed_distance(each, solid.points, faces)[0] for each in (points, pushed))
+        faces = triangles_of(solid_mesh(solid.points, solid.counts, solid.indices))
+        before, after = (signed(each, solid.points, faces) for each in (points, pushed))
         assert (before < gap).sum() > 20
         assert after.min() > gap - 5e-4
         np.testing.assert_array_equal(points[before > gap + 5e-4], pushed[before > gap + 5e-4])
