@@ -11,7 +11,7 @@ from .walker import Cage, Cells, body, trousers, tube, walk
 
 FRAMES, RATE = 30, 24.0
 
-GAPS = (0.005, 0.010, 0.016)
+GAPS = (0.005, 0.010, 0.0152)
 """Distance of trousers, shirt and belt from the body, where all three lie over one another [m]."""
 
 WAIST = 1.02
