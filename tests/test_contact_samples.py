@@ -36,6 +36,7 @@ class Told:
 
 SHOTS = {
     "crossing": Told(("Front", "Back"), (), 12),
+    "torus": Told(("Sheet",), ("Ring",), 28),
     "layers": Told(("Trousers", "Shirt", "Belt"), ("Form",), 30),
     "block": Told(("Sheet",), ("Block",), 24),
 }

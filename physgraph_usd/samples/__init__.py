@@ -19,6 +19,7 @@ SAMPLES: dict[str, str] = {
     "frozen": "a cloth draped over a table, twelve equal samples",
     "layers": "trousers, a shirt over them and a belt over both, on a body that walks in place",
     "block": "a sheet dropped over a block, folding at its corners",
+    "torus": "a sheet pulled through a torus by a grip on its middle",
     "crossing": "two hanging sheets whose lower ends start on the wrong sides of one another",
     "swatch": "a small hanging swatch whose top edge is gathered, metres, Y up",
     "swatch_cm": "the swatch in centimetres",
