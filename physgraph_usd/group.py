@@ -15,7 +15,7 @@ from torch import Tensor
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.rounds import solve_rounds
+from .contact.rounds import solve_rounds, untangle
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
@@ -41,7 +41,8 @@ UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
 import os
-REFACTORED = int(os.environ.get("REF","8000"))
+
+REFACTORED = int(os.environ.get("REF", "8000"))
 """Vertices up to which a level's metric takes up the stiffness of what touches: factorising costs more than it saves above."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
@@ -308,15 +309,20 @@ class Group:
             return System(ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing)
 
         integrator = self._settings.method.build()
-        touched = () if view is None else view.terms(x)
-        if cold:
-            x = leave_saddle(system(touched, x), level, x, outward=self._outward)
         if view is None:
+            x = leave_saddle(system((), x), level, x, outward=self._outward) if cold else x
             x, report = solve_level(system((), x), integrator, x, level=level.index, budget=budget)
             return x, [report], ()
+        freed: list[LevelReport] = []
+        if cold and level is self.levels[0]:
+            x, freed, touched = untangle(system, integrator, x, view=view, level=level.index, budget=budget)
+        else:
+            touched = view.terms(x)
+        x = leave_saddle(system(touched, x), level, x, outward=self._outward) if cold else x
         x, made, touched = solve_rounds(
             system, integrator, x, terms=touched, view=view, level=level.index, budget=budget
         )
+        made = freed + made
         if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
             held = torch.stack([term.near(level) for term in touched]).any(dim=0)
             apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing)

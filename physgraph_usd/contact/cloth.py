@@ -21,6 +21,7 @@ from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh, Crossings, Pairs
 from .regions import Regions
+from .untangle import cut_off, gaps_out
 
 LEAST_OFFSET = 0.25
 """Part of the thickness that parts keep where the input has them closer."""
@@ -32,8 +33,8 @@ MENDS = 8
 """Most passes in all; after them the whole group goes back."""
 TURNED = 0.5
 """Cosine beyond which the way from one part to another counts as turned round since the input: one passed through."""
-RETURN = 2.0
-"""Most that parts on wrong sides are moved towards one another in a round, in thicknesses."""
+OUT = 0.5
+"""How far crossing parts are moved past one another in a round, in mean edges."""
 FRONTAL = 0.3
 """Cosine to the inner garment's normal under which a pair of ordered garments is beside it, not through it."""
 
@@ -91,7 +92,11 @@ def _meet(a: Garment, b: Garment) -> bool:
 
 
 class ClothView:
-    """One level's cloth in one frame."""
+    """One level's cloth in one frame.
+
+    Attributes:
+        tangled: Whether anything crossed where the term was asked for last.
+    """
 
     def __init__(
         self,
@@ -114,19 +119,14 @@ class ClothView:
         self._lasting, self._level, self._base = lasting, level, base
         self._mesh, self._regions = lasting.mesh(level), lasting.regions(level)
         self._thickness, self._stiffness = thickness, stiffness
+        self._sides: Tensor | None = None
+        self.tangled = False
         self._reach = float(thickness.max()) + float(level.spacing.mean())
 
     @cached_property
     def before(self) -> ClothState:
         """The upsampled cage."""
         return self.look(self._base)
-
-    @cached_property
-    def _crossing(self) -> Bool[Tensor, " vertices"]:
-        """Vertices of what crosses in the upsampled cage: sides have no meaning there."""
-        crossing = torch.zeros_like(self._level.free[:, 0])
-        crossing[self._mesh.corners_of(self.before.crossings).reshape(-1)] = True
-        return crossing
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ClothState:
         """Find what crosses at x."""
@@ -138,13 +138,23 @@ class ClothView:
         return ClothState(x, self._mesh.crossings(busy))
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | None:
-        """The force between parts that are near one another, or None where no parts are."""
+        """The force between parts that are near one another, or None where no parts are.
+
+        Sides are those of the first positions asked for in which nothing crosses; what crosses is drawn out.
+        """
         busy = self._regions.busy(x, self._reach)
+        self.tangled = False
         if not bool(busy.any()):
             return None
         self._mesh.move(x)
-        pairs = self._mesh.pairs(busy, torch.full_like(self._level.spacing, self._reach))
-        gaps = self._gaps(pairs, x)
+        crossings = self._mesh.crossings(busy)
+        self.tangled = crossings.count > 0
+        if self._sides is None or self.tangled:
+            self._sides = x
+        gaps = self._gaps(self._mesh.pairs(busy, torch.full_like(self._level.spacing, self._reach)), x, crossings)
+        if crossings.count:
+            step = OUT * float(self._level.spacing.mean())
+            gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=self._stiffness))
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
     def mend(self, x: Float[Tensor, "vertices 3"], good: ClothState | None = None) -> ClothState:
@@ -159,9 +169,7 @@ class ClothView:
             that cannot be had, the positions found that have the fewest.
         """
         good = good or self.before
-        zone = torch.zeros_like(self._crossing)
-        zone[self._mesh.corners_of(good.crossings).reshape(-1)] = True
-        zone = self._mesh.grown(zone, ZONE)
+        zone = self._mesh.grown(self._corners(good.crossings), ZONE)
         best = state = self.look(x)
         shift = x - good.x
         for attempt in range(MENDS):
@@ -214,29 +222,46 @@ class ClothView:
             inner = inner_next
         return kept.unsqueeze(1)
 
-    def _gaps(self, pairs: Pairs, x: Float[Tensor, "vertices 3"]) -> Gaps:
-        """Planes between parts, each on the side that it has in the upsampled cage or, if ordered, that it should."""
+    def _corners(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
+        """Vertices of what crosses."""
+        out = torch.zeros_like(self._level.free[:, 0])
+        out[self._mesh.corners_of(crossings).reshape(-1)] = True
+        return out
+
+    def _gaps(self, pairs: Pairs, x: Float[Tensor, "vertices 3"], crossings: Crossings) -> Gaps:
+        """Planes between parts, each on the side that it had at the start or, if ordered, that it should have."""
         corners = pairs.corners.long()
         garment = self._level.vertex_garment.long()[corners[:, [0, 3]]]
         ordered = self._lasting.order[garment[:, 0]] != self._lasting.order[garment[:, 1]]
         ordered &= ~self._lasting.order[garment].isnan().any(dim=1)
-        kept = ~self._crossing[corners].any(dim=1) | ordered
+        off = cut_off(self._mesh, crossings) if crossings.count else torch.zeros_like(self._level.free[:, 0])
+        swapped, undecided = _swapped(off[corners], pairs.face, self._is_split(off)[garment])
+        kept = (~self._corners(crossings)[corners].any(dim=1) & ~undecided) | ordered
         pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
-        corners, garment, ordered = corners[kept], garment[kept], ordered[kept]
-        way, at_input = ((pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base))
+        corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
+        way, at_input, at_start = (
+            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, self._sides)
+        )
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
         distance = at_input.norm(dim=1)
-        turned = (normal * at_input).sum(dim=1) < -TURNED * distance
-        wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), turned)
+        turned = (normal * at_start).sum(dim=1) < -TURNED * at_start.norm(dim=1)
+        wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), turned ^ swapped)
         normal = torch.where(wrong.unsqueeze(1), -normal, normal)
         thickness = self._thickness[garment].mean(dim=1)
         offset = torch.minimum(thickness, torch.maximum(distance, LEAST_OFFSET * thickness))
         offset = torch.where(wrong & ordered, thickness, offset)
         # What is on the wrong side comes back a little each round: all at once would tear the cloth.
-        offset = torch.where(wrong, torch.minimum(offset, RETURN * thickness - way.norm(dim=1)), offset)
+        most = OUT * float(self._level.spacing.mean())
+        offset = torch.where(wrong, torch.minimum(offset, most - way.norm(dim=1)), offset)
         area = self._level.vertex_area[corners]
         share = torch.where(pairs.face, area[:, 0], area.amin(dim=1) / 3.0)
         return Gaps(pairs.corners, pairs.weight, normal.contiguous(), offset.contiguous(), self._stiffness * share)
+
+    def _is_split(self, off: Bool[Tensor, " vertices"]) -> Bool[Tensor, " garments"]:
+        """Which garments have pieces that are cut off."""
+        split = torch.zeros(len(self._level.spans), dtype=torch.bool, device=off.device)
+        split[self._level.vertex_garment.long()[off]] = True
+        return split
 
     def _on_wrong_side(self, pairs: Pairs, garment: Tensor, normal: Tensor) -> Bool[Tensor, " pairs"]:
         """Whether the outer of two ordered garments lies inside the inner one."""
@@ -253,3 +278,20 @@ class ClothView:
         cosine = (out * normal).sum(dim=1) * self._lasting.outward[owner]
         cosine = torch.where(first_is_outer, cosine, -cosine)
         return cosine < -FRONTAL
+
+
+def _swapped(
+    off: Bool[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], split: Bool[Tensor, "pairs 2"]
+) -> tuple[Bool[Tensor, " pairs"], Bool[Tensor, " pairs"]]:
+    """Which pairs are to change sides, and which are beside a contour and have none.
+
+    Args:
+        off: Whether each corner is of a piece that is cut off.
+        face: Whether the pair is a vertex and a face.
+        split: Whether the first and the second garment of each pair have such pieces at all.
+    """
+    first = torch.where(face, off[:, 0], off[:, :2].all(dim=1))
+    second = torch.where(face, off[:, 1:].all(dim=1), off[:, 2:].all(dim=1))
+    both = first & second
+    swapped = both | (first & ~split[:, 1]) | (second & ~split[:, 0])
+    return swapped, (first ^ second) & ~swapped

@@ -34,6 +34,11 @@ class LevelContact:
     cloth: ClothView | None
     rounds: int
 
+    @property
+    def tangled(self) -> bool:
+        """Whether cloth crossed cloth where the terms were asked for last."""
+        return self.cloth is not None and self.cloth.tangled
+
     def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
         """The forces of what is near positions x [m]; empty where nothing is."""
         parts = [part.term(x) for part in (self.bodies, self.cloth) if part is not None]

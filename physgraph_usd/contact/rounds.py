@@ -16,6 +16,34 @@ from ..integrate.base import Carry, Integrator, System
 from ..integrate.solve import Budget, LevelReport, solve_level
 from .frame import LevelContact, Touch
 
+UNTANGLINGS = 25
+"""Most rounds that draw out what crosses."""
+STEPS = 4
+"""Steps of each of them."""
+
+
+def untangle(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
+    integrator: Integrator,
+    x: Float[Tensor, "vertices 3"],
+    *,
+    view: LevelContact,
+    level: int,
+    budget: Budget,
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
+    """Draw out what crosses, in rounds of few steps; nothing where nothing does.
+
+    Arguments and results are those of `solve_rounds`; the last result is the contact terms at the positions returned.
+    """
+    reports: list[LevelReport] = []
+    terms = view.terms(x)
+    while view.tangled and len(reports) < UNTANGLINGS and (not reports or reports[-1].stopped != "budget"):
+        short = replace(budget, steps=STEPS, tolerance=0.0)
+        x, report = solve_level(make_system(terms, x), integrator, x, level=level, budget=short)
+        reports.append(report)
+        terms = view.terms(x)
+    return x, reports, terms
+
 
 def solve_rounds(
     make_system: Callable[[Sequence[Touch], Tensor], System],

@@ -15,13 +15,18 @@ contour grows shorter by G.d with
 | F | a face at the edge |
 | R_F | unit direction of the contour, from the edge into F |
 
-Moved along G, contours shrink until nothing crosses, whichever side is the right one.
+Moved along G, contours shrink, whichever side is the right one. A straight contour from rim to rim does not: there the
+piece that the contour cuts off, the smaller one, is on the wrong side (Baraff, Witkin and Kass 2003), and pairs of such
+pieces turn round.
 """
 
 from __future__ import annotations
 
+import numpy as np
+import scipy.sparse as sp
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.sparse import csgraph
 from torch import Tensor
 
 from ..forces.self_contact import Gaps
@@ -43,7 +48,7 @@ def ways_out(
         x: Positions [m].
 
     Returns:
-        Unit directions, zero where there is none, and the place: along the edge, then barycentric on the face.
+        Directions, at most of length 1, and the place: along the edge, then barycentric on the face.
     """
     ends, face = mesh.level.edges.long()[crossings.edge], mesh.triangles[crossings.face]
     a, b = x[ends[:, 0]], x[ends[:, 1]]
@@ -67,7 +72,33 @@ def ways_out(
         share = (contour * along).sum(dim=1) / cosine
         way = way + torch.where(there.unsqueeze(1), contour - share.unsqueeze(1) * normal, torch.zeros_like(way))
     place = torch.cat([at.unsqueeze(1), _barycentric(point, p, q, r)], dim=1)
-    return torch.nn.functional.normalize(way, dim=1, eps=1e-30), place
+    return way / way.norm(dim=1, keepdim=True).clamp_min(1.0), place
+
+
+def cut_off(mesh: ClothMesh, crossings: Crossings) -> Bool[Tensor, " vertices"]:
+    """Vertices of pieces that contours cut off: all but the largest piece of what hangs together without crossings.
+
+    Args:
+        mesh: The cloth.
+        crossings: What crosses.
+    """
+    count = mesh.level.vertex_count
+    ends = mesh.level.edges.cpu().numpy()
+    kept = np.ones(len(ends), bool)
+    kept[crossings.edge.cpu().numpy()] = False
+    whole, piece = (_labels(ends[which], count) for which in (np.ones(len(ends), bool), kept))
+    area = np.bincount(piece, mesh.level.vertex_area.double().cpu().numpy())
+    first = np.unique(piece, return_index=True)[1]
+    largest = np.zeros(int(whole.max()) + 1)
+    np.maximum.at(largest, whole[first], area)
+    off = area < largest[whole[first]]
+    return torch.as_tensor(off[piece], device=mesh.level.rest.device)
+
+
+def _labels(ends: np.ndarray, count: int) -> np.ndarray:
+    """Piece of each vertex, by the edges that hold it."""
+    graph = sp.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    return csgraph.connected_components(graph, directed=False)[1]
 
 
 def gaps_out(
@@ -88,10 +119,11 @@ def gaps_out(
     corners = torch.cat([torch.cat([ends[:, i : i + 1], face], dim=1) for i in range(2)])
     share = torch.cat([1.0 - place[:, 0], place[:, 0]])
     weight = torch.cat([torch.ones_like(place[:, :1]), -place[:, 1:]], dim=1).repeat(2, 1)
-    normal = way.repeat(2, 1)
+    length = way.norm(dim=1).repeat(2)
+    normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30).repeat(2, 1)
     here = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
     strength = stiffness * share * level.vertex_area[corners[:, 0]]
-    return Gaps(corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step, strength)
+    return Gaps(corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step * length, strength)
 
 
 def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor, "points 3"]:

@@ -17,7 +17,7 @@ Pairs, weights and normals stay while the term lives, so it is a function of x a
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import scipy.sparse as sp
@@ -47,6 +47,10 @@ class Gaps:
     normal: Float[Tensor, "gaps 3"]
     offset: Float[Tensor, " gaps"]
     stiffness: Float[Tensor, " gaps"]
+
+    def with_more(self, other: Gaps) -> Gaps:
+        """These pairs and others."""
+        return Gaps(*(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)))
 
     def vectors(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "gaps 3"]:
         """From the second point to the first [m]."""
