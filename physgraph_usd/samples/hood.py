@@ -35,7 +35,7 @@ def build() -> PlainStage:
         One garment, 24 samples, pinned along its neckline; a head that moves by its transform and static shoulders.
     """
     quads, used, uv = _faces()
-    rest, worn = (points.reshape(-1, 3)[used] for points in (_hull(0.0, 0.385, 1.13), _hull(1.0, 0.315, 1.0)))
+    rest, worn = (points.reshape(-1, 3)[used] for points in (_hull(0.0, 0.39, 1.17), _hull(1.0, 0.315, 1.0)))
     held = rest[:, 1] < 1e-9
     times = np.arange(FRAMES) / 24.0
     hood = PlainMesh(
