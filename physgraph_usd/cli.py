@@ -136,6 +136,7 @@ solve_options = _together(
 layer_options = _together(
     click.option("--mode", type=click.Choice(["over", "sibling"]), help="Refine in place, or beside the coarse mesh."),
     click.option("--velocities", is_flag=True, help="Also write point velocities."),
+    click.option("--heat-map", is_flag=True, help="Also write depth inside bodies and crossings as primvars."),
     click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),
     click.option("--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write what was done as JSON."),
     overwrite_option,

@@ -11,6 +11,7 @@ import torch
 
 from .colliders.pose import Pose
 from .contact.broad_phase import Bodies, bounds_of, reach_of
+from .contact.heat import penetration_map
 from .detail import Carried
 from .errors import GarmentError
 from .group import Group, SolveSettings
@@ -48,6 +49,7 @@ class Refiner:
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
         lanes: int = 1,
+        heat_map: bool = False,
     ) -> None:
         """Subdivide the garments and prepare their levels.
 
@@ -58,6 +60,7 @@ class Refiner:
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
             lanes: Most threads that a kernel uses on the CPU; the result does not depend on it.
+            heat_map: Whether states hold a heat map.
 
         Raises:
             GarmentError: A rest shape cannot be solved on.
@@ -72,7 +75,7 @@ class Refiner:
             Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device, lanes=lanes)
             for garment, chain in zip(scene.garments, self.refinements, strict=True)
         ]
-        self._scene = scene
+        self._scene, self._device, self._heat_map = scene, device, heat_map
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
         self._last: list[_Known | None] = [None] * len(self.groups)
         self._time: float | None = None
@@ -123,7 +126,8 @@ class Refiner:
                 points.append(solved)
                 telemetry.append(entry)
         self._time = frame.time
-        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
+        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
     def _solve_group(
         self, index: int, frame: GarmentFrame, time: float | None, *, gap: bool
@@ -145,6 +149,16 @@ class Refiner:
         if gap:
             entry["start"] = "cold: the time between samples is too long"
         return solved[0], entry
+
+    def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
+        """Where a garment is inside the bodies whose bounds it meets, whether or not they push it."""
+        if points is None:
+            return None
+        garment, chain = self._scene.garments[index], self.refinements[index]
+        met = self._bodies.near(garment, bounds_of(points), 0.0)
+        surfaces = [each.surface for each in self._bodies.touching(met, [0.0])]
+        edges = (chain[-1].mesh if chain else garment.mesh).half_edges.edges
+        return {"penetration": penetration_map(surfaces, points, edges, device=self._device)}
 
     def _near(self, index: int, frame: GarmentFrame) -> tuple[int, ...]:
         """Numbers of the bodies that a garment may touch."""
