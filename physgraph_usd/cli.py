@@ -204,6 +204,8 @@ def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
 @garment_option
 @collider_option
 @click.option("--preset", metavar="FABRIC", help="Fabric of the garments, such as denim; see docs/fabrics.md.")
+@click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
+@click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
     """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
