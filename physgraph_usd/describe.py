@@ -132,7 +132,8 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
         "guide": "ties the local average to the coarse animation",
     }
     if _touching(opened) and options.contact != "off":
-        modelled["contact"] = f"{options.contact} form, with {', '.join(_touching(opened))}, in frames where it is near"
+        bodies = ", ".join(_touching(opened))
+        modelled["contact"] = f"{options.contact} form, with {bodies}, in frames where it is near"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
@@ -147,9 +148,13 @@ def _in_plane(report: RefineReport) -> dict[str, str]:
 
 
 def _touching(opened: Shot) -> list[str]:
-    """Paths of the colliders that some garment feels."""
+    """Paths of the colliders that some garment feels, each with its side where that was chosen."""
     felt = {path for garment in opened.scene.garments for path in _felt(opened, garment)}
-    return [collider.path for collider in opened.scene.colliders if collider.path in felt]
+    return [
+        collider.path + ("" if collider.side == "auto" else f" (side: {collider.side})")
+        for collider in opened.scene.colliders
+        if collider.path in felt
+    ]
 
 
 def _felt(opened: Shot, garment: Garment) -> list[str]:

@@ -11,6 +11,7 @@ import torch
 
 from .colliders.pose import Pose
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
+from .contact.heat import penetration_map
 from .detail import Carried, join, split
 from .errors import GarmentError
 from .group import Group, SolveSettings
@@ -48,6 +49,7 @@ class Refiner:
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
         lanes: int = 1,
+        heat_map: bool = False,
     ) -> None:
         """Subdivide the garments.
 
@@ -58,6 +60,7 @@ class Refiner:
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
             lanes: Most threads that a kernel uses on the CPU; the result does not depend on it.
+            heat_map: Whether states hold a heat map.
 
         Raises:
             GarmentError: A rest shape cannot be solved on.
@@ -70,7 +73,7 @@ class Refiner:
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
         self._place = {"dtype": dtype, "device": device, "lanes": lanes}
         self._groups: dict[tuple[int, ...], Group] = {}
-        self._scene = scene
+        self._scene, self._device, self._heat_map = scene, device, heat_map
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
         self._last: list[_Known | None] = [None] * len(scene.garments)
@@ -137,7 +140,8 @@ class Refiner:
                 if asked[index] and each is not None:
                     points[index], telemetry[index] = each.points, entry
         self._time = frame.time
-        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
+        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
@@ -169,6 +173,16 @@ class Refiner:
         for index, each, xs, detail in zip(part, frames, solved, own, strict=True):
             self._last[index] = _Known(each, xs, detail, part, poses)
         return [self._last[index] for index in part], [entry] * len(part)
+
+    def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
+        """Where a garment is inside the bodies whose bounds it meets, whether or not they push it."""
+        if points is None:
+            return None
+        garment, chain = self._scene.garments[index], self.refinements[index]
+        met = self._bodies.near(garment, bounds_of(points), 0.0)
+        surfaces = [each.surface for each in self._bodies.touching(met, [[0.0] * len(met)])]
+        edges = (chain[-1].mesh if chain else garment.mesh).half_edges.edges
+        return {"penetration": penetration_map(surfaces, points, edges, device=self._device)}
 
     def _near(self, part: Sequence[int], frames: Sequence[GarmentFrame]) -> tuple[int, ...]:
         """Numbers of the bodies that garments may touch."""

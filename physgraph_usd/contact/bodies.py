@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
-from ..colliders.sign import MARGIN, signed_distances
+from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
 from .measure import penetration, pinched
@@ -103,8 +103,9 @@ class _Track:
     def _signs(self, which: Tensor, found: Nearest, asked: Tensor, moved: Tensor) -> Tensor:
         """1 outside, or on the start side of an open surface; -1 inside or behind it."""
         if not self.surface.closed:
-            behind = (found.side * self.side[which] < 0) & ~found.rim
-            return torch.where(behind, -torch.ones_like(moved), torch.ones_like(moved))
+            return torch.where(behind(found, self.side[which]), -torch.ones_like(moved), torch.ones_like(moved))
+        if self.surface.certain:
+            return found.side
         known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
         may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
         ask = may_have_crossed & (found.side != known)
@@ -258,8 +259,8 @@ class FrameBodies:
 
 def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"], finest: Level) -> Float[Tensor, " vertices"]:
     """The side on which the cage around each fine vertex lies: 1 or -1, 0 where it is undecided or has no meaning."""
-    if surface.closed:
-        return torch.zeros(finest.vertex_count, dtype=cage.dtype, device=cage.device)
+    if surface.closed or surface.fixed_side is not None:
+        return torch.full((finest.vertex_count,), surface.fixed_side or 0.0, dtype=cage.dtype, device=cage.device)
     found = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
     side = torch.where(found.rim, torch.zeros_like(found.side), found.side)
     return finest.base.apply(side.unsqueeze(1).expand(-1, 3).contiguous())[:, 0].sign()

@@ -80,7 +80,7 @@ class Bodies:
         """Prepare one body for each collider; nothing is built before something is near it."""
         self.colliders = tuple(colliders)
         self._device = device
-        self._meshes = [MeshBody(device=device, lanes=lanes) if c.kind == "mesh" else None for c in colliders]
+        self._meshes = [MeshBody(side=c.side, device=device, lanes=lanes) for c in colliders]
         self._poses: Sequence[Pose | None] = ()
         self._surfaces: dict[int, tuple[Surface, ...]] = {}
         self._bounds: dict[int, np.ndarray] = {}
@@ -138,7 +138,6 @@ class Bodies:
             if isinstance(pose, ShapePose):
                 self._surfaces[index] = (ShapeSurface(pose, device=self._device),)
             elif isinstance(pose, MeshPose):
-                mesh = mesh or MeshBody(device=self._device, lanes=1)
                 self._surfaces[index] = mesh.pose(pose)
             else:
                 self._surfaces[index] = ()
