@@ -22,11 +22,12 @@ from .scene import Frame, GarmentFrame, Scene, State
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """One garment's last solved frame, with whom it was solved, and the bodies that it could touch there."""
+    """One garment's last solved frame, what crosses in it, with whom it was solved, and the bodies it could touch."""
 
     frame: GarmentFrame
     points: np.ndarray
     carried: Carried
+    crossing: np.ndarray
     part: tuple[int, ...]
     near: dict[int, Pose | None]
 
@@ -132,10 +133,9 @@ class Refiner:
                 reused[index] = same
             if not any(asked[index] for index in part):
                 continue
+            entries: list[dict[str, object]] = [{"start": "reused: the input equals the last frame's"}] * len(part)
             if not same:
                 known, entries = self._solve_part(part, frame, gap=gap)
-            else:
-                entries = [{"start": "reused: the input equals the last frame's"}] * len(part)
             for index, each, entry in zip(part, known, entries, strict=True):
                 if asked[index] and each is not None:
                     points[index], telemetry[index] = each.points, entry
@@ -157,11 +157,12 @@ class Refiner:
                 for index, each in zip(part, frames, strict=True)
             ]
             touching = self._bodies.touching(near, offsets)
-            solved, carried, entry = group.solve(frames, kept, at=frame.time, touching=touching)
-            more = self._reached(part, frames, solved)
+            solved = group.solve(frames, kept, at=frame.time, touching=touching)
+            more = self._reached(part, frames, solved.points)
             if more <= set(near):
                 break
             near = tuple(sorted({*near, *more}))
+        entry = solved.telemetry
         if any(self._scene.garments[index].colliders for index in part):
             entry["near"] = [self._scene.colliders[each].path for each in near]
         if len(part) > 1:
@@ -169,20 +170,23 @@ class Refiner:
         if gap:
             entry["start"] = "cold: the time between samples is too long"
         poses = {each: self._bodies.pose_of(each) for each in near}
-        own = split(carried, group.levels[0].spans, group.levels[-1].spans)
-        for index, each, xs, detail in zip(part, frames, solved, own, strict=True):
-            self._last[index] = _Known(each, xs, detail, part, poses)
+        own = split(solved.carried, group.levels[0].spans, group.levels[-1].spans)
+        for index, each, xs, detail, crossing in zip(part, frames, solved.points, own, solved.crossing, strict=True):
+            self._last[index] = _Known(each, xs, detail, crossing, part, poses)
         return [self._last[index] for index in part], [entry] * len(part)
 
     def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
-        """Where a garment is inside the bodies whose bounds it meets, whether or not they push it."""
+        """Where a garment is inside bodies whose bounds it meets, pushed by them or not, and where cloth crosses."""
         if points is None:
             return None
         garment, chain = self._scene.garments[index], self.refinements[index]
         met = self._bodies.near(garment, bounds_of(points), 0.0)
         surfaces = [each.surface for each in self._bodies.touching(met, [[0.0] * len(met)])]
         edges = (chain[-1].mesh if chain else garment.mesh).half_edges.edges
-        return {"penetration": penetration_map(surfaces, points, edges, device=self._device)}
+        known = self._last[index]
+        crossing = np.zeros(len(points), bool) if known is None else known.crossing
+        depth = penetration_map(surfaces, points, edges, device=self._device)
+        return {"penetration": depth, "crossing": crossing.astype(np.float32)}
 
     def _near(self, part: Sequence[int], frames: Sequence[GarmentFrame]) -> tuple[int, ...]:
         """Numbers of the bodies that garments may touch."""
