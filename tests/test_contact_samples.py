@@ -41,7 +41,7 @@ SHOTS = {
     "crossing": Told(("Front", "Back"), (), 12),
     "torus": Told(("Sheet",), ("Ring",), 28),
     "hood": Told(("Hood",), ("Head", "Bust"), 24),
-    "armpit": Told(("Shirt",), ("Form",), 30),
+    "armpit": Told(("Shirt",), ("Form",), 30, inside=0.02, deepest_mm=8.0),
     "layers": Told(("Trousers", "Shirt", "Belt"), ("Form",), 30),
     "block": Told(("Sheet",), ("Block",), 24),
 }
@@ -128,7 +128,8 @@ def test_bodies_are_closed_and_face_out(name: str) -> None:
         assert len(forth) == len(directed), "two faces run along an edge in the same direction"
         np.testing.assert_array_equal(forth, back, "an edge has one face only")
         corners = place(mesh, 0)[faces]
-        assert np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() > 0.0
+        volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+        assert np.bincount(parts(mesh)[faces[:, 0]], volumes).min() > 1e-4, "a part is inside out"
 
 
 @pytest.mark.parametrize("name", SHOTS)
@@ -209,7 +210,7 @@ def test_the_armpit_is_pinched_in_the_middle_and_open_at_the_ends() -> None:
         bodies.append(signed(form.samples[frame, lower], form.samples[frame], faces[torso[faces].all(axis=1)]).min())
         points = place(shirt, frame)
         layers.append(np.median(cKDTree(points[side]).query(points[under])[0]))
-    assert 0.002 < bodies[1] < 0.008, "between arm and side there is less room than two layers of cloth ask for"
+    assert 0.002 < bodies[1] < 0.012, "between arm and side there is less room than two layers of cloth ask for"
     assert layers[1] < 0.015, "sleeve and side lie on one another"
     assert min(bodies[0], bodies[2], layers[0], layers[2]) > 0.03
     gaps = -depths(place(shirt, 0), form, 0)

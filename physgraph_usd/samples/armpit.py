@@ -43,7 +43,7 @@ ARM = np.array([[0.14, 0.068], [0.22, 0.071], [0.34, 0.070], [0.42, 0.054], [0.5
 RAISED, HANGING, WORN = 18.0, 86.0, 45.0
 """How far the arm points down at the ends of the shot, in its middle, and in the rest shape [degrees]."""
 
-PRESSED = 10.0
+PRESSED = 7.0
 """How much farther down the hanging arm points than its sleeve, which it presses to the side [degrees]."""
 
 SUNK = 0.24
@@ -131,7 +131,7 @@ def _arm(side: float) -> Solid:
     )
     radius = np.interp(along, ARM[:, 0], ARM[:, 1])
     radius[:5], radius[-5:] = thick * np.sin(turn), thin * np.sin(turn[::-1])
-    a = -2 * np.pi * np.arange(28) / 28
+    a = 2 * np.pi * np.arange(28) / 28
     height = 0.5 * (SHIRT.armpit + SHIRT.shoulder) - 0.005
     ring = [along[:, None], height + radius[:, None] * np.cos(a), 0.94 * radius[:, None] * np.sin(a)]
     rings = np.stack(np.broadcast_arrays(*ring), axis=-1)
