@@ -12,6 +12,7 @@ import torch
 from .colliders.pose import Pose
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import penetration_map
+from .contact.passed import Passed
 from .detail import Carried, join, split
 from .errors import GarmentError
 from .group import Group, SolveSettings
@@ -75,6 +76,7 @@ class Refiner:
         self._groups: dict[tuple[int, ...], Group] = {}
         self._scene, self._device, self._heat_map = scene, device, heat_map
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
+        self._passed = Passed(scene.garments, scene.colliders, device=device, lanes=lanes)
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
         self._last: list[_Known | None] = [None] * len(scene.garments)
         self._time: float | None = None
@@ -99,6 +101,7 @@ class Refiner:
 
     def forget(self) -> None:
         """Start the next frame cold."""
+        self._passed.forget()
         self._last = [None] * len(self._last)
         self._time = None
 
@@ -119,6 +122,8 @@ class Refiner:
             wanted: For each garment, whether it is asked for; all when None.
         """
         gap = self._is_gap(frame.time)
+        if gap:
+            self._passed.forget()
         self._bodies.pose(frame.colliders)
         count = len(frame.garments)
         asked = [True] * count if wanted is None else list(wanted)
@@ -140,6 +145,8 @@ class Refiner:
                 if asked[index] and each is not None:
                     points[index], telemetry[index] = each.points, entry
         self._time = frame.time
+        for index, passed in enumerate(self._passed.look(frame)):
+            telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
         heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
