@@ -37,6 +37,7 @@ class Told:
 SHOTS = {
     "crossing": Told(("Front", "Back"), (), 12),
     "torus": Told(("Sheet",), ("Ring",), 28),
+    "hood": Told(("Hood",), ("Head", "Bust"), 24),
     "layers": Told(("Trousers", "Shirt", "Belt"), ("Form",), 30),
     "block": Told(("Sheet",), ("Block",), 24),
 }
@@ -173,6 +174,21 @@ def test_sheets_start_crossed_near_their_lower_edges() -> None:
         assert mesh.samples is not None
         assert mesh.pin is not None
         assert np.ptp(mesh.samples[:, mesh.pin == 1], axis=0).max() == 0.0
+
+
+def test_the_hood_lies_on_itself_and_the_head_turns_in_it() -> None:
+    hood, head = of_role("hood", "garment")[0], of_role("hood", "collider")[0]
+    points, faces = place(hood, 0), triangles_of(hood)
+    corners = points[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    behind = np.abs(corners.mean(axis=1)[:, 0]) < 0.03
+    back = normal[behind & (corners.mean(axis=1)[:, 2] < -0.1) & (corners.mean(axis=1)[:, 1] < 0.08)]
+    assert (back[:, 2] < 0).any()
+    assert (back[:, 2] > 0).any(), "the middle layer of the fold faces the other way"
+    assert head.transforms is not None
+    turned = [np.degrees(np.arctan2(matrix[0, 2], matrix[2, 2])) for matrix in head.transforms]
+    assert max(turned) > 25
+    assert min(turned) < -15
 
 
 def test_the_body_walks() -> None:

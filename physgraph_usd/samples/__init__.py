@@ -20,6 +20,7 @@ SAMPLES: dict[str, str] = {
     "layers": "trousers, a shirt over them and a belt over both, on a body that walks in place",
     "block": "a sheet dropped over a block, folding at its corners",
     "torus": "a sheet pulled through a torus by a grip on its middle",
+    "hood": "a wide hood over a turning head, with a fold that lies on itself",
     "crossing": "two hanging sheets whose lower ends start on the wrong sides of one another",
     "swatch": "a small hanging swatch whose top edge is gathered, metres, Y up",
     "swatch_cm": "the swatch in centimetres",
