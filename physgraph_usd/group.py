@@ -83,6 +83,7 @@ class Group:
     Attributes:
         garments: The garments.
         levels: Their levels, cage first.
+        cloth: Their cloth, as something that can be near itself.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class Group:
         self._outward = torch.tensor([-1.0 if garment.flipped else 1.0 for garment in garments], device=device)
         self._fixed = np.flatnonzero(~finest.free.cpu().numpy().ravel())
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
-        self._cloth = ClothContact(self.levels, self.garments)
+        self.cloth = ClothContact(self.levels, self.garments)
         self._material: tuple[object, ...] = ()
         self._forces: list[LevelForces] = []
         self._stretch = 0.0
@@ -247,7 +248,7 @@ class Group:
     ) -> FrameContact | None:
         """What a frame's cloth may touch, or None when there is nothing."""
         settings = self._settings.contact
-        cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
+        cloth = self.cloth if settings.cloth != "off" and self.cloth.meets.any() else None
         if not len(coarse) or (cloth is None and not touching):
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)

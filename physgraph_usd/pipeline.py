@@ -11,7 +11,7 @@ import torch
 
 from .colliders.pose import Pose
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
-from .contact.heat import penetration_map
+from .contact.heat import body_crossings, cloth_crossings, penetration_map
 from .contact.passed import Passed
 from .detail import Carried, join, split
 from .errors import GarmentError
@@ -147,8 +147,8 @@ class Refiner:
         self._time = frame.time
         for index, passed in enumerate(self._passed.look(frame)):
             telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
-        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
-        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
+        heat = self._heat(self._parts.of(frame.garments), points) if self._heat_map else ()
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), heat)
 
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
@@ -181,15 +181,34 @@ class Refiner:
             self._last[index] = _Known(each, xs, detail, part, poses)
         return [self._last[index] for index in part], [entry] * len(part)
 
-    def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
-        """Where a garment is inside the bodies whose bounds it meets, whether or not they push it."""
-        if points is None:
-            return None
-        garment, chain = self._scene.garments[index], self.refinements[index]
+    def _heat(
+        self, parts: Sequence[tuple[int, ...]], points: Sequence[np.ndarray | None]
+    ) -> tuple[dict[str, np.ndarray] | None, ...]:
+        """Where garments are inside bodies whose bounds they meet, whether or not those push, and what crosses."""
+        heat: list[dict[str, np.ndarray] | None] = [None] * len(points)
+        for part in parts:
+            last = [self._last[index] for index in part]
+            if any(each is None for each in last):
+                continue
+            group = self.group_of(part)
+            crossed = cloth_crossings(group.cloth, group.levels[-1], [each.points for each in last if each])
+            edges, triangles = (each.cpu().numpy() for each in (group.levels[-1].edges, group.levels[-1].triangles))
+            for index, marks, span in zip(part, crossed, group.levels[-1].spans, strict=True):
+                solved = points[index]
+                own = [_part_of(each, span) for each in (edges, triangles)]
+                heat[index] = None if solved is None else self._body_heat(index, solved, marks, *own)
+        return tuple(heat)
+
+    def _body_heat(
+        self, index: int, points: np.ndarray, crossed: np.ndarray, edges: np.ndarray, triangles: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """One garment's heat maps, given what of it crosses cloth, its edges and its faces."""
+        garment = self._scene.garments[index]
         met = self._bodies.near(garment, bounds_of(points), 0.0)
         surfaces = [each.surface for each in self._bodies.touching(met, [[0.0] * len(met)])]
-        edges = (chain[-1].mesh if chain else garment.mesh).half_edges.edges
-        return {"penetration": penetration_map(surfaces, points, edges, device=self._device)}
+        depth = penetration_map(surfaces, points, edges, device=self._device)
+        crossed = crossed | body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
+        return {"penetration": depth, "crossing": crossed.astype(np.float32)}
 
     def _near(self, part: Sequence[int], frames: Sequence[GarmentFrame]) -> tuple[int, ...]:
         """Numbers of the bodies that garments may touch."""
@@ -232,6 +251,12 @@ def _same(a: GarmentFrame, b: GarmentFrame) -> bool:
     """Whether two frames would give the same answer, to the bit."""
     settings = (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
     return settings and a.points.shape == b.points.shape and bool(np.array_equal(a.points, b.points))
+
+
+def _part_of(elements: np.ndarray, span: slice) -> np.ndarray:
+    """Edges or faces whose vertices are in a span, by numbers within it."""
+    first = elements[:, 0]
+    return elements[(first >= span.start) & (first < span.stop)] - span.start
 
 
 def _require_solvable(path: str, indices: np.ndarray, counts: np.ndarray, rest: np.ndarray) -> None:
