@@ -11,23 +11,25 @@ import torch
 
 from .colliders.pose import Pose
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
-from .contact.heat import body_crossings, cloth_crossings, penetration_map
+from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
 from .detail import Carried, join, split
 from .errors import GarmentError
 from .group import Group, SolveSettings
 from .level import refine_garments
 from .mesh.subdivide import Refinement
+from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State
 
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """One garment's last solved frame, with whom it was solved, and the bodies that it could touch there."""
+    """One garment's last solved frame, what crosses in it, with whom it was solved, and the bodies it could touch."""
 
     frame: GarmentFrame
     points: np.ndarray
     carried: Carried
+    crossing: np.ndarray
     part: tuple[int, ...]
     near: dict[int, Pose | None]
 
@@ -137,18 +139,17 @@ class Refiner:
                 reused[index] = same
             if not any(asked[index] for index in part):
                 continue
+            entries: list[dict[str, object]] = [{"start": "reused: the input equals the last frame's"}] * len(part)
             if not same:
                 known, entries = self._solve_part(part, frame, gap=gap)
-            else:
-                entries = [{"start": "reused: the input equals the last frame's"}] * len(part)
             for index, each, entry in zip(part, known, entries, strict=True):
                 if asked[index] and each is not None:
                     points[index], telemetry[index] = each.points, entry
         self._time = frame.time
         for index, passed in enumerate(self._passed.look(frame)):
             telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
-        heat = self._heat(self._parts.of(frame.garments), points) if self._heat_map else ()
-        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), heat)
+        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
@@ -164,11 +165,12 @@ class Refiner:
                 for index, each in zip(part, frames, strict=True)
             ]
             touching = self._bodies.touching(near, offsets)
-            solved, carried, entry = group.solve(frames, kept, at=frame.time, touching=touching)
-            more = self._reached(part, frames, solved)
+            solved = group.solve(frames, kept, at=frame.time, touching=touching)
+            more = self._reached(part, frames, solved.points)
             if more <= set(near):
                 break
             near = tuple(sorted({*near, *more}))
+        entry = solved.telemetry
         if any(self._scene.garments[index].colliders for index in part):
             entry["near"] = [self._scene.colliders[each].path for each in near]
         if len(part) > 1:
@@ -176,39 +178,26 @@ class Refiner:
         if gap:
             entry["start"] = "cold: the time between samples is too long"
         poses = {each: self._bodies.pose_of(each) for each in near}
-        own = split(carried, group.levels[0].spans, group.levels[-1].spans)
-        for index, each, xs, detail in zip(part, frames, solved, own, strict=True):
-            self._last[index] = _Known(each, xs, detail, part, poses)
+        own = split(solved.carried, group.levels[0].spans, group.levels[-1].spans)
+        for index, each, xs, detail, crossing in zip(part, frames, solved.points, own, solved.crossing, strict=True):
+            self._last[index] = _Known(each, xs, detail, crossing, part, poses)
         return [self._last[index] for index in part], [entry] * len(part)
 
-    def _heat(
-        self, parts: Sequence[tuple[int, ...]], points: Sequence[np.ndarray | None]
-    ) -> tuple[dict[str, np.ndarray] | None, ...]:
-        """Where garments are inside bodies whose bounds they meet, whether or not those push, and what crosses."""
-        heat: list[dict[str, np.ndarray] | None] = [None] * len(points)
-        for part in parts:
-            last = [self._last[index] for index in part]
-            if any(each is None for each in last):
-                continue
-            group = self.group_of(part)
-            crossed = cloth_crossings(group.cloth, group.levels[-1], [each.points for each in last if each])
-            edges, triangles = (each.cpu().numpy() for each in (group.levels[-1].edges, group.levels[-1].triangles))
-            for index, marks, span in zip(part, crossed, group.levels[-1].spans, strict=True):
-                solved = points[index]
-                own = [_part_of(each, span) for each in (edges, triangles)]
-                heat[index] = None if solved is None else self._body_heat(index, solved, marks, *own)
-        return tuple(heat)
-
-    def _body_heat(
-        self, index: int, points: np.ndarray, crossed: np.ndarray, edges: np.ndarray, triangles: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """One garment's heat maps, given what of it crosses cloth, its edges and its faces."""
-        garment = self._scene.garments[index]
+    def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
+        """Where a garment is inside bodies whose bounds it meets, pushed by them or not, and where cloth crosses."""
+        if points is None:
+            return None
+        garment, chain = self._scene.garments[index], self.refinements[index]
         met = self._bodies.near(garment, bounds_of(points), 0.0)
         surfaces = [each.surface for each in self._bodies.touching(met, [[0.0] * len(met)])]
+        finest, rest = (chain[-1].mesh, None) if chain else (garment.mesh, garment.rest)
+        triangles = finest.triangulate(rest).triangles
+        edges = edges_of(triangles, len(points)).vertices
+        known = self._last[index]
+        crossing = np.zeros(len(points), bool) if known is None else known.crossing
+        crossing = crossing | body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
         depth = penetration_map(surfaces, points, edges, device=self._device)
-        crossed = crossed | body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
-        return {"penetration": depth, "crossing": crossed.astype(np.float32)}
+        return {"penetration": depth, "crossing": crossing.astype(np.float32)}
 
     def _near(self, part: Sequence[int], frames: Sequence[GarmentFrame]) -> tuple[int, ...]:
         """Numbers of the bodies that garments may touch."""
@@ -251,12 +240,6 @@ def _same(a: GarmentFrame, b: GarmentFrame) -> bool:
     """Whether two frames would give the same answer, to the bit."""
     settings = (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
     return settings and a.points.shape == b.points.shape and bool(np.array_equal(a.points, b.points))
-
-
-def _part_of(elements: np.ndarray, span: slice) -> np.ndarray:
-    """Edges or faces whose vertices are in a span, by numbers within it."""
-    first = elements[:, 0]
-    return elements[(first >= span.start) & (first < span.stop)] - span.start
 
 
 def _require_solvable(path: str, indices: np.ndarray, counts: np.ndarray, rest: np.ndarray) -> None:

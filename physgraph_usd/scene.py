@@ -5,7 +5,7 @@ Everything here is SI, in world space, and knows no USD. Only ``usd/`` converts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -123,3 +123,10 @@ class State:
     telemetry: tuple[dict[str, object], ...] = field(default=())
     reused: tuple[bool, ...] = field(default=())
     heat: tuple[dict[str, np.ndarray] | None, ...] = field(default=())
+
+
+def recentred(garment: Garment) -> Garment:
+    """The garment with its rest shape about the origin: far away, float32 would lose its edges."""
+    if not len(garment.rest):
+        return garment
+    return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))

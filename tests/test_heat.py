@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from bodies import ball, distances, tube
 from cloth import sheet
 from layers import COAT, TIMES, errors, fine_points, make_shot, open_over, refine_all
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
-from sheets import garment_of
 from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API
 
@@ -22,10 +20,8 @@ from physgraph_usd.chunks import Outcome, _collect, _solve_chunk
 from physgraph_usd.colliders.mesh import MeshBody
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.colliders.primitives import ShapeSurface
-from physgraph_usd.contact.cloth import ClothContact
-from physgraph_usd.contact.heat import body_crossings, cloth_crossings, penetration_map
+from physgraph_usd.contact.heat import body_crossings, penetration_map
 from physgraph_usd.errors import LayerError
-from physgraph_usd.level import build_levels
 from physgraph_usd.mesh.topology import edges_of
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.usd.reader import open_shot
@@ -104,22 +100,6 @@ class TestCrossings:
         expected = np.zeros(len(x), bool)
         expected[edges[inside[:, 0] != inside[:, 1]].ravel()] = True
         np.testing.assert_array_equal(found, expected)
-
-    @pytest.mark.parametrize("apart", [False, True])
-    def test_two_sheets_that_cross_are_marked_where_they_do(self, apart: bool):
-        """One sheet through the middle of the other: what is farther than an edge from the line is not marked."""
-        mesh, rest = sheet(8, 8, 0.05)
-        flat = rest - rest.mean(axis=0)
-        normal = int(np.ptp(flat, axis=0).argmin())
-        turned = np.roll(flat, 1, axis=1) + 0.007
-        garments = [garment_of(mesh, rest), replace(garment_of(mesh, rest), path="/World/other")]
-        if apart:
-            garments[0] = replace(garments[0], apart_from=("/World/other",))
-        levels = build_levels(garments, [(), ()])
-        marks = cloth_crossings(ClothContact(levels, garments), levels[-1], [flat, turned])
-        assert [bool(each.any()) for each in marks] == [not apart, not apart]
-        assert np.abs(turned[marks[1], normal]).max(initial=0.0) < 0.1
-        assert np.abs(flat[marks[0], (normal + 1) % 3]).max(initial=0.0) < 0.1
 
 
 def level_sheet() -> tuple[np.ndarray, np.ndarray]:

@@ -42,14 +42,14 @@ class Parts:
         edge to spare, since a vertex may be near an edge's middle.
         """
         count = len(frames)
-        near = sparse.lil_matrix((count, count), dtype=bool)
+        near = np.zeros((count, count), bool)
         trees: dict[int, cKDTree] = {}
         for a in range(count if self._together else 0):
             for b in range(a + 1, count):
                 near[a, b] = touch_one_another(self._garments[a], self._garments[b]) and self._close(
                     a, b, frames, trees
                 )
-        labels = csgraph.connected_components(near.tocsr(), directed=False)[1]
+        labels = csgraph.connected_components(sparse.csr_matrix(near), directed=False)  # pyright: ignore[reportArgumentType][1]
         return [tuple(np.flatnonzero(labels == label).tolist()) for label in dict.fromkeys(labels.tolist())]
 
     def _close(self, a: int, b: int, frames: Sequence[GarmentFrame], trees: dict[int, cKDTree]) -> bool:

@@ -46,10 +46,12 @@ class ClothState:
     Attributes:
         x: Positions [m].
         crossings: What crosses there.
+        near: Whether any parts are near enough to cross.
     """
 
     x: Float[Tensor, "vertices 3"]
     crossings: Crossings
+    near: bool = True
 
 
 class ClothContact:
@@ -133,7 +135,7 @@ class ClothView:
         busy = self._regions.busy(x, 0.0)
         if not bool(busy.any()):
             none = torch.zeros(0, dtype=torch.int64, device=x.device)
-            return ClothState(x, Crossings(none, none, 0))
+            return ClothState(x, Crossings(none, none, 0), near=False)
         self._mesh.move(x)
         return ClothState(x, self._mesh.crossings(busy))
 
@@ -165,8 +167,8 @@ class ClothView:
             good: Positions to fall back on; the upsampled cage when None.
 
         Returns:
-            Positions with no more crossings than the good ones have, and none away from where those had some; where
-            that cannot be had, the positions found that have the fewest.
+            The positions found that have the fewest crossings; no more than the good ones have, but where that cannot
+            be had.
         """
         good = good or self.before
         zone = self._mesh.grown(self._corners(good.crossings), ZONE)
@@ -174,11 +176,10 @@ class ClothView:
         shift = x - good.x
         for attempt in range(MENDS):
             corners = self._mesh.corners_of(state.crossings)
-            new = ~zone[corners].all(dim=1)
-            if state.crossings.count > good.crossings.count:
-                new = torch.ones_like(new)
-            if not bool(new.any()):
-                return state
+            too_many = state.crossings.count > good.crossings.count
+            new = torch.ones_like(corners[:, 0], dtype=torch.bool) if too_many else ~zone[corners].all(dim=1)
+            if not bool(new.any()) or (attempt >= SMOOTHINGS and not too_many):
+                return best
             back = torch.zeros_like(zone)
             back[corners[new].reshape(-1)] = True
             if attempt < SMOOTHINGS:
@@ -189,18 +190,25 @@ class ClothView:
             best = min(best, state, key=lambda each: each.crossings.count)
         return best
 
-    def measure(self, x: Float[Tensor, "vertices 3"]) -> dict[str, dict[str, int]]:
-        """What crosses before and after, as plain values.
+    def worse(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """Whether more crosses than in the upsampled cage."""
+        return self.look(x).crossings.count > self.before.crossings.count
+
+    def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, dict[str, int]], Bool[Tensor, " vertices"]]:
+        """What crosses before and after, as plain values, and the vertices of what does after; nothing where no part
+        is near another.
 
         Args:
             x: The result [m].
         """
-        said = {}
-        for name, state in (("before", self.before), ("after", self.look(x))):
+        said, after = {}, self.look(x)
+        if not (self.before.near or after.near):
+            return {}, torch.zeros_like(self._level.free[:, 0])
+        for name, state in (("before", self.before), ("after", after)):
             table = self._mesh.between(state.crossings)
             apart = int(np.triu(table, 1).sum())
             said[name] = {"crossings": state.crossings.count, "between_garments": apart}
-        return said
+        return said, self._corners(after.crossings)
 
     def _smoothed(self, shift: Tensor, where: Bool[Tensor, " vertices"], *, passes: int) -> Tensor:
         """Displacements averaged over neighbours again and again within a region; held outside."""
@@ -240,7 +248,8 @@ class ClothView:
         pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
         corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
         way, at_input, at_start = (
-            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, self._sides)
+            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1)
+            for at in (x, self._base, x if self._sides is None else self._sides)
         )
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
         distance = at_input.norm(dim=1)

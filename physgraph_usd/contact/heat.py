@@ -13,9 +13,7 @@ import warp as wp
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
 from ..colliders.sign import signed_distances
-from ..level import Level
 from ..mesh.lanes import Launch
-from .cloth import ClothContact
 from .measure import depths
 
 LAYERS = wp.constant(8)
@@ -108,28 +106,6 @@ def body_crossings(
         _, faces = _marked(cloth, start[meets], end[meets], device=device)
         marks[triangles[faces].ravel()] = True
     return marks
-
-
-def cloth_crossings(cloth: ClothContact, finest: Level, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Which vertices are corners of an edge or a face that crosses cloth, of garments that feel one another.
-
-    Args:
-        cloth: The group's cloth.
-        finest: Its finest level.
-        points: World positions of each garment [m], shape (V, 3), float64.
-
-    Returns:
-        Per garment, shape (V,), bool.
-    """
-    world = np.concatenate(points)
-    marks = np.zeros(len(world), bool)
-    if len(world) and cloth.meets.any():
-        x = torch.as_tensor(world - world.mean(axis=0), dtype=finest.dtype, device=finest.device)
-        mesh = cloth.mesh(finest)
-        mesh.move(x)
-        found = mesh.crossings(cloth.regions(finest).busy(x, 0.0))
-        marks[mesh.corners_of(found).cpu().numpy().ravel()] = True
-    return [marks[span] for span in finest.spans]
 
 
 def _marked(mesh: wp.Mesh, start: np.ndarray, end: np.ndarray, *, device: str) -> tuple[np.ndarray, np.ndarray]:
