@@ -247,9 +247,9 @@ class ClothView:
         kept = (~self._corners(crossings)[corners].any(dim=1) & ~undecided) | ordered
         pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
         corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
+        start = x if self._sides is None else self._sides
         way, at_input, at_start = (
-            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1)
-            for at in (x, self._base, x if self._sides is None else self._sides)
+            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, start)
         )
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
         distance = at_input.norm(dim=1)
