@@ -81,8 +81,8 @@ class FrameContact:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             cloth = None
             if self._cloth is not None:
-                base, stiffness = level.base.apply(self._coarse), self._settings.stiffness
-                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, stiffness=stiffness)
+                base = level.base.apply(self._coarse)
+                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds)
         return self._views[level.index]
 
