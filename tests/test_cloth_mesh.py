@@ -267,6 +267,18 @@ class TestCrossings:
             x[half:] += torch.tensor(shift)
             assert moved(level, x).crossings(everything(level)).count == 0
 
+    def test_a_lining_of_the_same_mesh_passes_through_at_the_sides_of_faces(self):
+        """Every edge that passes through meets an edge below it; it is counted once, as when moved aside by a hair."""
+        level = levels_of(named(square(4), "A"), named(square(4), "B"))[-1]
+        half = level.vertex_count // 2
+        x = level.rest.clone()
+        x[half:, 1] = 0.3 * x[half:, 0] + 0.11 * x[half:, 2] + 0.002
+        found = moved(level, x).crossings(everything(level)).count
+        x[half:] += 1e-5 * torch.rand_like(x[half:])
+        aside = moved(level, x).crossings(everything(level)).count
+        assert aside == len(crossings(Soup.of(level, x)))
+        assert 0.5 * aside < found < 1.5 * aside
+
     @pytest.mark.parametrize("shape", [flat, folded])
     def test_what_does_not_cross_has_none(self, shape: object):
         level = levels_of(named(strip(8, 3)))[-1]

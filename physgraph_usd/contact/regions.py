@@ -43,6 +43,8 @@ class Regions:
         self._patch = torch.as_tensor(patch, device=device)
         self._triangles = level.triangles.long()
         self._triangle_patch = self._patch[self._triangles[:, 0]]
+        self._has_triangles = torch.zeros(self._count, dtype=torch.bool, device=device)
+        self._has_triangles[self._triangle_patch] = True
         ring, near = _rings(cage.edges.cpu().numpy(), cage.vertex_count)
         self._ring = sp.coo_matrix(ring)
         self._centre, self._member = (
@@ -101,7 +103,7 @@ class Regions:
         sums = torch.zeros_like(total).index_put_((self._centre,), total[self._member], accumulate=True)
         mean = torch.nn.functional.normalize(sums, dim=1, eps=1e-30)
         angle = torch.arccos((mean[self._centre] * axis[self._member]).sum(dim=1).clamp(-1.0, 1.0))
-        over = angle + spread[self._member] > TURNED
+        over = (angle + spread[self._member] > TURNED) & self._has_triangles[self._member]
         out = torch.zeros(self._count, dtype=torch.bool, device=x.device)
         turned = torch.zeros_like(out)
         turned[self._centre[over]] = True
