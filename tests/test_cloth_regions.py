@@ -72,9 +72,7 @@ class TestNothingIsMissed:
         x[half:] += 0.1 * EDGE * torch.rand_like(x[half:])
         self.same(regions, levels[-1], x, reach=0.01, meets=np.ones((2, 2), bool))
 
-    @pytest.mark.xfail(
-        strict=True, reason="of a slit's lips 3% of the crossings are missed at its end"
-    )
+    @pytest.mark.xfail(strict=True, reason="of a slit's lips 3% of the crossings are missed at its end")
     @pytest.mark.parametrize("seed", range(4))
     def test_of_the_lips_of_a_slit(self, seed: int):
         """Both lips lie in the plane of the cloth, their normals up, and pass over and through one another."""
