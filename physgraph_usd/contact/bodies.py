@@ -227,8 +227,10 @@ class LevelBodies:
         for track in self._tracks:
             moved = (x - track.at).norm(dim=1)
             found = pierced(track.surface, self._level, x + track.shift, (track.known.abs() - moved).clamp_min(0.0))
-            out[self._level.edges.long()[found.edges].reshape(-1)] = True
-            out[self._level.triangles.long()[found.triangles].reshape(-1)] = True
+            held = ~self._level.free[:, 0] & (track.known < 0)
+            for corners in (self._level.edges.long()[found.edges], self._level.triangles.long()[found.triangles]):
+                # What a pin holds inside comes out at no height.
+                out[corners[~held[corners].any(dim=1)].reshape(-1)] = True
         return out
 
 
