@@ -173,8 +173,8 @@ class Group:
         moved: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
-            result, moved = contact.finish(result)
-            x = x if scaled else result
+            result, start_next, moved = contact.finish(result)
+            x = x if scaled else start_next
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
         elastic = forces[-1].elastic_energy(x)
