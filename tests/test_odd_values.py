@@ -201,6 +201,17 @@ class TestWritten:
         told = [str(problem) for problem in validate_layer(tmp_path / "out.usdc", tmp_path / "shot.usda")]
         assert any("is a partition, but names" in line and "so it is in the shot" in line for line in told)
 
+    @pytest.mark.parametrize("mode", ["over", "sibling"])
+    def test_a_family_of_faces_that_are_left_out(self, dressed: Usd.Stage, tmp_path: Path, mode: str):
+        mesh = UsdGeom.Mesh(dressed.GetPrimAtPath(COAT))
+        mesh.GetFaceVertexCountsAttr().Set([2, 4])
+        mesh.GetFaceVertexIndicesAttr().Set([0, 1, 5, 6, 11, 10])
+        dressed.RemovePrim(f"{COAT}/back")
+        UsdGeom.Subset.Get(dressed, f"{COAT}/front").GetIndicesAttr().Set([0])
+        UsdGeom.Subset.SetFamilyType(UsdGeom.Imageable(mesh), "materialBind", "nonOverlapping")
+        shot = Path(save(dressed))
+        assert errors(write_layer(shot, tmp_path / "out.usdc", mode=mode), shot) == []
+
     def test_subsets_that_overlap_at_one_time_as_the_shot_s_do(self, dressed: Usd.Stage, tmp_path: Path):
         subset = UsdGeom.Subset.Get(dressed, f"{COAT}/back")
         every = Vt.IntArray.FromNumpy(np.arange(12, dtype=np.int32))

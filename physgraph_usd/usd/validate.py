@@ -173,8 +173,12 @@ def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]
 
 
 def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
-    """Whether a finding is what we did on purpose: skinning is taken off, its coarse properties stay below."""
-    return problem.path in fine and problem.rule.endswith("MissingSkelBindingAPI")
+    """Whether a finding is what we did on purpose.
+
+    Skinning is taken off, its coarse properties stay below; a family whose faces were all left out has none.
+    """
+    emptied = problem.rule.endswith(_COUNTS) and "No indices in family" in problem.message
+    return problem.path in fine and (emptied or problem.rule.endswith("MissingSkelBindingAPI"))
 
 
 def _findings(module: object, validators: list, stage: Usd.Stage) -> dict[tuple[str, str, str], Problem]:
