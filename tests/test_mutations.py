@@ -26,7 +26,9 @@ def test_it_applies_to_the_present_text(mutation: Mutation):
     assert mutation.breaks
     assert mutation.tests
     for test in mutation.tests:
-        assert (ROOT / test.partition("::")[0]).is_file(), test
+        file, *names = test.split("::")
+        assert (ROOT / file).is_file(), test
+        assert all(name in (ROOT / file).read_text(encoding="utf-8") for name in names), test
 
 
 def test_a_defect_is_found_where_its_text_was_moved_to(tmp_path: Path):
