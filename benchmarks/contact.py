@@ -19,7 +19,7 @@ import numpy as np
 import trimesh
 
 from physgraph_usd.colliders.pose import Collider, MeshPose
-from physgraph_usd.contact import ContactSettings
+from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.fabric import PRESETS
 from physgraph_usd.group import SolveSettings
 from physgraph_usd.integrate import method_named

@@ -8,6 +8,7 @@ Interpolated to the fine vertices, they take the detail along.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,11 +44,32 @@ class Carried:
         coarse: Cage positions [m], world space.
         detail: Fine positions minus the smooth base, in the moving frames [m], shape (V, 3).
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
+        energy: Elastic energy of the result [J], summed over garments.
     """
 
     coarse: Float[Tensor, "coarse 3"]
     detail: Float[Tensor, "vertices 3"]
     frames: Float[Tensor, "coarse 3 3"]
+    energy: float = 0.0
+
+
+def join(parts: Sequence[Carried]) -> Carried:
+    """What several garments carry, as one."""
+    tensors = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
+    return Carried(*tensors, energy=sum(part.energy for part in parts))
+
+
+def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> list[Carried]:
+    """What each garment of a group carries.
+
+    Args:
+        carried: What the group carries.
+        coarse: Cage vertices of each garment.
+        fine: Fine vertices of each garment.
+    """
+    pairs = list(zip(coarse, fine, strict=True))
+    share = carried.energy / max(len(pairs), 1)
+    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c], share) for c, f in pairs]
 
 
 class MovingFrames:

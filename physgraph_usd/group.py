@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,11 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .contact import ContactSettings, FrameContact, LevelContact, Touching
+from .contact.bodies import FrameBodies, Touching
+from .contact.cloth import ClothContact
+from .contact.frame import FrameContact, LevelContact, Touch
+from .contact.rounds import solve_rounds, untangle
+from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
 from .forces.base import ForceModule
-from .forces.contact import Contact
 from .forces.guide import GuideMap
 from .integrate import Method
 from .integrate.base import System
@@ -26,18 +29,19 @@ from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .level_forces import LevelForces, build_forces
 from .mesh.subdivide import Refinement
-from .resolution import sharp_folds
-from .rounds import solve_rounds
-from .scene import Garment, GarmentFrame
+from .resolution import edge_strain, sharp_folds
+from .scene import Garment, GarmentFrame, recentred
 
 WORTH = 2.0
-"""Elastic energy of carried detail, over that of the upsampled cage, beyond which a frame starts cold: detail that is
-worth carrying takes compression up and lowers it; carried by a crumpled cage it tears the cloth."""
+"""Elastic energy of carried detail, over that of the upsampled cage and of the last result, beyond which a frame is
+cold: detail that is worth carrying takes compression up and lowers it; carried by a crumpled cage it tears cloth."""
 LEAST_STRAIN = 1e-2
 """Strain of the whole garment under which that ratio is not looked at."""
 UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
+REFACTORED = 8000
+"""Vertices up to which a level's metric takes up the stiffness of what touches; above, factorising costs too much."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
 COARSE_TOLERANCE = 0.1
@@ -69,6 +73,23 @@ class SolveSettings:
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """One frame of a group.
+
+    Attributes:
+        points: World positions of each garment [m].
+        carried: What the next frame needs.
+        telemetry: Plain values.
+        crossing: For each garment, which vertices belong to cloth that crosses cloth, shape (V,), bool.
+    """
+
+    points: list[np.ndarray]
+    carried: Carried
+    telemetry: dict[str, object]
+    crossing: list[np.ndarray]
 
 
 class Group:
@@ -104,7 +125,7 @@ class Group:
         self.garments = tuple(garments)
         self._gravity, self._settings = gravity, settings
         self.levels = build_levels(
-            [_recentred(g) for g in garments], refinements, dtype=dtype, device=device, lanes=lanes
+            [recentred(g) for g in garments], refinements, dtype=dtype, device=device, lanes=lanes
         )
         self._guide_maps = [GuideMap(level) for level in self.levels]
         cage, finest = self.levels[0], self.levels[-1]
@@ -113,6 +134,7 @@ class Group:
         self._outward = torch.tensor([-1.0 if garment.flipped else 1.0 for garment in garments], device=device)
         self._fixed = np.flatnonzero(~finest.free.cpu().numpy().ravel())
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
+        self._cloth = ClothContact(self.levels, self.garments)
         self._material: tuple[object, ...] = ()
         self._forces: list[LevelForces] = []
         self._stretch = 0.0
@@ -124,7 +146,7 @@ class Group:
         *,
         at: float | None,
         touching: Sequence[Touching] = (),
-    ) -> tuple[list[np.ndarray], Carried, dict[str, object]]:
+    ) -> Solved:
         """Solve one frame.
 
         Args:
@@ -132,9 +154,6 @@ class Group:
             kept: The previous frame's result, or None for a cold start.
             at: The time code, for errors.
             touching: Surfaces that the garments may touch.
-
-        Returns:
-            World positions [m] of each garment, what the next frame needs, and telemetry.
 
         Raises:
             SolveError: A term of the potential is not finite.
@@ -152,19 +171,22 @@ class Group:
         except SolveError as error:
             raise SolveError(self._blame(forces[-1], coarse, error, at)) from error
         result = self._finish(x, coarse, frames)
-        pushed = None
+        moved: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
-            result, pushed = contact.at(self.levels[-1], self.levels[-1]).project(result)
+            result, moved = contact.finish(result)
             x = x if scaled else result
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
-        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
+        elastic = forces[-1].elastic_energy(x)
+        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames, elastic)
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
+        crossing = torch.zeros_like(self.levels[-1].free[:, 0])
         if contact is not None:
-            upsampled = self.levels[-1].base.apply(coarse)
-            telemetry["contact"] = contact.measure(self.levels[-1], upsampled, result) | {"projected": pushed}
+            measured, crossing = contact.measure(result)
+            if measured:
+                telemetry["contact"] = measured | moved
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -172,7 +194,8 @@ class Group:
         }
         points = result.double().cpu().numpy() + origin
         points[self._fixed] = self._place_fixed @ world
-        return [points[span] for span in self.levels[-1].spans], carried, telemetry
+        spans, crosses = self.levels[-1].spans, crossing.cpu().numpy()
+        return Solved([points[span] for span in spans], carried, telemetry, [crosses[span] for span in spans])
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
@@ -232,19 +255,29 @@ class Group:
         predicted = torch.where(finest.free, predicted, base)
         carried, plain = (self._forces[-1].elastic_energy(x) for x in (predicted, base))
         least = LEAST_STRAIN**2 * self._stretch * float(finest.vertex_area.sum())
-        if carried > WORTH * max(plain, least):
-            return None, f"cold: carried detail has {carried / max(plain, least):.3g} times the upsampled cage's energy"
+        usual = max(plain, least, kept.energy)
+        if carried > WORTH * usual:
+            return (
+                None,
+                f"cold: carried detail has {carried / usual:.3g} times the energy of cage and last frame",
+            )
         return predicted, "warm"
 
     def _contact(
         self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray, frames: Sequence[GarmentFrame]
     ) -> FrameContact | None:
-        """The bodies of a frame, or None when there are none."""
-        if not touching or not len(coarse):
+        """What a frame's cloth may touch, or None when there is nothing."""
+        settings = self._settings.contact
+        cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
+        if not len(coarse) or (cloth is None and not touching):
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
-        settings = self._settings.contact.scaled(self.levels[0], stretch=self._stretch, weight=weight)
-        return FrameContact.begin(self.levels, touching, coarse, origin=origin, settings=settings)
+        settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
+        bodies = None
+        if touching:
+            bodies = FrameBodies.begin(self.levels, touching, coarse, origin=origin, settings=settings)
+        thickness = [frame.fabric.thickness for frame in frames]
+        return FrameContact(self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings)
 
     def _descend(
         self,
@@ -269,13 +302,13 @@ class Group:
             if predicted is not None and self._settings.temporal == "tether":
                 terms = ForceModule((*module.forces, lasting.tether(self._settings.tether, predicted)))
             budget = self._budget(index, len(self.levels), clock)
-            view = None if contact is None else contact.at(level, self.levels[-1])
+            view = None if contact is None else contact.at(level)
             cold = predicted is None
             x, made, touched = self._solve_level(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
             if index < len(self.levels) - 1:
                 made[-1].energies = module.energies(x)
             reports += made
-            module = module if touched is None else ForceModule((*module.forces, touched))
+            module = ForceModule((*module.forces, *touched))
         return x, reports, module
 
     def _solve_level(
@@ -288,25 +321,32 @@ class Group:
         cold: bool,
         view: LevelContact | None,
         budget: Budget,
-    ) -> tuple[Tensor, list[LevelReport], Contact | None]:
-        """Solve one level, in rounds where bodies are near; returns the contact term too, where there is one."""
+    ) -> tuple[Tensor, list[LevelReport], tuple[Touch, ...]]:
+        """Solve one level, in rounds where something is near; returns the contact terms too."""
 
-        def system(touched: Contact | None) -> System:
-            module = terms if touched is None else ForceModule((*terms.forces, touched))
-            return System(module, metric, free=level.free, spacing=level.spacing)
+        def system(touched: Sequence[Touch], at: Tensor) -> System:
+            stiff = [3.0 * term.diagonal(at) for term in touched] if level.vertex_count <= REFACTORED else []
+            held = metric.plus(torch.stack(stiff).sum(dim=0)) if stiff else metric
+            return System(ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing)
 
         integrator = self._settings.method.build()
-        touched = None if view is None else view.term(x)
-        if cold:
-            x = leave_saddle(system(touched), level, x, outward=self._outward)
         if view is None:
-            x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
-            return x, [report], None
+            x = leave_saddle(system((), x), level, x, outward=self._outward) if cold else x
+            x, report = solve_level(system((), x), integrator, x, level=level.index, budget=budget)
+            return x, [report], ()
+        freed: list[LevelReport] = []
+        if cold and level is self.levels[0]:
+            x, freed, touched = untangle(system, integrator, x, view=view, level=level.index, budget=budget)
+        else:
+            touched = view.terms(x)
+        x = leave_saddle(system(touched, x), level, x, outward=self._outward) if cold else x
         x, made, touched = solve_rounds(
-            system, integrator, x, touched=touched, view=view, level=level.index, budget=budget
+            system, integrator, x, terms=touched, view=view, level=level.index, budget=budget
         )
-        if touched is not None and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
-            apart = System(terms, metric, free=level.free & ~touched.near(level), spacing=level.spacing)
+        made = freed + made
+        if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
+            held = torch.stack([term.near(level) for term in touched]).any(dim=0)
+            apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing)
             x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
             made.append(report)
         return x, made, touched
@@ -354,20 +394,3 @@ class Group:
         where = ", ".join(f"<{garment.path}>" for garment in self.garments)
         when = "" if at is None else f" at time code {at:g}"
         return f"{where}{when}: {error}; terms that are not finite: {', '.join(broken)}"
-
-
-def _recentred(garment: Garment) -> Garment:
-    """The garment with its rest shape about the origin: far away, float32 would lose its edges."""
-    if not len(garment.rest):
-        return garment
-    return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))
-
-
-def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
-    """Size of the edges' relative extension: median, 99th percentile and largest."""
-    if not len(level.edges):
-        return {"p50": 0.0, "p99": 0.0, "max": 0.0}
-    ends = level.edges.long()
-    strain = ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) / level.rest_length - 1.0).abs().cpu().numpy()
-    p50, p99 = np.percentile(strain, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(strain.max())}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .contact import ContactSettings
+from .contact.settings import ContactSettings
 from .errors import UsageError
 from .group import SolveSettings
 from .integrate import method_named
@@ -45,6 +45,7 @@ class RefineOptions:
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
         velocities: Also write point velocities.
+        heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
         rest_frame: Time code whose points are the rest shape, or None.
         root: A .usda to write that lays the new layer over the shot, or None.
         progress: Called with (frames done, frames in all), or None.
@@ -69,13 +70,16 @@ class RefineOptions:
     overwrite: bool = False
     dry_run: bool = False
     velocities: bool = False
+    heat_map: bool = False
     rest_frame: float | None = None
     root: Path | None = None
     progress: Callable[[int, int], None] | None = None
 
     def plain(self) -> dict[str, Any]:
         """The options that decide the result, ready for JSON."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_OF_THE_RESULT}
+        names = {f.name for f in dataclasses.fields(self)} - _NOT_OF_THE_RESULT
+        names -= set() if self.heat_map else {"heat_map"}  # a layer without one is as it was before there were any
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def solve_settings(self) -> SolveSettings:

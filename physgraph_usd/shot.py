@@ -168,7 +168,8 @@ class _ShotSolver:
         prepare_device(device)
         shot = self._opened or _open(self._shot, self._options)
         settings = self._options.solve_settings()
-        refiner = Refiner(shot.scene, settings, levels=self.levels, device=device, lanes=self._lanes)
+        options = {"device": device, "lanes": self._lanes, "heat_map": self._options.heat_map}
+        refiner = Refiner(shot.scene, settings, levels=self.levels, **options)
         for time in times:
             began = clock.perf_counter()
             try:
@@ -180,7 +181,7 @@ class _ShotSolver:
                 yield Outcome(time, (), (), {"time": time, "error": str(error)})
                 continue
             record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
-            yield Outcome(time, state.points, state.reused, record)
+            yield Outcome(time, state.points, state.reused, record, state.heat)
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:
@@ -241,7 +242,7 @@ def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
         report.warnings.append(f"no sample is written at time code {name}: {report.failed[name]}")
         return 0.0
     start = clock.perf_counter()
-    writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused])
+    writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused], heat=outcome.heat)
     return clock.perf_counter() - start
 
 

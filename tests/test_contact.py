@@ -12,7 +12,7 @@ from cloth import FABRIC, sheet
 from sheets import level_of
 from touching import frame, measured, mesh_pose, refiner
 
-import physgraph_usd.contact
+import physgraph_usd.contact.bodies
 from physgraph_usd.colliders.mesh import MeshBody
 from physgraph_usd.colliders.pose import ShapePose
 from physgraph_usd.forces.contact import Contact, Planes
@@ -204,7 +204,7 @@ class TestLeftOut:
         def refuse(*args: object, **options: object) -> None:
             raise AssertionError("contact code ran")
 
-        monkeypatch.setattr(physgraph_usd.contact.FrameContact, "begin", refuse)
+        monkeypatch.setattr(physgraph_usd.contact.bodies.FrameBodies, "begin", refuse)
         monkeypatch.setattr(MeshBody, "pose", refuse)
         near = mesh_pose(ball())
         assert refiner((MESH, REST), felt=()).solve(frame(draped(0.1), near)).points[0] is not None

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..colliders.pose import SIDES
 from ..errors import UsageError
 from ..fabric import PRESETS
 
@@ -20,7 +21,8 @@ MATERIAL = "physgraph:material:"
 AUTO_LEVEL = -1
 """Level that asks for as many subdivisions as the fabric's buckling wavelength needs."""
 
-_SI = " SI, whatever the stage's metersPerUnit."
+SI = " SI, whatever the stage's metersPerUnit."
+"""End of the doc of every property that has a unit."""
 _JERSEY = PRESETS["jersey"]
 
 
@@ -39,18 +41,20 @@ class Property:
         doc: What it is, for the schema's documentation.
         uniform: Whether it cannot be animated.
         interpolation: Of a primvar, else "".
+        tokens: Words that a token may be.
     """
 
     schema: str
     name: str
     type: str
-    fallback: float | int | bool | None
+    fallback: float | int | bool | str | None
     unit: str
     minimum: float | None
     maximum: float | None
     doc: str
     uniform: bool = False
     interpolation: str = ""
+    tokens: tuple[str, ...] = ()
 
     @property
     def short(self) -> str:
@@ -63,7 +67,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
 
     def row(name: str, fallback: float | None, unit: str, minimum: float, doc: str) -> Property:
         return Property(
-            schema, MATERIAL + name, "float", fallback if fallbacks else None, unit, minimum, None, doc + _SI
+            schema, MATERIAL + name, "float", fallback if fallbacks else None, unit, minimum, None, doc + SI
         )
 
     return (
@@ -90,19 +94,27 @@ PROPERTIES: tuple[Property, ...] = (
     *_material(GARMENT_API, fallbacks=True),
     Property(
         GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, None,
-        "How firmly the mean of the fine cloth follows the coarse animation." + _SI,
+        "How firmly the mean of the fine cloth follows the coarse animation." + SI,
     ),
     Property(
         GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, None,
-        "Distance kept from colliders." + _SI,
+        "Distance kept from colliders." + SI,
     ),
     Property(
         GARMENT_API, "physgraph:contact:selfCollision", "bool", True, "", None, None,
         "Whether the garment collides with itself.", True,
     ),
     Property(
+        GARMENT_API, "physgraph:contact:layer", "int", None, "", None, None,
+        "Order among garments: lower is nearer to the body; garments with equal or no layer are not ordered.", True,
+    ),
+    Property(
         GARMENT_API, "physgraph:colliders", "rel", None, "", None, None,
         "Colliders of this garment; empty means every collider prim on the stage.",
+    ),
+    Property(
+        GARMENT_API, "physgraph:contact:exclude", "rel", None, "", None, None,
+        "Colliders and garments that this garment never touches: prims, prims above them, or collections.",
     ),
     _scale("stretchScale", 1.0, None, "Painted multiplier of the stretch stiffness; vertex or constant."),
     _scale("bendScale", 1.0, None, "Painted multiplier of the bending stiffness; vertex or constant."),
@@ -115,7 +127,13 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None,
-        "Distance kept from this collider, added to the garment's." + _SI,
+        "Distance kept from this collider, added to the garment's." + SI,
+    ),
+    Property(
+        COLLIDER_API, "physgraph:collider:side", "token", "auto", "", None, None,
+        "Where cloth belongs: auto, outside closed parts and where the coarse cloth is at open ones; winding, outside "
+        "by the winding number; start, where the coarse cloth is; front or back, that side of the faces of open parts.",
+        True, tokens=SIDES,
     ),
     *_material(MATERIAL_API, fallbacks=False),
 )  # fmt: skip
@@ -123,6 +141,8 @@ PROPERTIES: tuple[Property, ...] = (
 
 GARMENT: dict[str, Property] = {row.short: row for row in PROPERTIES if row.schema == GARMENT_API}
 """Rows of the garment schema by short name."""
+COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.schema == COLLIDER_API}
+"""Rows of the collider schema by short name."""
 
 
 def find_property(text: str) -> Property:

@@ -16,49 +16,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .colliders.base import Nearest, Surface
-from .colliders.sign import MARGIN, signed_distances
-from .forces.contact import Contact, Planes
-from .level import Level
+from ..colliders.base import Nearest, Surface
+from ..colliders.sign import MARGIN, behind, signed_distances
+from ..forces.contact import Contact, Planes
+from ..level import Level
 from .measure import penetration, pinched
+from .settings import ContactSettings
 
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
-
-
-@dataclass(frozen=True)
-class ContactSettings:
-    """How contact is solved.
-
-    Attributes:
-        form: "quadratic", "linear" as in the paper, or "off".
-        stiffness: k_c of the quadratic form, in stretch stiffnesses over the square of the cage's mean edge.
-        pressure: k_c over the garment's area of the linear form, in weights of the cloth.
-        rounds: How often in a level's steps closest points are found anew.
-        clearance: Part of the offset that the last projection leaves at least.
-        projections: Most passes of the last projection.
-    """
-
-    form: str = "quadratic"
-    stiffness: float = 15.0
-    pressure: float = 5.0
-    rounds: int = 3
-    clearance: float = 0.25
-    projections: int = 10
-
-    def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
-        """The same settings with k_c itself as their stiffness, [N/m^3], or [N] in the linear form.
-
-        Args:
-            cage: The cage.
-            stretch: Stretch stiffness of the cloth [N/m].
-            weight: Its weight per area [N/m^2].
-        """
-        if self.form == "linear":
-            return replace(self, stiffness=self.pressure * weight * float(cage.vertex_area.sum()))
-        return replace(self, stiffness=self.stiffness * stretch / float(cage.spacing.mean()) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +36,7 @@ class Touching:
     Attributes:
         path: Its collider's prim path.
         surface: The posed surface.
-        offset: Distance kept by each garment of the group [m].
+        offset: Distance kept by each garment of the group [m]; minus infinity where it does not feel the surface.
     """
 
     path: str
@@ -135,8 +103,9 @@ class _Track:
     def _signs(self, which: Tensor, found: Nearest, asked: Tensor, moved: Tensor) -> Tensor:
         """1 outside, or on the start side of an open surface; -1 inside or behind it."""
         if not self.surface.closed:
-            behind = (found.side * self.side[which] < 0) & ~found.rim
-            return torch.where(behind, -torch.ones_like(moved), torch.ones_like(moved))
+            return torch.where(behind(found, self.side[which]), -torch.ones_like(moved), torch.ones_like(moved))
+        if self.surface.certain:
+            return found.side
         known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
         may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
         ask = may_have_crossed & (found.side != known)
@@ -151,7 +120,7 @@ def _at(found: Nearest, which: Tensor) -> Nearest:
     return Nearest(**{each.name: getattr(found, each.name)[which] for each in fields(found)})
 
 
-class LevelContact:
+class LevelBodies:
     """One level's view of the bodies.
 
     Attributes:
@@ -205,7 +174,7 @@ class LevelContact:
 
 
 @dataclass(eq=False)
-class FrameContact:
+class FrameBodies:
     """A group's bodies in one frame.
 
     Attributes:
@@ -217,7 +186,7 @@ class FrameContact:
     distances: list[Float[Tensor, " vertices"]]
     _tracks: list[_Track] = field(default_factory=list)
     _settings: ContactSettings = field(default_factory=ContactSettings)
-    _views: dict[int, LevelContact] = field(default_factory=dict)
+    _views: dict[int, LevelBodies] = field(default_factory=dict)
 
     @staticmethod
     def begin(
@@ -227,7 +196,7 @@ class FrameContact:
         *,
         origin: np.ndarray,
         settings: ContactSettings,
-    ) -> FrameContact:
+    ) -> FrameBodies:
         """Find the distances of the upsampled cage.
 
         Args:
@@ -245,10 +214,11 @@ class FrameContact:
             offset = torch.as_tensor(each.offset).to(base)[finest.vertex_garment.long()]
             reach = float(offset.max()) + float(levels[0].spacing.mean())
             known = signed_distances(each.surface, base + shift, finest.edges, reach=reach)
+            known = torch.where(offset.isfinite(), known, torch.full_like(known, float("inf")))
             side = _start_sides(each.surface, coarse + shift, finest)
             longest = PINCHED * float(levels[0].spacing.mean())
             tracks.append(_Track(each.surface, shift, offset, side, base, known, longest))
-        return FrameContact(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
+        return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
 
     def measure(
         self, finest: Level, base: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
@@ -264,6 +234,7 @@ class FrameContact:
         for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
             surface, shift = each.surface, track.shift
             after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
+            after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {
                 "before": asdict(penetration(surface, finest, base + shift, before, track.longest)),
@@ -271,7 +242,7 @@ class FrameContact:
             }
         return {"bodies": bodies}
 
-    def at(self, level: Level, finest: Level) -> LevelContact:
+    def at(self, level: Level, finest: Level) -> LevelBodies:
         """The view of one level, the same at each call; its vertices come first among each garment's finest ones."""
         if level.index in self._views:
             return self._views[level.index]
@@ -282,14 +253,14 @@ class FrameContact:
             replace(t, **{name: getattr(t, name)[which].clone() for name in ("offset", "side", "at", "known")})
             for t in self._tracks
         ]
-        self._views[level.index] = LevelContact(level, tracks, self._settings)
+        self._views[level.index] = LevelBodies(level, tracks, self._settings)
         return self._views[level.index]
 
 
 def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"], finest: Level) -> Float[Tensor, " vertices"]:
     """The side on which the cage around each fine vertex lies: 1 or -1, 0 where it is undecided or has no meaning."""
-    if surface.closed:
-        return torch.zeros(finest.vertex_count, dtype=cage.dtype, device=cage.device)
+    if surface.closed or surface.fixed_side is not None:
+        return torch.full((finest.vertex_count,), surface.fixed_side or 0.0, dtype=cage.dtype, device=cage.device)
     found = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
     side = torch.where(found.rim, torch.zeros_like(found.side), found.side)
     return finest.base.apply(side.unsqueeze(1).expand(-1, 3).contiguous())[:, 0].sign()

@@ -12,10 +12,10 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .colliders.base import Nearest, Surface
-from .colliders.mesh import MeshSurface
-from .level import Level
-from .mesh.lanes import Launch
+from ..colliders.base import Nearest, Surface
+from ..colliders.mesh import MeshSurface
+from ..level import Level
+from ..mesh.lanes import Launch
 
 DETOUR = 1.05
 """The nearest face is buried where the way out is longer than this, over the distance to it."""
@@ -64,7 +64,7 @@ def penetration(
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
     """
     free = level.free[:, 0]
-    depth, held = _depths(surface, x, signed, longest)
+    depth, held = depths(surface, x, signed, longest)
     deep = (depth > DEEP) & ~held
     inside = int((deep & free).sum())
     deepest = float((depth * (free & ~held)).max()) if len(depth) else 0.0
@@ -78,10 +78,17 @@ def penetration(
     )
 
 
-def _depths(
-    surface: Surface, x: Tensor, signed: Tensor, longest: float
+def depths(
+    surface: Surface, x: Float[Tensor, "vertices 3"], signed: Float[Tensor, " vertices"], longest: float
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-    """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched."""
+    """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched.
+
+    Args:
+        surface: The surface.
+        x: Positions in its coordinates [m].
+        signed: Signed distances at x, lower bounds where they are positive [m].
+        longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
+    """
     depth, held = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
     within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
     if len(within):

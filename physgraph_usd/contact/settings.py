@@ -1,0 +1,42 @@
+"""How contact is solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from ..level import Level
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """How contact is solved.
+
+    Attributes:
+        form: Against bodies: "quadratic", "linear" as in the paper, or "off".
+        cloth: Of cloth with cloth: "pairs" of points, faces and edges, "spheres" as in the paper, or "off".
+        stiffness: k_c of the quadratic form, in stretch stiffnesses over the square of the cage's mean edge.
+        pressure: k_c over the garment's area of the linear form, in weights of the cloth.
+        rounds: How often in a level's steps closest points are found anew.
+        clearance: Part of the offset that the last projection leaves at least.
+        projections: Most passes of the last projection.
+    """
+
+    form: str = "quadratic"
+    cloth: str = "pairs"
+    stiffness: float = 15.0
+    pressure: float = 5.0
+    rounds: int = 3
+    clearance: float = 0.25
+    projections: int = 10
+
+    def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
+        """The same settings with k_c itself as their stiffness, [N/m^3], or [N] in the linear form.
+
+        Args:
+            cage: The cage.
+            stretch: Stretch stiffness of the cloth [N/m].
+            weight: Its weight per area [N/m^2].
+        """
+        if self.form == "linear":
+            return replace(self, stiffness=self.pressure * weight * float(cage.vertex_area.sum()))
+        return replace(self, stiffness=self.stiffness * stretch / float(cage.spacing.mean()) ** 2)
