@@ -264,9 +264,10 @@ def s36_drift(method: str) -> Result:
     group = group_of(mesh, rest, level=2, integrator=method, steps=12, tolerance=0.0)
     frame, kept, outputs, energies = GarmentFrame(wave(rest), FABRIC, GUIDE), None, [], []
     for _ in range(11):
-        points, kept, telemetry = group.solve([frame], kept, at=None)
-        outputs.append(points[0])
-        energies.append(total(telemetry, "output"))
+        found = group.solve([frame], kept, at=None)
+        kept = found.carried
+        outputs.append(found.points[0])
+        energies.append(total(found.telemetry, "output"))
     changes = [rms(after - before) for before, after in pairwise(outputs)]
     risen = any(after > before + 1e-9 * abs(before) for before, after in pairwise(energies))
     ratio = changes[-1] / changes[0] if changes[0] else 0.0
