@@ -11,12 +11,14 @@ import torch
 
 from .colliders.pose import Pose
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
-from .contact.heat import penetration_map
+from .contact.heat import body_crossings, penetration_map
+from .contact.passed import Passed
 from .detail import Carried, join, split
 from .errors import GarmentError
 from .group import Group, SolveSettings
 from .level import refine_garments
 from .mesh.subdivide import Refinement
+from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State
 
 
@@ -76,6 +78,7 @@ class Refiner:
         self._groups: dict[tuple[int, ...], Group] = {}
         self._scene, self._device, self._heat_map = scene, device, heat_map
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
+        self._passed = Passed(scene.garments, scene.colliders, device=device, lanes=lanes)
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
         self._last: list[_Known | None] = [None] * len(scene.garments)
         self._time: float | None = None
@@ -100,6 +103,7 @@ class Refiner:
 
     def forget(self) -> None:
         """Start the next frame cold."""
+        self._passed.forget()
         self._last = [None] * len(self._last)
         self._time = None
 
@@ -120,6 +124,8 @@ class Refiner:
             wanted: For each garment, whether it is asked for; all when None.
         """
         gap = self._is_gap(frame.time)
+        if gap:
+            self._passed.forget()
         self._bodies.pose(frame.colliders)
         count = len(frame.garments)
         asked = [True] * count if wanted is None else list(wanted)
@@ -140,6 +146,8 @@ class Refiner:
                 if asked[index] and each is not None:
                     points[index], telemetry[index] = each.points, entry
         self._time = frame.time
+        for index, passed in enumerate(self._passed.look(frame)):
+            telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
         heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
@@ -182,9 +190,12 @@ class Refiner:
         garment, chain = self._scene.garments[index], self.refinements[index]
         met = self._bodies.near(garment, bounds_of(points), 0.0)
         surfaces = [each.surface for each in self._bodies.touching(met, [[0.0] * len(met)])]
-        edges = (chain[-1].mesh if chain else garment.mesh).half_edges.edges
+        finest, rest = (chain[-1].mesh, None) if chain else (garment.mesh, garment.rest)
+        triangles = finest.triangulate(rest).triangles
+        edges = edges_of(triangles, len(points)).vertices
         known = self._last[index]
         crossing = np.zeros(len(points), bool) if known is None else known.crossing
+        crossing = crossing | body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
         depth = penetration_map(surfaces, points, edges, device=self._device)
         return {"penetration": depth, "crossing": crossing.astype(np.float32)}
 

@@ -18,6 +18,7 @@ import warp as wp
 
 from . import __version__
 from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
+from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .options import RefineOptions
@@ -227,7 +228,7 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
         start = clock.perf_counter()
         writer.close()
         report.seconds["close"] = clock.perf_counter() - start
-        report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report)
+        report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report) + _passed(report)
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
@@ -254,6 +255,15 @@ def _coarse_garments(report: RefineReport) -> list[str]:
         shares = {time: entry["sharp_folds"] for time, entry in entries.items() if "sharp_folds" in entry}
         said.append(too_coarse(garment["path"], garment["level"], shares))
     return [warning for warning in said if warning]
+
+
+def _passed(report: RefineReport) -> list[str]:
+    """A warning for each body that a coarse garment passes right through."""
+    said = []
+    for index, garment in enumerate(report.garments):
+        entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
+        said += told(garment["path"], {t: e["passed_through"] for t, e in entries.items() if "passed_through" in e})
+    return said
 
 
 def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +28,8 @@ def garment_of(mesh: PolygonMesh, rest: np.ndarray, *, bent: bool = False, **pai
     """A garment with unit paint and no pins unless given."""
     one = np.ones(mesh.vertex_count)
     paint = {"stretch_scale": one, "bend_scale": one, "guide_scale": one, "detail_scale": one, "pin": 0 * one}
-    return replace(Garment("/World/Sheet", mesh, rest, 0, False, bent, **paint), **painted)
+    values: dict[str, Any] = paint | painted
+    return Garment("/World/Sheet", mesh, rest, 0, False, bent, **values)
 
 
 def level_of(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import ball, distances, tube
+from cloth import sheet
 from layers import COAT, TIMES, errors, fine_points, make_shot, open_over, refine_all
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, cloth_shot, faults, refine
@@ -19,8 +20,9 @@ from physgraph_usd.chunks import Outcome, _collect, _solve_chunk
 from physgraph_usd.colliders.mesh import MeshBody
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.colliders.primitives import ShapeSurface
-from physgraph_usd.contact.heat import penetration_map
+from physgraph_usd.contact.heat import body_crossings, penetration_map
 from physgraph_usd.errors import LayerError
+from physgraph_usd.mesh.topology import edges_of
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.validate import validate_layer
@@ -61,6 +63,49 @@ class TestPenetration:
         (surface,) = MeshBody(side=side, device="cpu", lanes=1).pose(MeshPose(*tube(around=256)))
         found = penetration_map([surface], np.array([[0.08, 0.0, 0.0]]), NO_EDGES)
         assert found[0] == pytest.approx(depth, abs=0.1)
+
+
+class TestCrossings:
+    def test_a_sheet_through_a_mesh_marks_what_crosses(self):
+        """A level sheet through a ball: its edges between inside and outside, and nothing away from the surface."""
+        x, faces = level_sheet()
+        soup = ball(0.2, level=3)
+        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))
+        edges = edges_of(faces, len(x)).vertices
+        found = body_crossings([surface], x, edges, triangles=faces)
+        radius = np.linalg.norm(x, axis=1)[edges]
+        through = (radius.min(axis=1) < 0.199) & (radius.max(axis=1) > 0.2)
+        assert through.sum() > 20
+        assert found[edges[through].ravel()].all()
+        away = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 0.075
+        assert away.sum() > 80
+        assert not found[away].any()
+
+    def test_a_spike_through_the_middle_of_a_face_marks_its_corners(self):
+        x, faces = level_sheet()
+        at = x[faces[7]].mean(axis=0)
+        normal = np.eye(3)[np.ptp(x, axis=0).argmin()]
+        base = np.array([[1e-3, 1e-3, 1e-3], [-1e-3, 1e-3, -1e-3], [1e-3, -1e-3, -1e-3]])
+        spike = np.concatenate([[0.3 * normal], base - 0.3 * normal]) + at
+        sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [3, 2, 1]])
+        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(spike, sides))
+        found = body_crossings([surface], x, edges_of(faces, len(x)).vertices, triangles=faces)
+        assert np.flatnonzero(found).tolist() == sorted(faces[7].tolist())
+
+    def test_of_a_primitive_edges_with_one_end_inside(self):
+        x, faces = level_sheet()
+        edges = edges_of(faces, len(x)).vertices
+        found = body_crossings([sphere(0.2)], x, edges, triangles=faces)
+        inside = (np.linalg.norm(x, axis=1) < 0.2)[edges]
+        expected = np.zeros(len(x), bool)
+        expected[edges[inside[:, 0] != inside[:, 1]].ravel()] = True
+        np.testing.assert_array_equal(found, expected)
+
+
+def level_sheet() -> tuple[np.ndarray, np.ndarray]:
+    """Points and triangles of a sheet in a plane through the origin."""
+    mesh, rest = sheet(12, 12, 0.05)
+    return rest - rest.mean(axis=0) + 1e-3, np.asarray(mesh.triangulate(None).triangles)
 
 
 def write(shot_file: Path, out: Path, heat: Mapping[Any, dict[str, Any] | None], **options: object) -> Path:
@@ -205,6 +250,10 @@ class TestShots:
             away = np.linalg.norm(points - 0.05 * np.array([2.0, 2.0, time - 3.0]), axis=1)
             np.testing.assert_allclose(found, 1e3 * np.maximum(0.075 - away, 0.0), atol=1e-3)
             deepest = max(deepest, float(found.max()))
+            crossing = values(stage, "crossing", time, path=CLOTH)
+            assert crossing is not None
+            assert set(np.unique(crossing)) <= {0.0, 1.0}
+            assert crossing.any() == (contact == "off" and time == 3.0)
         assert (deepest > 1.0) == (contact == "off")
 
     def test_a_body_moving_through_cloth_at_rest_shows(self, tmp_path: Path):

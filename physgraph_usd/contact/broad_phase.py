@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -49,7 +50,8 @@ class Parts:
                 near[a, b] = touch_one_another(self._garments[a], self._garments[b]) and self._close(
                     a, b, frames, trees
                 )
-        labels = csgraph.connected_components(sparse.csr_matrix(near), directed=False)  # pyright: ignore[reportArgumentType][1]
+        graph: Any = sparse.csr_matrix(near)
+        labels = csgraph.connected_components(graph, directed=False)[1]
         return [tuple(np.flatnonzero(labels == label).tolist()) for label in dict.fromkeys(labels.tolist())]
 
     def _close(self, a: int, b: int, frames: Sequence[GarmentFrame], trees: dict[int, cKDTree]) -> bool:

@@ -176,7 +176,7 @@ class ClothView:
         shift = x - good.x
         for attempt in range(MENDS):
             corners = self._mesh.corners_of(state.crossings)
-            too_many = state.crossings.count > good.crossings.count
+            too_many = self._excess(state, good) > 0
             new = torch.ones_like(corners[:, 0], dtype=torch.bool) if too_many else ~zone[corners].all(dim=1)
             if not bool(new.any()) or (attempt >= SMOOTHINGS and not too_many):
                 return best
@@ -187,12 +187,17 @@ class ClothView:
             else:
                 shift = shift * self._falling_off(back, attempt - SMOOTHINGS + 1)
             state = self.look(good.x + shift)
-            best = min(best, state, key=lambda each: each.crossings.count)
+            best = min(best, state, key=lambda each: (self._excess(each, good), each.crossings.count))
         return best
 
     def worse(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether more crosses than in the upsampled cage."""
-        return self.look(x).crossings.count > self.before.crossings.count
+        """Whether more crosses than in the upsampled cage, in all or between garments."""
+        return self._excess(self.look(x), self.before) > 0
+
+    def _excess(self, state: ClothState, good: ClothState) -> int:
+        """By how much more crosses than in good positions, in all or between garments."""
+        apart = [int(np.triu(self._mesh.between(each.crossings), 1).sum()) for each in (state, good)]
+        return max(state.crossings.count - good.crossings.count, apart[0] - apart[1], 0)
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, dict[str, int]], Bool[Tensor, " vertices"]]:
         """What crosses before and after, as plain values, and the vertices of what does after; nothing where no part
@@ -247,9 +252,9 @@ class ClothView:
         kept = (~self._corners(crossings)[corners].any(dim=1) & ~undecided) | ordered
         pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
         corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
+        start = x if self._sides is None else self._sides
         way, at_input, at_start = (
-            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1)
-            for at in (x, self._base, x if self._sides is None else self._sides)
+            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, start)
         )
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
         distance = at_input.norm(dim=1)

@@ -19,6 +19,7 @@ class ContactSettings:
         rounds: How often in a level's steps closest points are found anew.
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
+        lifts: How often it moves cloth farther out where a body comes through it.
     """
 
     form: str = "quadratic"
@@ -28,6 +29,7 @@ class ContactSettings:
     rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
+    lifts: int = 5
 
     def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
         """The same settings with k_c itself as their stiffness, [N/m^3], or [N] in the linear form.

@@ -17,6 +17,7 @@ SAMPLES: dict[str, str] = {
     "tshirt": "quads with UVs, two materials and skinning that shows the armpit artefact",
     "flag": "quads in the wind, pinned on one edge, no collider",
     "frozen": "a cloth draped over a table, twelve equal samples",
+    "armpit": "a T-shirt pinched between the side and an arm that goes down and up again",
     "layers": "trousers, a shirt over them and a belt over both, on a body that walks in place",
     "block": "a sheet dropped over a block, folding at its corners",
     "torus": "a sheet pulled through a torus by a grip on its middle",

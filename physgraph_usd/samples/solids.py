@@ -103,22 +103,6 @@ def ellipsoid(axes: np.ndarray, middle: np.ndarray, cells: tuple[int, int]) -> S
     return lathe(middle + axes * rings, middle + axes * np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]))
 
 
-def off_ellipsoid(points: np.ndarray, axes: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Move points that are inside an ellipsoid away from its centre, to its surface.
-
-    Args:
-        points: Positions [m], shape (V, 3).
-        axes: Half axes [m], shape (3,).
-        middle: Its centre [m], shape (3,).
-
-    Returns:
-        The positions [m], shape (V, 3).
-    """
-    away = points - middle
-    reach = np.maximum(np.linalg.norm(away / axes, axis=1, keepdims=True), 1e-6)
-    return np.where(reach < 1.0, middle + away / reach, points)
-
-
 def off_box(points: np.ndarray, half: np.ndarray, gap: float) -> np.ndarray:
     """Move points that are closer to a box about the origin than a gap straight out.
 
