@@ -94,7 +94,7 @@ CASES = (
     Case(36, "ten passes over its own output", "energy falls, changes decay", solver.s36_drift),
     Case(37, "guarded; and adversaries under the guard", "energy never rises", solver.s37_guard, stages.s37_adversary),
     Case(38, "constants, cantilever on three kinds of mesh", "5 %", once=stages.s38_analytic),
-    Case(39, "coarse mesh that cannot show the folds", "warned, and only then", once=stages.s39_locking),
+    Case(39, "waves of 0.5, 1, 2, 3 and 8 edges", "warned under four edges", once=stages.s39_locking),
     Case(40, "every force against differences of its energy", "1e-6", once=stages.s40_gradients),
 )
 
