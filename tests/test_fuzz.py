@@ -1,4 +1,4 @@
-"""Some hundred and fifty mutants in this process, and the machinery of the fuzzer: `python -m tests.fuzz` runs thousands."""
+"""A hundred and fifty mutants in this process, and the fuzzer's machinery: `python -m tests.fuzz` runs thousands."""
 
 from __future__ import annotations
 
