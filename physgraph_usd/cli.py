@@ -130,6 +130,7 @@ solve_options = _together(
     click.option("--device", metavar="cpu|cuda", help="Where to compute."),
     click.option("--potential", type=click.Choice(["continuum", "paper"]), help="Which form of the energy."),
     click.option("--contact", type=click.Choice(["quadratic", "paper", "off"]), help="How bodies push the cloth."),
+    click.option("--self-contact", type=click.Choice(["auto", "paper", "off"]), help="How cloth pushes cloth."),
     click.option("--temporal", type=click.Choice(["tether", "warm", "off"]), help="How a frame uses the last one."),
     click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes that share the frames."),
 )

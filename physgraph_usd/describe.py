@@ -134,6 +134,9 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     if _touching(opened) and options.contact != "off":
         bodies = ", ".join(_touching(opened))
         modelled["contact"] = f"{options.contact} form, with {bodies}, in frames where it is near"
+    if options.self_contact != "off":
+        form = {"auto": "pairs of points", "paper": "spheres"}[options.self_contact]
+        modelled["self contact"] = f"{form}, where parts come near one another; garments that do are solved together"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
@@ -172,9 +175,11 @@ def _why_no_contact(opened: Shot) -> str:
 
 def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
-        "self contact": "not in this version",
         "network": "not in this version; quasi-Newton integrates",
+        "friction": "out of scope: shapes at rest under pressure alone; the guide and the tether hold cloth in place",
     }
+    if "self contact" not in report.modelled:
+        left_out["self contact"] = "switched off by --self-contact"
     if "contact" not in report.modelled:
         left_out["contact"] = _why_no_contact(opened)
     if "membrane" not in report.modelled:

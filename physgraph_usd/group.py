@@ -40,8 +40,6 @@ LEAST_STRAIN = 1e-2
 UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
-REFACTORED = 8000
-"""Vertices up to which a level's metric takes up the stiffness of what touches; above, factorising costs too much."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
 COARSE_TOLERANCE = 0.1
@@ -325,8 +323,7 @@ class Group:
         """Solve one level, in rounds where something is near; returns the contact terms too."""
 
         def system(touched: Sequence[Touch], at: Tensor) -> System:
-            stiff = [3.0 * term.diagonal(at) for term in touched] if level.vertex_count <= REFACTORED else []
-            held = metric.plus(torch.stack(stiff).sum(dim=0)) if stiff else metric
+            held = metric if view is None else view.metric(metric, touched, at)
             return System(ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing)
 
         integrator = self._settings.method.build()

@@ -18,6 +18,8 @@ POTENTIALS = ("continuum", "paper")
 MODES = ("over", "sibling")
 CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
 """Forms of contact by their names on the command line."""
+SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
+"""Forms of contact of cloth with cloth by their names on the command line."""
 _NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
 
 
@@ -39,7 +41,8 @@ class RefineOptions:
         mode: "over" or "sibling".
         temporal: "tether", "warm" or "off": how a frame uses the last one.
         potential: "continuum" or "paper".
-        contact: "quadratic", "paper" (its linear form) or "off".
+        contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
+        self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
         workers: Processes that share the frames.
         report: JSON file to write, or None.
         overwrite: Replace files that exist.
@@ -65,6 +68,7 @@ class RefineOptions:
     temporal: str = "tether"
     potential: str = "continuum"
     contact: str = "quadratic"
+    self_contact: str = "auto"
     workers: int = 1
     report: Path | None = None
     overwrite: bool = False
@@ -82,6 +86,10 @@ class RefineOptions:
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
+    def contact_settings(self) -> ContactSettings:
+        """The part that concerns contact."""
+        return ContactSettings(CONTACTS[self.contact], cloth=SELF_CONTACTS[self.self_contact])
+
     def solve_settings(self) -> SolveSettings:
         """The part that concerns the solver."""
         return SolveSettings(
@@ -91,7 +99,7 @@ class RefineOptions:
             budget_ms=self.budget_ms,
             temporal=self.temporal,
             potential=self.potential,
-            contact=ContactSettings(CONTACTS[self.contact]),
+            contact=self.contact_settings(),
         )
 
     def check(self) -> None:
@@ -106,6 +114,7 @@ class RefineOptions:
             ("potential", self.potential, POTENTIALS),
             ("mode", self.mode, MODES),
             ("contact", self.contact, tuple(CONTACTS)),
+            ("self contact", self.self_contact, tuple(SELF_CONTACTS)),
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")

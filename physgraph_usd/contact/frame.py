@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..forces.contact import Contact
 from ..forces.self_contact import SelfContact, Spheres
+from ..integrate.metric import Metric
 from ..level import Level
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
@@ -22,7 +23,13 @@ Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
 
 
-@dataclass(frozen=True, eq=False)
+CHANGED = 0.3
+"""Part of the stiffness of what touches that may change before a metric is factorised anew."""
+REFACTORED = 60_000
+"""Vertices up to which a level's metric takes up the stiffness of what touches; above, factorising costs too much."""
+
+
+@dataclass(eq=False)
 class LevelContact:
     """One level's view of what it may touch.
 
@@ -35,6 +42,17 @@ class LevelContact:
     bodies: LevelBodies | None
     cloth: ClothView | None
     rounds: int
+    _held: tuple[Tensor, Metric] | None = None
+
+    def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric:
+        """The metric of a level whose cloth is held by what touches at x [m]; the same one while little changes."""
+        if not terms or len(x) > REFACTORED:
+            return plain
+        # A plane holds in one direction of three; the metric knows none, so it takes the whole stiffness.
+        stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
+        if self._held is None or float((stiff - self._held[0]).abs().sum()) > CHANGED * float(stiff.sum()):
+            self._held = (stiff, plain.plus(stiff))
+        return self._held[1]
 
     @property
     def tangled(self) -> bool:
@@ -81,8 +99,8 @@ class FrameContact:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             cloth = None
             if self._cloth is not None:
-                base, stiffness = level.base.apply(self._coarse), self._settings.stiffness
-                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, stiffness=stiffness)
+                base = level.base.apply(self._coarse)
+                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds)
         return self._views[level.index]
 
