@@ -125,7 +125,8 @@ def s7_units(method: str) -> Result:
     mesh, rest = sheet(6, 4)
     points, scale = wave(rest), 0.01
     one = solved(mesh, rest, points, level=2, integrator=method).points[0]
-    fabric = Fabric(FABRIC.stretch, FABRIC.bend * scale**2, FABRIC.density / scale)
+    thickness = FABRIC.thickness * scale
+    fabric = Fabric(FABRIC.stretch, FABRIC.bend * scale**2, FABRIC.density / scale, thickness)
     frame = frame_of(scale * points, fabric=fabric, guide=GUIDE / scale**2)
     two = refiner_of([garment_of(mesh, scale * rest)], level=2, integrator=method).solve(frame).points[0]
     return under(rms(two / scale - one) / (EDGE / 4), 1e-4, " edges")

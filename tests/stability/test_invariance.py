@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cloth import DOWN, base_of, frame_of, refiner_of, rms, sheet, solved, wave
+from cloth import DOWN, FABRIC, base_of, frame_of, refiner_of, rms, sheet, solved, wave
 from meshes import grid, mesh_of
 from sheets import garment_of, rotation
 
@@ -94,7 +94,7 @@ def test_s7_the_same_cloth_at_another_size(scale: float, integrator: str):
     points = wave(rest)
     options = {"level": 2, "dtype": torch.float64, "integrator": integrator}
     one = solved(mesh, rest, points, **options).points[0]
-    fabric = Fabric(30.0, 4.7e-6 * scale**2, 0.187 / scale)
+    fabric = Fabric(30.0, 4.7e-6 * scale**2, 0.187 / scale, FABRIC.thickness * scale)
     frame = frame_of(scale * points, fabric=fabric, guide=2000.0 / scale**2)
     two = refiner_of([garment_of(mesh, scale * rest)], **options).solve(frame).points[0]
     assert rms(two / scale - one) < 1e-6 * EDGE / 4
