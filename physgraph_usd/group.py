@@ -279,7 +279,7 @@ class Group:
         """What a frame's cloth may touch, or None when there is nothing."""
         settings = self._settings.contact
         cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
-        if not len(coarse) or (cloth is None and not touching):
+        if not len(self.levels[0].triangles) or (cloth is None and not touching):
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
         settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
