@@ -79,7 +79,7 @@ class TestVertexFace:
         soup, rest = Soup.of(level, x), level.rest.double().numpy()
         pairs = moved(level, x).pairs(everything(level), reach(level))
         found = found_faces(soup, pairs)
-        near: np.ndarray = beside(soup)[:, soup.faces].any(axis=2)
+        near = np.asarray(beside(soup)[:, soup.faces].any(axis=2))
         normal, tally = normals(soup), 0
         for v, point in enumerate(soup.x):
             corners = [soup.x[soup.faces[:, i]] for i in range(3)]
