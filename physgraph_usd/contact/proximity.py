@@ -75,6 +75,12 @@ def is_inside(s: float, t: float):
 
 
 @wp.func
+def between(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, g: wp.vec2i, s: float, t: float):
+    """From the place t on edge g to the place s on edge e."""
+    return (1.0 - s) * x[e[0]] + s * x[e[1]] - (1.0 - t) * x[g[0]] - t * x[g[1]]
+
+
+@wp.func
 def belongs(distance: float, rest_distance: float, cosine: float):
     """Whether a part of the same garment is a neighbour in the plane, where it belongs."""
     return wp.abs(cosine) < IN_PLANE and distance > CLOSED_IN * rest_distance
@@ -167,8 +173,7 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
     e = ask[i]
     a, b = edges[e][0], edges[e][1]
     far = 0.5 * (reach[a] + reach[b])
-    n = normal[a] + normal[b]
-    n = n / wp.max(wp.length(n), 1.0e-20)
+    n = wp.normalize(normal[a] + normal[b])
     best_up = wp.float32(far)
     best_down = wp.float32(far)
     up = wp.int32(-1)
@@ -190,11 +195,9 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
                 continue
             if are_beside(edges[e], edges[g], starts, ring):
                 continue
-            way = (1.0 - s) * x[a] + s * x[b] - (1.0 - t) * x[c] - t * x[d]
-            cosine = wp.dot(way, n) / distance
+            cosine = wp.dot(between(x, edges[e], edges[g], s, t), n) / distance
             if garment[a] == garment[c]:
-                at_rest = (1.0 - s) * rest[a] + s * rest[b] - (1.0 - t) * rest[c] - t * rest[d]
-                if belongs(distance, wp.length(at_rest), cosine):
+                if belongs(distance, wp.length(between(rest, edges[e], edges[g], s, t)), cosine):
                     continue
             if cosine > 0.0:
                 if distance < best_up:
