@@ -16,6 +16,7 @@ from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
 from .contact.rounds import solve_rounds, untangle
+from .contact.seams import Seams
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
@@ -279,7 +280,10 @@ class Group:
         """What a frame's cloth may touch, or None when there is nothing."""
         settings = self._settings.contact
         cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
-        if not len(self.levels[0].triangles) or (cloth is None and not touching):
+        if not len(self.levels[0].triangles):
+            return None
+        seams = Seams.find(self.levels[0], coarse, self._stretch) if settings.cloth != "off" else None
+        if cloth is None and not touching and seams is None:
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
         settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
@@ -287,7 +291,9 @@ class Group:
         if touching:
             bodies = FrameBodies.begin(self.levels, touching, coarse, origin=origin, settings=settings)
         thickness = [frame.fabric.thickness for frame in frames]
-        return FrameContact(self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings)
+        return FrameContact(
+            self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings, seams=seams
+        )
 
     def _descend(
         self,
