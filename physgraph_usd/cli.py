@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
-EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview"}
+EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview", "matplotlib": "chart", "plotly": "chart"}
 """Which extra brings a module that only some commands need."""
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
@@ -257,6 +257,27 @@ def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) 
     click.echo(draw(layer, out, times=times or None, **options))
 
 
+@main.command()
+@shot_argument
+@out_option("DIR", "Folder to write into; a chart that was begun there goes on.")
+@scene_options
+@click.option("--device", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--method", "methods", multiple=True, metavar="NAME", help="Integrator to measure; repeatable.")
+@click.option("--count", type=click.IntRange(min=1), metavar="N", help="Frames to measure.")
+@click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="How often each time is taken.")
+@click.option("--short", is_flag=True, help="Take less than 15 minutes.")
+@click.option("--budget-minutes", type=float, metavar="M", help="Plan with this time.")
+@overwrite_option
+def chart(shot: str, out: Path, **options: Any) -> None:
+    """Measure SHOT's frames by every method, draw speed against accuracy, and print a summary."""
+    from .chart.options import ChartOptions
+    from .chart.run import chart_shot
+
+    given = {name: value for name, value in options.items() if value not in (None, ())}
+    done = chart_shot(shot, out, ChartOptions(**given, progress=_tell))
+    click.echo("\n".join(done.lines()))
+
+
 @main.command("schema-path")
 def schema_path() -> None:
     """Print the folder of the schemas, for PXR_PLUGINPATH_NAME."""
@@ -338,6 +359,12 @@ def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(done - bar.pos)
 
         yield show
+
+
+def _tell(part: float, seconds: float, what: str) -> None:
+    """One line of progress on stderr."""
+    left = f"about {seconds / 60.0:.0f} min left" if seconds > 90.0 else f"about {seconds:.0f} s left"
+    click.echo(f"{part:4.0%}  {left:20s}  {what}", err=True)
 
 
 def _outline(value: Any, indent: str = "") -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -189,6 +190,28 @@ class Group:
         return [
             System(m, lasting.metric, free=level.free, spacing=level.spacing) for level, lasting, m in parts
         ], coarse
+
+    def use(self, settings: SolveSettings) -> None:
+        """Solve the frames that follow in another way; levels and metrics are kept."""
+        if settings.potential != self._settings.potential:
+            self._material = ()
+        self._settings = settings
+
+    def judge(
+        self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], *, touching: Sequence[Touching] = ()
+    ) -> dict[str, Any]:
+        """Energy of each term [J], strain and contact of given fine positions [m], whoever computed them."""
+        world = np.concatenate([frame.points for frame in frames])
+        origin = world.mean(axis=0)
+        coarse, x = self._tensor(world - origin), self._tensor(np.concatenate(points) - origin)
+        finest, module = self.levels[-1], self._forces_for(frames)[-1].module(coarse)
+        found: dict[str, Any] = {"energy_joules": module.energies(x), "strain": edge_strain(finest, x)}
+        contact = self._contact(touching, coarse, origin, frames)
+        if contact is not None:
+            term = contact.at(finest, finest).term(x)
+            found["energy_joules"]["contact"] = 0.0 if term is None else float(term.add_force(x, torch.zeros_like(x)))
+            found |= contact.measure(finest, finest.base.apply(coarse), x)
+        return found
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""

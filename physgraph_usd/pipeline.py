@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from .colliders.pose import Pose
+from .contact.bodies import Touching
 from .contact.broad_phase import Bodies, bounds_of, reach_of
 from .detail import Carried
 from .errors import GarmentError
@@ -86,6 +87,19 @@ class Refiner:
         """Start the next frame cold."""
         self._last = [None] * len(self.groups)
         self._time = None
+
+    def use(self, settings: SolveSettings) -> None:
+        """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
+        self._settings = settings
+        for group in self.groups:
+            group.use(settings)
+        self.forget()
+
+    def touching(self, index: int, frame: Frame) -> tuple[Touching, ...]:
+        """The surfaces that a garment may touch in a frame."""
+        self._bodies.pose(frame.colliders)
+        garment = frame.garments[index]
+        return self._bodies.touching(self._near(index, garment), [garment.offset])
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
         """Solve frames in order, one state a frame.
