@@ -50,7 +50,7 @@ def measure_curves(
         began = clock.spent
         alive = {curve.name: curve for curve in curves}
         for done, steps in enumerate(rungs(plan.growth), start=1):
-            if steps == first_above:
+            if steps == (first_above if repeat else 1):
                 bench.run(DEFAULT, None, COLD.steps, repeat=repeat)
             for name, curve in list(alive.items()):
                 if clock.late and (repeat or done > 1):
@@ -104,23 +104,23 @@ class _Bench:
             settings = replace(settings, method=curve.method, steps=steps, tolerance=0.0)
             about = {"integrator": curve.integrator, "nested": curve.method.nested}
         for frame in self._frames:
-            if self._journal.one("point", method=name, steps=steps, frame=frame.time, repeat=repeat):
+            key = {"method": name, "steps": steps, "frame": frame.time}
+            if self._journal.one("point", repeat=repeat, **key) or self._journal.one("failed", **key):
                 continue
             self._clock.say(f"{name}, {steps} steps, turn {repeat + 1} of {self._plan.repeats}")
             try:
                 solved = self._timed.solve(frame, settings)
             except SolveError as error:
-                self._journal.add("failed", method=name, steps=steps, frame=frame.time, error=str(error))
+                self._journal.add("failed", error=str(error), **key)
                 continue
             found = {} if repeat else asdict(self._judge.judge(frame, solved.points))
-            self._add(name, frame, solved.milliseconds, steps=steps, repeat=repeat, made=solved.steps, **about, **found)
+            found |= {"made": solved.steps, "waited": solved.waited}
+            self._add(name, frame, solved.milliseconds, steps=steps, repeat=repeat, **about, **found)
 
     def is_done(self, name: str, steps: int, *, growth: float) -> bool:
         """Whether a method's next rung would take too long, or gets nowhere."""
         rows = self._journal.rows("point", method=name, repeat=0)
         last = [row for row in rows if row["steps"] == steps]
-        if not last:
-            return True
         if len(last) < len(self._frames):
             return True
         spent = sum(row["ms"] for row in last) / len(last)

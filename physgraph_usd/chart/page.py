@@ -13,9 +13,10 @@ from plotly.subplots import make_subplots
 from .methods import DEFAULT, SMOOTH, UPSAMPLED
 from .styles import Style, styles
 from .table import Chart
-from .words import changes, figures, percent, settings, title
+from .words import FAR, changes, figures, percent, settings, title
 
 FLOOR = 1e-5
+TICKS = [1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001]
 SIGNS = {DEFAULT: "star", UPSAMPLED: "square", SMOOTH: "diamond"}
 PANELS = (
     ("gap", "energy gap (Phi - Phi*) / (Phi0 - Phi*)"),
@@ -72,9 +73,9 @@ def _figure(chart: Chart) -> go.Figure:
         for name in chart.methods:
             figure.add_trace(_trace(chart, name, look[name], field=field, first=row == 1), row=row, col=1)
         figure.update_yaxes(title_text=words, row=row, col=1)
-    figure.update_xaxes(type="log")
+    figure.update_xaxes(type="log", dtick=1, minor={"dtick": "D1", "showgrid": True})
     figure.update_xaxes(title_text="milliseconds a frame", row=len(panels), col=1)
-    figure.update_yaxes(type="log", tickformat="~p", row=1, col=1)
+    figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=1, col=1)
     figure.update_layout(
         height=480 + 240 * (len(panels) - 1),
         template="plotly_white",
@@ -117,6 +118,8 @@ def _lead(chart: Chart) -> str:
     if times:
         order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in times.items())
         said.append(f"To a gap of 3%: {order}.")
+    if chart.busy:
+        said.append(f"Warning: {chart.busy}.")
     return f"<p>{html.escape(' '.join(said))}</p>"
 
 
@@ -126,7 +129,8 @@ def _terms(chart: Chart) -> str:
     if not found:
         return ""
     rows = [
-        (each.name, f"{each.cost_ms:.1f}", percent(each.share), f"{each.moved_mm:.3f}", each.buys) for each in found
+        (each.name, f"{each.cost_ms:.1f}", percent(each.share), _millimetres(each.moved_mm), each.buys)
+        for each in found
     ]
     return (
         "<h2>What each part of the model costs and buys</h2>"
@@ -134,6 +138,10 @@ def _terms(chart: Chart) -> str:
         + "<p class='note'>By refine's default, with the part less without it; a level less the one below it. The "
         "result moves by the RMS distance between the two; gaps are by the full potential at the finest level.</p>"
     )
+
+
+def _millimetres(moved: float) -> str:
+    return "-" if moved > FAR else f"{moved:.3f}"
 
 
 def _notes(chart: Chart) -> str:

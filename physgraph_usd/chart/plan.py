@@ -100,7 +100,7 @@ class Clock:
 
     def expect(self, seconds: float) -> None:
         """Correct the time that all of it will take."""
-        self.expected = seconds
+        self.expected = seconds if self._minutes is None else min(seconds, 60.0 * self._minutes)
 
     def say(self, what: str) -> None:
         """Tell what is being measured."""

@@ -8,12 +8,12 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator, SymmetricalLogLocator
 
 from .methods import DEFAULT, SMOOTH, UPSAMPLED
 from .styles import Style, styles
 from .table import Chart, Point
-from .words import Change, changes, percent, title
+from .words import FAR, Change, changes, percent, title
 
 FLOOR = 1e-4
 """Least gap that is drawn: Phi* itself is known no better."""
@@ -60,7 +60,7 @@ def _figure(chart: Chart) -> Figure:
     if chart.has_bodies:
         _contacts(parts[1].subplots(1, 2), chart, look)
     if steps:
-        _terms(parts[-1].subplots(1, 2, sharey=True), steps)
+        _terms(parts[-1].subplots(1, 3, sharey=True, width_ratios=[1.0, 1.0, 1.5]), steps)
     return figure
 
 
@@ -112,19 +112,25 @@ def _contacts(panels: Any, chart: Chart, look: dict[str, Style]) -> None:
 def _terms(panels: Any, steps: list[Change]) -> None:
     """What each part of the model costs and buys."""
     places = list(range(len(steps)))[::-1]
-    cost, buys = panels
-    cost.barh(places, [each.cost_ms for each in steps], color="#0072b2", height=0.6)
-    cost.set(yticks=places, title="Costs, or saves where negative [ms a frame]")
-    cost.set_yticklabels([each.name for each in steps])
-    buys.barh(places, [each.moved_mm for each in steps], color="#009e73", height=0.6)
-    buys.set(title="Moves the result by [mm, RMS]", xscale="symlog")
-    buys.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    for axes, values in ((cost, [each.cost_ms for each in steps]), (buys, [each.moved_mm for each in steps])):
+    cost, buys, said = panels
+    for axes, values, colour, digits in (
+        (cost, [each.cost_ms for each in steps], "#0072b2", 0),
+        (buys, [min(each.moved_mm, FAR) for each in steps], "#009e73", 2),
+    ):
+        axes.barh(places, values, color=colour, height=0.6)
         axes.grid(visible=False, axis="y")
-        for place, value, each in zip(places, values, steps, strict=True):
-            note = f" {value:.0f}" if axes is cost else f" {value:.2f}   {each.buys}"
-            axes.text(max(value, 0.0), place, note, va="center", fontsize=7.5, color="#444444")
-    reach = max((each.moved_mm for each in steps), default=1.0)
-    buys.set_xlim(0, max(reach, 1.0) * 60.0)
+        axes.xaxis.set_major_locator(MaxNLocator(4) if axes is cost else SymmetricalLogLocator(base=10, linthresh=1))
+        for place, value in zip(places, values, strict=True):
+            told = f" over {value:.0f}" if value == FAR else f" {value:.{digits}f}"
+            axes.text(max(value, 0.0), place, told, va="center", fontsize=7.5, color="#444444")
+    cost.set(yticks=places, title="Costs [ms a frame]")
+    cost.set_yticklabels([each.name for each in steps])
+    cost.margins(x=0.25)
     cost.axvline(0.0, color="#888888", linewidth=0.8)
-    cost.margins(x=0.15)
+    buys.set(title="Moves the result [mm]", xscale="symlog")
+    buys.set_xlim(0, 8.0 * max(1.0, *(min(each.moved_mm, FAR) for each in steps)))
+    buys.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    said.set(title="Buys")
+    said.axis("off")
+    for place, each in zip(places, steps, strict=True):
+        said.text(0.0, place, each.buys, va="center", fontsize=7.5, color="#444444", in_layout=False)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,11 +32,13 @@ class Solved:
         points: Fine world positions [m] of each garment.
         milliseconds: Wall time of preparing and solving the frame, without reading, writing and telemetry.
         steps: Steps made at the finest levels.
+        waited: Milliseconds that its threads waited for a core that others had, or None where that is not known.
     """
 
     points: tuple[np.ndarray, ...]
     milliseconds: float
     steps: int
+    waited: float | None
 
 
 @dataclass(frozen=True)
@@ -100,11 +104,14 @@ class Problem:
 
     def next(self, frame: Frame) -> Solved:
         """Solve a frame from where the last one ended, with the settings in use."""
+        before = _waited()
         state = self.refiner.solve(frame)
+        after = _waited()
         spent = [entry.get("milliseconds") or {"prepare": 0.0, "solve": 0.0} for entry in state.telemetry]
         milliseconds = sum(each["prepare"] + each["solve"] for each in spent)  # type: ignore[index]
         steps = [level["steps"] for entry in state.telemetry for level in entry.get("levels", [])[-1:]]  # type: ignore
-        return Solved(tuple(p for p in state.points if p is not None), milliseconds, sum(steps))
+        waited = None if before is None or after is None else after - before
+        return Solved(tuple(p for p in state.points if p is not None), milliseconds, sum(steps), waited)
 
     def go_on(
         self, frame: Frame, settings: SolveSettings, kept: Sequence[Carried | None]
@@ -160,3 +167,15 @@ def plain_detail(frame: Frame) -> Frame:
 def with_garments(frame: Frame, change: Callable[[Any], Any]) -> Frame:
     """A frame with every garment's values changed."""
     return replace(frame, garments=tuple(change(garment) for garment in frame.garments))
+
+
+def _waited() -> float | None:
+    """Milliseconds that this process's threads have been ready to run and had no core; Linux alone tells."""
+    tasks = Path("/proc/self/task")
+    if not tasks.is_dir():
+        return None
+    total = 0
+    for file in tasks.glob("*/schedstat"):
+        with suppress(FileNotFoundError, ProcessLookupError):
+            total += int(file.read_text().split()[1])
+    return 1e-6 * total

@@ -19,6 +19,8 @@ GAPS = (0.1, 0.03, 0.01)
 """Gaps to which the time is told."""
 TOLERANCE = 1.1
 """Times that differ by less than this factor count as equal: medians of a few runs are no better."""
+BUSY = 0.1
+"""Time waited for a core, over the time measured, from which a reader is told."""
 TINY = 1e-12
 
 
@@ -92,6 +94,14 @@ class Chart:
         """Names of the curves, the most accurate ones first."""
         names = dict.fromkeys(point.method for point in self.points)
         return tuple(sorted(names, key=lambda name: min(p.gap for p in self.points if p.method == name)))
+
+    @property
+    def busy(self) -> str:
+        """A warning where other programs had the cores, or ""."""
+        waited = self.about["waited"]
+        if waited < BUSY:
+            return ""
+        return f"the machine was busy: threads waited for a core {waited:.0%} of the time, so trust no single time"
 
     @property
     def has_bodies(self) -> bool:
@@ -170,6 +180,8 @@ class Chart:
                 f"refine's default: {place['gap']:.2%} in {place['ms']:.0f} ms, {place['ratio']:.2f} times the "
                 f"{place['fastest_ms']:.0f} ms of the fastest to that gap ({place['fastest']}): {where}"
             )
+        if self.busy:
+            yield self.busy
 
 
 def typical(times: Sequence[float]) -> float:
@@ -189,6 +201,7 @@ def collate(journal: Journal) -> Chart:
     points = [_point([r for r in rows if (r["method"], r["steps"]) == key], found) for key in keys]
     plan = journal.one("plan") or {}
     about = journal.rows("problem")[0]["problem"] | {name: plan.get(name) for name in ("plan", "long_minutes")}
+    about["waited"] = sum(r.get("waited") or 0.0 for r in rows) / max(sum(r["ms"] for r in rows), TINY)
     return Chart(
         about,
         tuple(point for point in points if point is not None),

@@ -8,6 +8,9 @@ from typing import Any
 from .methods import DEFAULT
 from .table import Chart, Point
 
+FAR = 1e4
+"""Distance beyond which cloth that nothing holds has fallen away [mm]."""
+
 
 @dataclass(frozen=True)
 class Change:
@@ -89,17 +92,15 @@ def _term(row: dict[str, Any], fall: float, least: float) -> Change | None:
     full, other = row["with"], row["without"]
     if row["kind"] == "time":
         name = {"tether": "tether to the last frame", "warm": "start from the last frame"}[row["term"]]
-        worse = [f"jerk {full['jerk']:.3g}, without {other['jerk']:.3g} edges"]
+        worse = [f"jerk {other['jerk']:.3g} edges (with it {full['jerk']:.3g})"]
     else:
         name = row["term"]
-        worse = [f"gap without {percent((other['energy'] - least) / max(fall, 1e-12))}"]
-    worse += [
-        f"{words} {full[key]}, without {other[key]}"
-        for key, words in (("inside", "inside"), ("crossings", "crossings"))
-        if full[key] != other[key]
-    ]
+        worse = [f"gap {percent((other['energy'] - least) / max(fall, 1e-12))}"]
+    worse += [f"{key} {other[key]} ({full[key]})" for key in ("inside", "crossings") if full[key] != other[key]]
     cost = full["ms"] - other["ms"]
-    return Change(name, cost, cost / max(full["ms"], 1e-9), row["moved_mm"], "; ".join(worse))
+    if row["moved_mm"] > FAR:
+        worse = ["the cloth falls away"]
+    return Change(name, cost, cost / max(full["ms"], 1e-9), row["moved_mm"], "without it " + ", ".join(worse))
 
 
 def _levels(chart: Chart, fall: float, least: float) -> list[Change]:
@@ -111,6 +112,6 @@ def _levels(chart: Chart, fall: float, least: float) -> list[Change]:
         cost = own["ms"] - before
         moved = 0.0 if apart is None else max(apart - row["moved_mm"], 0.0)
         name = f"{row['term']} ({own['vertices']:,} vertices)"
-        found.append(Change(name, cost, cost / max(own["ms"], 1e-9), moved, f"gap if it is the last {gap}"))
+        found.append(Change(name, cost, cost / max(own["ms"], 1e-9), moved, f"as the last one gap {gap}"))
         before, apart = own["ms"], row["moved_mm"]
     return found
