@@ -33,7 +33,7 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
     report = RefineReport(opened.path, None, options.plain())
     first = _first_frame(opened)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
-    report.garments = [_garment(*part) for part in parts]
+    report.garments = [_garment(*part) | {"colliders": _felt(opened, part[0])} for part in parts]
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.warnings = [str(notice) for notice in opened.warnings]
@@ -115,6 +115,9 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "wavelength_mm": round(1e3 * choice.wavelength, 2),
         "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},
         "sources": dict(source.sources),
+        "self_contact": garment.self_contact,
+        "layer": garment.layer,
+        "apart_from": dict(source.apart_from),
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),
     }
@@ -145,8 +148,21 @@ def _in_plane(report: RefineReport) -> dict[str, str]:
 
 def _touching(opened: Shot) -> list[str]:
     """Paths of the colliders that some garment feels."""
-    felt = {index for garment in opened.scene.garments for index in garment.colliders}
-    return [collider.path for index, collider in enumerate(opened.scene.colliders) if index in felt]
+    felt = {path for garment in opened.scene.garments for path in _felt(opened, garment)}
+    return [collider.path for collider in opened.scene.colliders if collider.path in felt]
+
+
+def _felt(opened: Shot, garment: Garment) -> list[str]:
+    """Paths of the colliders that a garment feels."""
+    return [opened.scene.colliders[index].path for index in garment.colliders]
+
+
+def _why_no_contact(opened: Shot) -> str:
+    if _touching(opened):
+        return "switched off by --contact"
+    if set(opened.colliders) & {path for source in opened.sources for path in source.apart_from}:
+        return "every collider is excluded by physgraph:contact:exclude"
+    return "no collider is tagged or named"
 
 
 def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
@@ -155,8 +171,7 @@ def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
         "network": "not in this version; quasi-Newton integrates",
     }
     if "contact" not in report.modelled:
-        switched = "switched off by --contact" if _touching(opened) else "no collider is tagged or named"
-        left_out["contact"] = switched
+        left_out["contact"] = _why_no_contact(opened)
     if "membrane" not in report.modelled:
         left_out["triangle membrane"] = "no garment authors shear stiffness: edge springs have G = 0.375 Y"
     return left_out

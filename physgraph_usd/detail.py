@@ -8,6 +8,7 @@ Interpolated to the fine vertices, they take the detail along.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,23 @@ class Carried:
     coarse: Float[Tensor, "coarse 3"]
     detail: Float[Tensor, "vertices 3"]
     frames: Float[Tensor, "coarse 3 3"]
+
+
+def join(parts: Sequence[Carried]) -> Carried:
+    """What several garments carry, as one."""
+    return Carried(*(torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames")))
+
+
+def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> list[Carried]:
+    """What each garment of a group carries.
+
+    Args:
+        carried: What the group carries.
+        coarse: Cage vertices of each garment.
+        fine: Fine vertices of each garment.
+    """
+    pairs = zip(coarse, fine, strict=True)
+    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c]) for c, f in pairs]
 
 
 class MovingFrames:

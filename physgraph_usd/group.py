@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,13 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .contact.bodies import FrameContact, LevelContact, Touching
-from .contact.rounds import solve_rounds
+from .contact.bodies import FrameBodies, Touching
+from .contact.cloth import ClothContact
+from .contact.frame import FrameContact, LevelContact, Touch
+from .contact.rounds import solve_rounds, untangle
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset
 from .errors import SolveError
 from .forces.base import ForceModule
-from .forces.contact import Contact
 from .forces.guide import GuideMap
 from .integrate import Method
 from .integrate.base import System
@@ -40,6 +40,10 @@ LEAST_STRAIN = 1e-2
 UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
+import os
+
+REFACTORED = int(os.environ.get("REF", "8000"))
+"""Vertices up to which a level's metric takes up the stiffness of what touches: factorising costs more than it saves above."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
 COARSE_TOLERANCE = 0.1
@@ -115,6 +119,7 @@ class Group:
         self._outward = torch.tensor([-1.0 if garment.flipped else 1.0 for garment in garments], device=device)
         self._fixed = np.flatnonzero(~finest.free.cpu().numpy().ravel())
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
+        self._cloth = ClothContact(self.levels, self.garments)
         self._material: tuple[object, ...] = ()
         self._forces: list[LevelForces] = []
         self._stretch = 0.0
@@ -154,10 +159,10 @@ class Group:
         except SolveError as error:
             raise SolveError(self._blame(forces[-1], coarse, error, at)) from error
         result = self._finish(x, coarse, frames)
-        pushed = None
+        moved: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
-            result, pushed = contact.at(self.levels[-1], self.levels[-1]).project(result)
+            result, moved = contact.finish(result)
             x = x if scaled else result
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
@@ -165,8 +170,7 @@ class Group:
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
         if contact is not None:
-            upsampled = self.levels[-1].base.apply(coarse)
-            telemetry["contact"] = contact.measure(self.levels[-1], upsampled, result) | {"projected": pushed}
+            telemetry["contact"] = contact.measure(result) | moved
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -197,21 +201,14 @@ class Group:
             self._material = ()
         self._settings = settings
 
-    def judge(
-        self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], *, touching: Sequence[Touching] = ()
-    ) -> dict[str, Any]:
-        """Energy of each term [J], strain and contact of given fine positions [m], whoever computed them."""
+    def potential(
+        self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()
+    ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
+        """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
         world = np.concatenate([frame.points for frame in frames])
         origin = world.mean(axis=0)
-        coarse, x = self._tensor(world - origin), self._tensor(np.concatenate(points) - origin)
-        finest, module = self.levels[-1], self._forces_for(frames)[-1].module(coarse)
-        found: dict[str, Any] = {"energy_joules": module.energies(x), "strain": edge_strain(finest, x)}
-        contact = self._contact(touching, coarse, origin, frames)
-        if contact is not None:
-            term = contact.at(finest, finest).term(x)
-            found["energy_joules"]["contact"] = 0.0 if term is None else float(term.add_force(x, torch.zeros_like(x)))
-            found |= contact.measure(finest, finest.base.apply(coarse), x)
-        return found
+        module, coarse = self._forces_for(frames)[-1], self._tensor(world - origin)
+        return module.module(coarse), self._contact(touching, coarse, origin, frames), origin
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
@@ -263,12 +260,18 @@ class Group:
     def _contact(
         self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray, frames: Sequence[GarmentFrame]
     ) -> FrameContact | None:
-        """The bodies of a frame, or None when there are none."""
-        if not touching or not len(coarse):
+        """What a frame's cloth may touch, or None when there is nothing."""
+        settings = self._settings.contact
+        cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
+        if not len(coarse) or (cloth is None and not touching):
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
-        settings = self._settings.contact.scaled(self.levels[0], stretch=self._stretch, weight=weight)
-        return FrameContact.begin(self.levels, touching, coarse, origin=origin, settings=settings)
+        settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
+        bodies = None
+        if touching:
+            bodies = FrameBodies.begin(self.levels, touching, coarse, origin=origin, settings=settings)
+        thickness = [frame.fabric.thickness for frame in frames]
+        return FrameContact(self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings)
 
     def _descend(
         self,
@@ -293,13 +296,13 @@ class Group:
             if predicted is not None and self._settings.temporal == "tether":
                 terms = ForceModule((*module.forces, lasting.tether(self._settings.tether, predicted)))
             budget = self._budget(index, len(self.levels), clock)
-            view = None if contact is None else contact.at(level, self.levels[-1])
+            view = None if contact is None else contact.at(level)
             cold = predicted is None
             x, made, touched = self._solve_level(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
             if index < len(self.levels) - 1:
                 made[-1].energies = module.energies(x)
             reports += made
-            module = module if touched is None else ForceModule((*module.forces, touched))
+            module = ForceModule((*module.forces, *touched))
         return x, reports, module
 
     def _solve_level(
@@ -312,25 +315,32 @@ class Group:
         cold: bool,
         view: LevelContact | None,
         budget: Budget,
-    ) -> tuple[Tensor, list[LevelReport], Contact | None]:
-        """Solve one level, in rounds where bodies are near; returns the contact term too, where there is one."""
+    ) -> tuple[Tensor, list[LevelReport], tuple[Touch, ...]]:
+        """Solve one level, in rounds where something is near; returns the contact terms too."""
 
-        def system(touched: Contact | None) -> System:
-            module = terms if touched is None else ForceModule((*terms.forces, touched))
-            return System(module, metric, free=level.free, spacing=level.spacing)
+        def system(touched: Sequence[Touch], at: Tensor) -> System:
+            stiff = [3.0 * term.diagonal(at) for term in touched] if level.vertex_count <= REFACTORED else []
+            held = metric.plus(torch.stack(stiff).sum(dim=0)) if stiff else metric
+            return System(ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing)
 
         integrator = self._settings.method.build()
-        touched = None if view is None else view.term(x)
-        if cold:
-            x = leave_saddle(system(touched), level, x, outward=self._outward)
         if view is None:
-            x, report = solve_level(system(None), integrator, x, level=level.index, budget=budget)
-            return x, [report], None
+            x = leave_saddle(system((), x), level, x, outward=self._outward) if cold else x
+            x, report = solve_level(system((), x), integrator, x, level=level.index, budget=budget)
+            return x, [report], ()
+        freed: list[LevelReport] = []
+        if cold and level is self.levels[0]:
+            x, freed, touched = untangle(system, integrator, x, view=view, level=level.index, budget=budget)
+        else:
+            touched = view.terms(x)
+        x = leave_saddle(system(touched, x), level, x, outward=self._outward) if cold else x
         x, made, touched = solve_rounds(
-            system, integrator, x, touched=touched, view=view, level=level.index, budget=budget
+            system, integrator, x, terms=touched, view=view, level=level.index, budget=budget
         )
-        if touched is not None and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
-            apart = System(terms, metric, free=level.free & ~touched.near(level), spacing=level.spacing)
+        made = freed + made
+        if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
+            held = torch.stack([term.near(level) for term in touched]).any(dim=0)
+            apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing)
             x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
             made.append(report)
         return x, made, touched

@@ -11,8 +11,8 @@ import torch
 
 from .colliders.pose import Pose
 from .contact.bodies import Touching
-from .contact.broad_phase import Bodies, bounds_of, reach_of
-from .detail import Carried
+from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
+from .detail import Carried, join, split
 from .errors import GarmentError
 from .group import Group, SolveSettings
 from .level import refine_garments
@@ -22,22 +22,22 @@ from .scene import Frame, GarmentFrame, Scene, State
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """One garment's last solved frame, and the bodies that it could touch there."""
+    """One garment's last solved frame, with whom it was solved, and the bodies that it could touch there."""
 
     frame: GarmentFrame
     points: np.ndarray
     carried: Carried
+    part: tuple[int, ...]
     near: dict[int, Pose | None]
 
 
 class Refiner:
     """Refines the frames of one scene in order.
 
-    Garments that cannot touch are solved apart, each in a group of its own.
+    Garments that cannot touch in a frame are solved apart, the others together.
 
     Attributes:
         refinements: The subdivisions of each garment, coarsest first.
-        groups: Garments solved together, in the order of the garments.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Refiner:
         device: str = "cpu",
         lanes: int = 1,
     ) -> None:
-        """Subdivide the garments and prepare their levels.
+        """Subdivide the garments.
 
         Args:
             scene: The scene.
@@ -69,13 +69,12 @@ class Refiner:
         self.refinements = self.subdivide(scene, chosen)
         self._settings = settings
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
-        self.groups = [
-            Group([garment], [chain], scene.gravity, settings, dtype=dtype, device=device, lanes=lanes)
-            for garment, chain in zip(scene.garments, self.refinements, strict=True)
-        ]
+        self._place = {"dtype": dtype, "device": device, "lanes": lanes}
+        self._groups: dict[tuple[int, ...], Group] = {}
         self._scene = scene
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
-        self._last: list[_Known | None] = [None] * len(self.groups)
+        self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
+        self._last: list[_Known | None] = [None] * len(scene.garments)
         self._time: float | None = None
 
     @staticmethod
@@ -83,23 +82,41 @@ class Refiner:
         """The refinements of each garment, without the solver."""
         return refine_garments(scene.garments, levels)
 
+    @property
+    def groups(self) -> list[Group]:
+        """A group for each garment alone, in the order of the garments."""
+        return [self.group_of((index,)) for index in range(len(self._scene.garments))]
+
+    def group_of(self, part: tuple[int, ...]) -> Group:
+        """The group of garments solved together, built when first asked for."""
+        if part not in self._groups:
+            garments = [self._scene.garments[index] for index in part]
+            chains = [self.refinements[index] for index in part]
+            self._groups[part] = Group(garments, chains, self._scene.gravity, self._settings, **self._place)
+        return self._groups[part]
+
     def forget(self) -> None:
         """Start the next frame cold."""
-        self._last = [None] * len(self.groups)
+        self._last = [None] * len(self._last)
         self._time = None
 
     def use(self, settings: SolveSettings) -> None:
         """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
         self._settings = settings
-        for group in self.groups:
+        self._parts = Parts(self._scene.garments, together=settings.contact.cloth != "off")
+        for group in self._groups.values():
             group.use(settings)
         self.forget()
 
-    def touching(self, index: int, frame: Frame) -> tuple[Touching, ...]:
-        """The surfaces that a garment may touch in a frame."""
+    def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
+        """Numbers of the garments that are solved together in a frame."""
+        return self._parts.of(frame.garments)
+
+    def touching(self, part: tuple[int, ...], frame: Frame) -> tuple[Touching, ...]:
+        """The surfaces that garments solved together may touch in a frame."""
         self._bodies.pose(frame.colliders)
-        garment = frame.garments[index]
-        return self._bodies.touching(self._near(index, garment), [garment.offset])
+        frames = [frame.garments[index] for index in part]
+        return self._touching(part, frames, self._near(part, frames))
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
         """Solve frames in order, one state a frame.
@@ -119,66 +136,95 @@ class Refiner:
         """
         gap = self._is_gap(frame.time)
         self._bodies.pose(frame.colliders)
-        points: list[np.ndarray | None] = []
-        telemetry: list[dict[str, object]] = []
-        reused: list[bool] = []
-        for index, garment in enumerate(frame.garments):
-            known = self._last[index]
-            same = known is not None and _same(garment, known.frame) and self._same_bodies(index, garment, known)
-            reused.append(same)
-            if wanted is not None and not wanted[index]:
-                points.append(None)
-                telemetry.append({"start": "left out: the garment has no sample here"})
-            elif known is not None and same:
-                points.append(known.points)
-                telemetry.append({"start": "reused: the input equals the last frame's"})
+        count = len(frame.garments)
+        asked = [True] * count if wanted is None else list(wanted)
+        points: list[np.ndarray | None] = [None] * count
+        telemetry: list[dict[str, object]] = [{"start": "left out: the garment has no sample here"}] * count
+        reused = [False] * count
+        for part in self._parts.of(frame.garments):
+            known = [self._last[index] for index in part]
+            same = self._same(part, frame, known)
+            for index in part:
+                reused[index] = same
+            if not any(asked[index] for index in part):
+                continue
+            if not same:
+                known, entries = self._solve_part(part, frame, gap=gap)
             else:
-                solved, entry = self._solve_group(index, garment, frame.time, gap=gap)
-                points.append(solved)
-                telemetry.append(entry)
+                entries = [{"start": "reused: the input equals the last frame's"}] * len(part)
+            for index, each, entry in zip(part, known, entries, strict=True):
+                if asked[index] and each is not None:
+                    points[index], telemetry[index] = each.points, entry
         self._time = frame.time
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
 
-    def _solve_group(
-        self, index: int, frame: GarmentFrame, time: float | None, *, gap: bool
-    ) -> tuple[np.ndarray, dict[str, object]]:
-        """Solve one garment apart and keep what its next frame needs; returns its points and telemetry."""
-        known = self._last[index]
-        kept = None if gap or known is None else known.carried
-        near = self._near(index, frame)
+    def _solve_part(
+        self, part: tuple[int, ...], frame: Frame, *, gap: bool
+    ) -> tuple[list[_Known | None], list[dict[str, object]]]:
+        """Solve garments together and keep what their next frame needs; returns that and their telemetry."""
+        frames = [frame.garments[index] for index in part]
+        last = [self._last[index] for index in part]
+        kept = None if gap or any(each is None for each in last) else join([each.carried for each in last if each])
+        group, near = self.group_of(part), self._near(part, frames)
         while True:
-            touching = self._bodies.touching(near, [frame.offset])
-            solved, carried, entry = self.groups[index].solve([frame], kept, at=time, touching=touching)
-            more = self._reached(index, frame, solved[0])
+            touching = self._touching(part, frames, near)
+            solved, carried, entry = group.solve(frames, kept, at=frame.time, touching=touching)
+            more = self._reached(part, frames, solved)
             if more <= set(near):
                 break
             near = tuple(sorted({*near, *more}))
-        self._last[index] = _Known(frame, solved[0], carried, {each: self._bodies.pose_of(each) for each in near})
-        if self._scene.garments[index].colliders:
+        if any(self._scene.garments[index].colliders for index in part):
             entry["near"] = [self._scene.colliders[each].path for each in near]
+        if len(part) > 1:
+            entry["together"] = [self._scene.garments[index].path for index in part]
         if gap:
             entry["start"] = "cold: the time between samples is too long"
-        return solved[0], entry
+        poses = {each: self._bodies.pose_of(each) for each in near}
+        own = split(carried, group.levels[0].spans, group.levels[-1].spans)
+        for index, each, xs, detail in zip(part, frames, solved, own, strict=True):
+            self._last[index] = _Known(each, xs, detail, part, poses)
+        return [self._last[index] for index in part], [entry] * len(part)
 
-    def _near(self, index: int, frame: GarmentFrame) -> tuple[int, ...]:
-        """Numbers of the bodies that a garment may touch."""
-        garment = self._scene.garments[index]
-        if not garment.colliders or self._settings.contact.form == "off":
-            return ()
-        return self._bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame))
+    def _touching(
+        self, part: Sequence[int], frames: Sequence[GarmentFrame], near: Sequence[int]
+    ) -> tuple[Touching, ...]:
+        """Posed surfaces of bodies, each with the distance that every garment keeps, None where it does not feel it."""
+        offsets = [
+            [each.offset if body in self._scene.garments[index].colliders else None for body in near]
+            for index, each in zip(part, frames, strict=True)
+        ]
+        return self._bodies.touching(near, offsets)
 
-    def _reached(self, index: int, frame: GarmentFrame, points: np.ndarray) -> set[int]:
+    def _near(self, part: Sequence[int], frames: Sequence[GarmentFrame]) -> tuple[int, ...]:
+        """Numbers of the bodies that garments may touch."""
+        found: set[int] = set()
+        for index, frame in zip(part, frames, strict=True):
+            garment = self._scene.garments[index]
+            if garment.colliders and self._settings.contact.form != "off":
+                found |= set(self._bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame)))
+        return tuple(sorted(found))
+
+    def _reached(self, part: Sequence[int], frames: Sequence[GarmentFrame], points: Sequence[np.ndarray]) -> set[int]:
         """Numbers of the bodies whose bounds the solved cloth meets."""
-        garment = self._scene.garments[index]
-        if not garment.colliders or self._settings.contact.form == "off":
-            return set()
-        return set(self._bodies.near(garment, bounds_of(points), frame.offset))
+        found: set[int] = set()
+        for index, frame, solved in zip(part, frames, points, strict=True):
+            garment = self._scene.garments[index]
+            if garment.colliders and self._settings.contact.form != "off":
+                found |= set(self._bodies.near(garment, bounds_of(solved), frame.offset))
+        return found
 
-    def _same_bodies(self, index: int, frame: GarmentFrame, known: _Known) -> bool:
-        """Whether the bodies that a garment may touch are where they were."""
-        near = self._near(index, frame)
-        poses = [(known.near.get(each), self._bodies.pose_of(each)) for each in near]
-        return set(near) == set(known.near) and all(a is not None and b is not None and a.equals(b) for a, b in poses)
+    def _same(self, part: tuple[int, ...], frame: Frame, known: Sequence[_Known | None]) -> bool:
+        """Whether garments and the bodies that they may touch are what they were, and solved together."""
+        near = self._near(part, [frame.garments[index] for index in part])
+        for index, each in zip(part, known, strict=True):
+            if each is None or each.part != part or not _same(frame.garments[index], each.frame):
+                return False
+            poses = [(each.near.get(body), self._bodies.pose_of(body)) for body in near]
+            if set(near) != set(each.near) or not all(
+                a is not None and b is not None and a.equals(b) for a, b in poses
+            ):
+                return False
+        return True
 
     def _is_gap(self, time: float | None) -> bool:
         if time is None or self._time is None or not self._spacing:

@@ -31,6 +31,9 @@ class Garment:
         detail_scale: Multiplier of the detail written out, shape (V,).
         pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,).
         colliders: Numbers of the scene's colliders that the garment feels.
+        self_contact: Whether it feels itself.
+        layer: Place in the order of garments, lower is nearer to the body; None, or equal to another's: not ordered.
+        apart_from: Paths of the garments that it never touches; each of them names it too.
     """
 
     path: str
@@ -45,6 +48,9 @@ class Garment:
     detail_scale: np.ndarray
     pin: np.ndarray
     colliders: tuple[int, ...] = ()
+    self_contact: bool = True
+    layer: int | None = None
+    apart_from: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,6 +76,7 @@ def point(method: str, steps: int, ms: float, gap: float) -> Point:
         percent=0.0,
         deepest_mm=0.0,
         crossings=0,
+        tangles=0,
         frames=1,
         repeats=1,
     )
@@ -167,9 +168,10 @@ def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
     _, folder, chart = made
     with opened(folder / "chart.html") as page:
         page.locator(".legend .traces").first.wait_for()
+        panels = 1 + len(chart.panels)
         curves = page.locator("#curves .scatterlayer .trace")
         assert page.locator(".legend .traces").count() == len(chart.methods)
-        assert curves.count() == 3 * len(chart.methods)
+        assert curves.count() == panels * len(chart.methods)
         index = chart.methods.index("gd, nested")
         said = hover(page, curves.nth(index).locator(".points path").nth(1))
         own = chart.curve("gd, nested")[1]
@@ -177,7 +179,7 @@ def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
         assert f"{own.ms:.1f} ms a frame" in said
         page.locator(".legend .traces").nth(index).locator(".legendtoggle").click()
         page.wait_for_function(
-            f"document.querySelectorAll('#curves .scatterlayer .trace').length == {3 * len(chart.methods) - 3}"
+            f"document.querySelectorAll('#curves .scatterlayer .trace').length == {panels * (len(chart.methods) - 1)}"
         )
         assert "contact" in page.locator("#terms").text_content()
 

@@ -24,7 +24,7 @@ from physgraph_usd.usd.schema import (
     register,
     schema_path,
 )
-from physgraph_usd.usd.schema_files import schema_files
+from physgraph_usd.usd.schema_files import attribute_table, schema_files
 
 TYPES = {GARMENT_API: UsdGeom.Mesh, COLLIDER_API: UsdGeom.Sphere, MATERIAL_API: UsdShade.Material}
 
@@ -46,6 +46,11 @@ def prims() -> dict[str, Usd.Prim]:
 def test_committed_files_are_what_the_table_gives(name: str) -> None:
     text = (schema_path() / name).read_text(encoding="utf-8")
     assert text == schema_files()[name], "run python -m physgraph_usd.usd.schema_files"
+
+
+def test_the_documented_table_is_the_one_in_the_code() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "attributes.md").read_text(encoding="utf-8")
+    assert attribute_table() in text, "paste what attribute_table() gives"
 
 
 @pytest.mark.parametrize("row", PROPERTIES, ids=lambda row: f"{row.schema}.{row.name}")

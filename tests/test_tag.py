@@ -48,6 +48,12 @@ def test_a_preset_is_authored_on_garments_only(untagged: Path, tmp_path: Path) -
     assert not stage.GetPrimAtPath("/World/ball").GetAttribute("physgraph:material:bendStiffness").HasAuthoredValue()
 
 
+def test_a_collider_can_be_tagged_alone(untagged: Path, tmp_path: Path) -> None:
+    stage = Usd.Stage.Open(str(tag(untagged, tmp_path / "tagged.usda", colliders=["/World/ball"])))
+    assert schemas(stage, "/World/ball") == ["PhysGraphColliderAPI"]
+    assert schemas(stage, COAT) == []
+
+
 def test_wrong_requests_name_the_choices(untagged: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="nothing to tag"):
         tag(untagged, tmp_path / "a.usda")

@@ -18,11 +18,6 @@ from .words import FAR, changes, figures, percent, settings, title
 FLOOR = 1e-5
 TICKS = [1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001]
 SIGNS = {DEFAULT: "star", UPSAMPLED: "square", SMOOTH: "diamond"}
-PANELS = (
-    ("gap", "energy gap (Phi - Phi*) / (Phi0 - Phi*)"),
-    ("percent", "vertices inside bodies [%]"),
-    ("crossings", "edges through faces"),
-)
 HOW = (
     "Every frame starts cold. Times are of preparing and solving a frame, the median of the faster half of {repeats} "
     "turns, in which all methods take one budget before any takes the next: what else a machine does only ever adds to "
@@ -64,12 +59,16 @@ def write_page(chart: Chart, file: Path) -> None:
 
 def _figure(chart: Chart) -> go.Figure:
     """Gap, penetrations and crossings against time, with one legend."""
-    panels = PANELS if chart.has_bodies else PANELS[:1]
+    panels = {"gap": "energy gap (Phi - Phi*) / (Phi0 - Phi*)", **chart.panels}
     figure = make_subplots(
-        rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[2.0, 1.0, 1.0][: len(panels)]
+        rows=len(panels),
+        cols=1,
+        shared_xaxes=True,
+        vertical_spacing=0.05,
+        row_heights=[2.0, *[1.0] * len(chart.panels)],
     )
     look = styles(chart)
-    for row, (field, words) in enumerate(panels, start=1):
+    for row, (field, words) in enumerate(panels.items(), start=1):
         for name in chart.methods:
             figure.add_trace(_trace(chart, name, look[name], field=field, first=row == 1), row=row, col=1)
         figure.update_yaxes(title_text=words, row=row, col=1)
@@ -88,7 +87,7 @@ def _figure(chart: Chart) -> go.Figure:
 
 def _trace(chart: Chart, name: str, style: Style, *, field: str, first: bool) -> go.Scatter:
     points = chart.curve(name)
-    said = ["<br>".join([settings(p), *figures(p, bodies=chart.has_bodies)]) for p in points]
+    said = ["<br>".join([settings(p), *figures(p, touches=bool(chart.panels))]) for p in points]
     values = [max(p.gap, FLOOR) if field == "gap" else getattr(p, field) for p in points]
     return go.Scatter(
         x=[max(p.ms, 1e-2) for p in points],

@@ -49,7 +49,7 @@ def draw_chart(chart: Chart, folder: Path) -> None:
 
 def _figure(chart: Chart) -> Figure:
     steps = changes(chart)
-    heights = [4.2, *([2.6] if chart.has_bodies else []), *([0.6 + 0.28 * len(steps)] if steps else [])]
+    heights = [4.2, *([2.6] if chart.panels else []), *([0.6 + 0.28 * len(steps)] if steps else [])]
     figure = Figure(figsize=(9.6, sum(heights) + 1.0), layout="constrained")
     figure.suptitle(title(chart), x=0.01, ha="left", fontsize=11)
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
@@ -57,8 +57,10 @@ def _figure(chart: Chart) -> Figure:
     axes = parts[0].subplots()
     _curves(axes, chart, look)
     parts[0].legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
-    if chart.has_bodies:
-        _contacts(parts[1].subplots(1, 2), chart, look)
+    if chart.panels:
+        panels = parts[1].subplots(1, len(chart.panels), squeeze=False)[0]
+        for axes, (name, words) in zip(panels, chart.panels.items(), strict=True):
+            _contact(axes, name, words, chart=chart, look=look)
     if steps:
         _terms(parts[-1].subplots(1, 3, sharey=True, width_ratios=[1.0, 1.0, 1.5]), steps)
     return figure
@@ -93,20 +95,16 @@ def _line(axes: Axes, name: str, points: tuple[Point, ...], style: Style, height
     )
 
 
-def _contacts(panels: Any, chart: Chart, look: dict[str, Style]) -> None:
-    """Penetrations and crossings against time."""
-    for axes, name, words in (
-        (panels[0], "percent", "Vertices inside bodies [%]"),
-        (panels[1], "crossings", "Edges through faces"),
-    ):
-        for method in chart.methods:
-            points = chart.curve(method)
-            _line(axes, method, points, look[method], [float(getattr(p, name)) for p in points])
-        axes.set(xscale="log", xlabel="milliseconds a frame", title=words)
-        axes.set_yscale("symlog", linthresh=0.01 if name == "percent" else 1.0)
-        axes.set_ylim(bottom=0)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+def _contact(axes: Axes, name: str, words: str, *, chart: Chart, look: dict[str, Style]) -> None:
+    """One measure of contact against time."""
+    for method in chart.methods:
+        points = chart.curve(method)
+        _line(axes, method, points, look[method], [float(getattr(p, name)) for p in points])
+    axes.set(xscale="log", xlabel="milliseconds a frame", title=words[0].upper() + words[1:])
+    axes.set_yscale("symlog", linthresh=0.01 if name == "percent" else 1.0)
+    axes.set_ylim(bottom=0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _terms(panels: Any, steps: list[Change]) -> None:

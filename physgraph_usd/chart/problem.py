@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,9 +13,11 @@ import torch
 
 from ..detail import Carried
 from ..group import SolveSettings
+from ..level import Level
 from ..options import RefineOptions
 from ..pipeline import Refiner
 from ..scene import Frame, Scene
+from .judge import Judgement, judge
 
 DEFAULT = RefineOptions().solve_settings()
 """What `refine` does by default."""
@@ -41,36 +42,11 @@ class Solved:
     waited: float | None
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """What fine positions are worth.
-
-    Attributes:
-        energies: Energy of each term [J].
-        strain: Largest over the garments of the edges' 99th percentile.
-        inside: Vertices inside closed bodies.
-        percent: Their share of all vertices.
-        deepest_mm: Depth of the deepest [mm].
-        crossings: Edges through faces.
-    """
-
-    energies: dict[str, float]
-    strain: float
-    inside: int
-    percent: float
-    deepest_mm: float
-    crossings: int
-
-    @property
-    def energy(self) -> float:
-        """The potential [J]."""
-        return sum(self.energies.values())
-
-
 class Problem:
     """The frames of a scene with the solver's levels built, in one precision.
 
     Attributes:
+        scene: The scene.
         refiner: The solver.
         has_bodies: Whether a garment may touch something.
     """
@@ -89,13 +65,15 @@ class Problem:
         """
         garments = tuple(replace(each, detail_scale=np.ones_like(each.detail_scale)) for each in scene.garments)
         scene = replace(scene, garments=garments)
+        self.scene = scene
         self.refiner = Refiner(scene, DEFAULT, levels=levels, dtype=dtype, device=device, lanes=lanes)
         self.has_bodies = any(garment.colliders for garment in garments)
 
     @property
     def vertex_count(self) -> int:
         """Number of fine vertices."""
-        return sum(group.levels[-1].vertex_count for group in self.refiner.groups)
+        chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
+        return sum(chain[-1].mesh.vertex_count if chain else each.mesh.vertex_count for each, chain in chains)
 
     def solve(self, frame: Frame, settings: SolveSettings) -> Solved:
         """Solve a frame from a cold start."""
@@ -107,11 +85,13 @@ class Problem:
         before = _waited()
         state = self.refiner.solve(frame)
         after = _waited()
-        spent = [entry.get("milliseconds") or {"prepare": 0.0, "solve": 0.0} for entry in state.telemetry]
-        milliseconds = sum(each["prepare"] + each["solve"] for each in spent)  # type: ignore[index]
-        steps = [level["steps"] for entry in state.telemetry for level in entry.get("levels", [])[-1:]]  # type: ignore
+        entries: list[Any] = list({id(entry): entry for entry in state.telemetry}.values())
+        spent = [value for each in entries for name, value in each.get("milliseconds", {}).items() if name != "measure"]
+        reports = [each for entry in entries for each in entry.get("levels", [])]
+        last = max((each["level"] for each in reports), default=0)
+        steps = sum(each["steps"] for each in reports if each["level"] == last)
         waited = None if before is None or after is None else after - before
-        return Solved(tuple(p for p in state.points if p is not None), milliseconds, sum(steps), waited)
+        return Solved(tuple(p for p in state.points if p is not None), sum(spent), steps, waited)
 
     def go_on(
         self, frame: Frame, settings: SolveSettings, kept: Sequence[Carried | None]
@@ -119,44 +99,42 @@ class Problem:
         """Solve a frame from a kept result of its own; cold where that is None.
 
         Returns:
-            Fine world positions [m] of each garment, and what to go on from.
+            Fine world positions [m] of each garment, and what to go on from, for each part.
         """
         self.refiner.use(replace(settings, temporal="warm"))
-        points, carried = [], []
-        for index, (group, own) in enumerate(zip(self.refiner.groups, kept, strict=True)):
-            touching = self.refiner.touching(index, frame)
-            found, after, _ = group.solve([frame.garments[index]], own, at=frame.time, touching=touching)
-            points.append(found[0])
+        points: dict[int, np.ndarray] = {}
+        carried = []
+        for part, own in zip(self.refiner.parts_of(frame), kept, strict=True):
+            frames, touching = [frame.garments[index] for index in part], self.refiner.touching(part, frame)
+            found, after, _ = self.refiner.group_of(part).solve(frames, own, at=frame.time, touching=touching)
+            points.update(zip(part, found, strict=True))
             carried.append(after)
-        return tuple(points), carried
+        return tuple(points[index] for index in sorted(points)), carried
 
     def judge(self, frame: Frame, points: Sequence[np.ndarray]) -> Judgement:
         """Energy, strain and contact of fine world positions [m], one array a garment."""
-        energies: Counter[str] = Counter()
-        bodies: list[dict[str, Any]] = []
-        strains = []
-        for index, group in enumerate(self.refiner.groups):
-            touching = self.refiner.touching(index, frame)
-            found = group.judge([frame.garments[index]], [points[index]], touching=touching)
-            for name, value in found["energy_joules"].items():
-                energies[name] += value
-            strains.append(found["strain"]["p99"])
-            bodies += [body["after"] for body in found.get("bodies", {}).values()]
-        inside = sum(body["inside"] for body in bodies)
-        return Judgement(
-            dict(energies),
-            max(strains),
-            inside,
-            100.0 * inside / max(self.vertex_count, 1),
-            max((body["deepest_mm"] for body in bodies), default=0.0),
-            sum(body["crossings"] for body in bodies),
-        )
+        self.refiner.use(COLD)
+        return judge(self.refiner, frame, points)
 
     def upsampled(self, frame: Frame, *, smooth: bool) -> tuple[np.ndarray, ...]:
         """The cage's fine positions [m], by the linear or by the smooth map, without any physics."""
-        finest = [group.levels[-1] for group in self.refiner.groups]
-        maps = [level.smooth_from_coarse if smooth else level.from_coarse for level in finest]
-        return tuple(np.asarray(m @ g.points) for m, g in zip(maps, frame.garments, strict=True))
+        return self._of_finest(
+            frame,
+            lambda level, points: np.asarray((level.smooth_from_coarse if smooth else level.from_coarse) @ points),
+        )
+
+    def spacing(self, frame: Frame) -> tuple[np.ndarray, ...]:
+        """Mean rest edge at each fine vertex [m], one array a garment."""
+        return self._of_finest(frame, lambda level, _: level.spacing.double().cpu().numpy())
+
+    def _of_finest(self, frame: Frame, measure: Callable[[Level, np.ndarray], np.ndarray]) -> tuple[np.ndarray, ...]:
+        """A value per fine vertex from the finest levels and the cages' points, one array a garment."""
+        found: dict[int, np.ndarray] = {}
+        for part in self.refiner.parts_of(frame):
+            finest = self.refiner.group_of(part).levels[-1]
+            values = measure(finest, np.concatenate([frame.garments[index].points for index in part]))
+            found.update((index, values[span]) for index, span in zip(part, finest.spans, strict=True))
+        return tuple(found[index] for index in sorted(found))
 
 
 def plain_detail(frame: Frame) -> Frame:

@@ -14,7 +14,8 @@ from typing import Any
 from ..detail import Carried
 from ..integrate import METHODS
 from ..scene import Frame
-from .problem import COLD, Judgement, Problem
+from .judge import Judgement
+from .problem import COLD, Problem
 
 FIRST_STEPS = 24
 MOST_STEPS = 800
@@ -58,7 +59,7 @@ class _Search:
         self.problem, self.frame = problem, frame
         self.start = problem.judge(frame, problem.upsampled(frame, smooth=False)).energy
         self.best: Judgement | None = None
-        self.kept: Sequence[Carried | None] = [None] * len(problem.refiner.groups)
+        self.kept: Sequence[Carried | None] = [None] * len(problem.refiner.parts_of(frame))
         self.by, self.gained = "", 1.0
 
     def take(self, name: str, points: Any, kept: list[Carried]) -> None:

@@ -45,7 +45,8 @@ class Point:
         inside: Vertices inside bodies, summed over the frames.
         percent: Their share.
         deepest_mm: Depth of the deepest [mm].
-        crossings: Edges through faces, summed over the frames.
+        crossings: Edges through faces, of cloth and bodies, summed over the frames.
+        tangles: Edges of cloth through faces of cloth, summed over the frames.
         frames: Number of frames.
         repeats: Number of times that the time was taken.
     """
@@ -67,6 +68,7 @@ class Point:
     percent: float
     deepest_mm: float
     crossings: int
+    tangles: int
     frames: int
     repeats: int
 
@@ -104,9 +106,19 @@ class Chart:
         return f"the machine was busy: threads waited for a core {waited:.0%} of the time, so trust no single time"
 
     @property
-    def has_bodies(self) -> bool:
-        """Whether the shot has something to touch."""
-        return any("contact" in point.energies for point in self.points)
+    def panels(self) -> dict[str, str]:
+        """What of contact there is to draw: fields of the points, and their titles."""
+        known = {
+            "percent": "vertices inside bodies [%]",
+            "crossings": "edges through faces of bodies",
+            "tangles": "edges of cloth through cloth",
+        }
+        touches = any("contact" in point.energies for point in self.points)
+        return {
+            name: words
+            for name, words in known.items()
+            if any(getattr(point, name) for point in self.points) or (touches and name != "tangles")
+        }
 
     def curve(self, method: str) -> tuple[Point, ...]:
         """The points of one method, in the order of the budgets."""
@@ -240,6 +252,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, dict[str, Any]]
         percent=statistics.fmean(v["percent"] for v in values),
         deepest_mm=max(v["deepest_mm"] for v in values),
         crossings=sum(v["crossings"] for v in values),
+        tangles=sum(v["tangles"] for v in values),
         frames=len(values),
         repeats=min(len(each) for each in times),
     )

@@ -53,6 +53,7 @@ TERMS = (
     Without("membrane", garment=lambda each: replace(each, fabric=replace(each.fabric, shear=None))),
     Without("guide", garment=lambda each: replace(each, guide=0.0)),
     Without("contact", settings=lambda given: replace(given, contact=replace(given.contact, form="off"))),
+    Without("self contact", settings=lambda given: replace(given, contact=replace(given.contact, cloth="off"))),
 )
 """A new term of the potential is one line here."""
 
@@ -180,6 +181,7 @@ def _worth(bench: Bench, points: Sequence[tuple[np.ndarray, ...]], frames: Seque
         "inside": sum(each["inside"] for each in values),
         "deepest_mm": max(each["deepest_mm"] for each in values),
         "crossings": sum(each["crossings"] for each in values),
+        "tangles": sum(each["tangles"] for each in values),
     }
 
 
@@ -204,6 +206,6 @@ def _jerk(bench: Bench, points: Sequence[tuple[np.ndarray, ...]]) -> float:
         np.concatenate([p - q for p, q in zip(each, bench.timed.upsampled(frame, smooth=False), strict=True)])
         for each, frame in zip(points, bench.run, strict=True)
     ]
-    spacing = np.concatenate([g.levels[-1].spacing.double().cpu().numpy() for g in bench.timed.refiner.groups])
+    spacing = np.concatenate(bench.timed.spacing(bench.run[0]))
     third = np.diff(np.stack(detail), n=3, axis=0) / spacing[:, None]
     return float(np.sqrt(np.square(third).sum(axis=2).mean()))

@@ -57,7 +57,7 @@ def settings(point: Point) -> str:
     return f"{point.integrator}, {'nested' if point.nested else 'finest level only'}, {point.steps} steps there"
 
 
-def figures(point: Point, *, bodies: bool) -> list[str]:
+def figures(point: Point, *, touches: bool) -> list[str]:
     """What a point reached."""
     said = [
         f"gap {percent(point.gap)}, energy {point.energy:.4g} J",
@@ -66,10 +66,10 @@ def figures(point: Point, *, bodies: bool) -> list[str]:
         ", ".join(f"{name} {1e3 * value:.3g}" for name, value in sorted(point.energies.items())) + " mJ",
         f"strain p99 {percent(point.strain)}",
     ]
-    if bodies:
+    if touches:
         said.append(
             f"{point.inside} vertices inside ({point.percent:.3g}%), deepest {point.deepest_mm:.3g} mm, "
-            f"{point.crossings} edges through faces"
+            f"{point.crossings} edges through faces of bodies, {point.tangles} through cloth"
         )
     return said
 
@@ -96,7 +96,9 @@ def _term(row: dict[str, Any], fall: float, least: float) -> Change | None:
     else:
         name = row["term"]
         worse = [f"gap {percent((other['energy'] - least) / max(fall, 1e-12))}"]
-    worse += [f"{key} {other[key]} ({full[key]})" for key in ("inside", "crossings") if full[key] != other[key]]
+    worse += [
+        f"{key} {other[key]} ({full[key]})" for key in ("inside", "crossings", "tangles") if full[key] != other[key]
+    ]
     cost = full["ms"] - other["ms"]
     if row["moved_mm"] > FAR:
         worse = ["the cloth falls away"]

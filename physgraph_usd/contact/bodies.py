@@ -36,7 +36,7 @@ class Touching:
     Attributes:
         path: Its collider's prim path.
         surface: The posed surface.
-        offset: Distance kept by each garment of the group [m].
+        offset: Distance kept by each garment of the group [m]; minus infinity where it does not feel the surface.
     """
 
     path: str
@@ -119,7 +119,7 @@ def _at(found: Nearest, which: Tensor) -> Nearest:
     return Nearest(**{each.name: getattr(found, each.name)[which] for each in fields(found)})
 
 
-class LevelContact:
+class LevelBodies:
     """One level's view of the bodies.
 
     Attributes:
@@ -173,7 +173,7 @@ class LevelContact:
 
 
 @dataclass(eq=False)
-class FrameContact:
+class FrameBodies:
     """A group's bodies in one frame.
 
     Attributes:
@@ -185,7 +185,7 @@ class FrameContact:
     distances: list[Float[Tensor, " vertices"]]
     _tracks: list[_Track] = field(default_factory=list)
     _settings: ContactSettings = field(default_factory=ContactSettings)
-    _views: dict[int, LevelContact] = field(default_factory=dict)
+    _views: dict[int, LevelBodies] = field(default_factory=dict)
 
     @staticmethod
     def begin(
@@ -195,7 +195,7 @@ class FrameContact:
         *,
         origin: np.ndarray,
         settings: ContactSettings,
-    ) -> FrameContact:
+    ) -> FrameBodies:
         """Find the distances of the upsampled cage.
 
         Args:
@@ -213,10 +213,11 @@ class FrameContact:
             offset = torch.as_tensor(each.offset).to(base)[finest.vertex_garment.long()]
             reach = float(offset.max()) + float(levels[0].spacing.mean())
             known = signed_distances(each.surface, base + shift, finest.edges, reach=reach)
+            known = torch.where(offset.isfinite(), known, torch.full_like(known, float("inf")))
             side = _start_sides(each.surface, coarse + shift, finest)
             longest = PINCHED * float(levels[0].spacing.mean())
             tracks.append(_Track(each.surface, shift, offset, side, base, known, longest))
-        return FrameContact(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
+        return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
 
     def measure(
         self, finest: Level, base: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
@@ -232,6 +233,7 @@ class FrameContact:
         for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
             surface, shift = each.surface, track.shift
             after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
+            after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {
                 "before": asdict(penetration(surface, finest, base + shift, before, track.longest)),
@@ -239,7 +241,7 @@ class FrameContact:
             }
         return {"bodies": bodies}
 
-    def at(self, level: Level, finest: Level) -> LevelContact:
+    def at(self, level: Level, finest: Level) -> LevelBodies:
         """The view of one level, the same at each call; its vertices come first among each garment's finest ones."""
         if level.index in self._views:
             return self._views[level.index]
@@ -250,7 +252,7 @@ class FrameContact:
             replace(t, **{name: getattr(t, name)[which].clone() for name in ("offset", "side", "at", "known")})
             for t in self._tracks
         ]
-        self._views[level.index] = LevelContact(level, tracks, self._settings)
+        self._views[level.index] = LevelBodies(level, tracks, self._settings)
         return self._views[level.index]
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
 
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshBody
@@ -15,6 +18,55 @@ from .bodies import Touching
 
 REACH = 2.0
 """How far the cloth is expected to leave its cage's bounds, in mean cage edges."""
+NEVER = -float("inf")
+"""Offset of a garment from a surface that it does not feel."""
+
+
+class Parts:
+    """Which garments may touch one another in a frame."""
+
+    def __init__(self, garments: Sequence[Garment], *, together: bool) -> None:
+        """Measure the cages.
+
+        Args:
+            garments: The garments.
+            together: False solves every garment apart.
+        """
+        self._garments, self._together = tuple(garments), together
+        self._edges = [_mean_edge(garment) for garment in garments]
+
+    def of(self, frames: Sequence[GarmentFrame]) -> list[tuple[int, ...]]:
+        """Numbers of the garments that are solved together, in order.
+
+        Cages count as near where two of their vertices are closer than the cloth is expected to leave them by, with an
+        edge to spare, since a vertex may be near an edge's middle.
+        """
+        count = len(frames)
+        near = sparse.lil_matrix((count, count), dtype=bool)
+        trees: dict[int, cKDTree] = {}
+        for a in range(count if self._together else 0):
+            for b in range(a + 1, count):
+                near[a, b] = touch_one_another(self._garments[a], self._garments[b]) and self._close(
+                    a, b, frames, trees
+                )
+        labels = csgraph.connected_components(near.tocsr(), directed=False)[1]
+        return [tuple(np.flatnonzero(labels == label).tolist()) for label in dict.fromkeys(labels.tolist())]
+
+    def _close(self, a: int, b: int, frames: Sequence[GarmentFrame], trees: dict[int, cKDTree]) -> bool:
+        thickness = 0.5 * (frames[a].fabric.thickness + frames[b].fabric.thickness)
+        reach = thickness + (0.5 * REACH + 1.0) * (self._edges[a] + self._edges[b])
+        first, second = bounds_of(frames[a].points), bounds_of(frames[b].points)
+        if not ((first[0] - reach <= second[1]).all() and (second[0] <= first[1] + reach).all()):
+            return False
+        for index in (a, b):
+            points = frames[index].points
+            trees[index] = trees.get(index) or cKDTree(points[np.isfinite(points).all(axis=1)])
+        return bool(np.isfinite(trees[a].query(trees[b].data, distance_upper_bound=reach)[0]).any())
+
+
+def touch_one_another(a: Garment, b: Garment) -> bool:
+    """Whether two different garments feel one another at all."""
+    return b.path not in a.apart_from and a.path not in b.apart_from
 
 
 class Bodies:
@@ -65,17 +117,18 @@ class Bodies:
             return bool(lowest <= pose.centre @ normal + grow)
         return bool((bounds[0] - grow <= high).all() and (low <= bounds[1] + grow).all())
 
-    def touching(self, indices: Sequence[int], offsets: Sequence[float]) -> tuple[Touching, ...]:
+    def touching(self, indices: Sequence[int], offsets: Sequence[Sequence[float | None]]) -> tuple[Touching, ...]:
         """Posed surfaces of colliders.
 
         Args:
             indices: Numbers of the colliders.
-            offsets: Distance that each garment keeps from colliders [m].
+            offsets: For each garment, the distance that it keeps from each of them [m]; None where it does not feel it.
         """
         found = []
-        for index in indices:
+        for place, index in enumerate(indices):
             collider = self.colliders[index]
-            offset = tuple(each + collider.offset for each in offsets)
+            own = (each[place] for each in offsets)
+            offset = tuple(NEVER if each is None else each + collider.offset for each in own)
             found += [Touching(collider.path, surface, offset) for surface in self._posed(index)]
         return tuple(found)
 
@@ -94,11 +147,14 @@ class Bodies:
 
 def reach_of(garment: Garment, frame: GarmentFrame) -> float:
     """How far from the cage's bounds a body counts as near [m]: its offset and the move expected of the cloth."""
+    return frame.offset + REACH * _mean_edge(garment)
+
+
+def _mean_edge(garment: Garment) -> float:
+    """Mean edge of the cage [m], 0 without edges."""
     ends = garment.mesh.half_edges.edges
-    if not len(ends):
-        return frame.offset
     lengths = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
-    return frame.offset + REACH * float(lengths.mean())
+    return float(lengths.mean()) if len(ends) else 0.0
 
 
 def bounds_of(points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The solve of one level that touches bodies: rounds of steps, each with the planes that its start sees.
+"""The solve of one level that touches something: rounds of steps, each with the planes and pairs that its start sees.
 
 Within a round the potential is a function of the positions alone. What the integrator learned of the curvature is kept
 from round to round: only few planes turn, and a line search guards each step.
@@ -6,65 +6,96 @@ from round to round: only few planes turn, and a line search guards each step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor
 
-from ..forces.contact import Contact
 from ..integrate.base import Carry, Integrator, System
 from ..integrate.solve import Budget, LevelReport, solve_level
-from .bodies import LevelContact
+from .frame import LevelContact, Touch
+
+UNTANGLINGS = 25
+"""Most rounds that draw out what crosses."""
+STEPS = 4
+"""Steps of each of them."""
 
 
-def solve_rounds(
-    make_system: Callable[[Contact | None], System],
+def untangle(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
     integrator: Integrator,
     x: Float[Tensor, "vertices 3"],
     *,
-    touched: Contact | None,
     view: LevelContact,
     level: int,
     budget: Budget,
-) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], Contact | None]:
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
+    """Draw out what crosses, in rounds of few steps; nothing where nothing does.
+
+    Arguments and results are those of `solve_rounds`; the last result is the contact terms at the positions returned.
+    """
+    reports: list[LevelReport] = []
+    terms = view.terms(x)
+    while view.tangled and len(reports) < UNTANGLINGS and (not reports or reports[-1].stopped != "budget"):
+        short = replace(budget, steps=STEPS, tolerance=0.0)
+        x, report = solve_level(make_system(terms, x), integrator, x, level=level, budget=short)
+        reports.append(report)
+        terms = view.terms(x)
+    return x, reports, terms
+
+
+def solve_rounds(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
+    integrator: Integrator,
+    x: Float[Tensor, "vertices 3"],
+    *,
+    terms: tuple[Touch, ...],
+    view: LevelContact,
+    level: int,
+    budget: Budget,
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
     """Solve one level in rounds; in one where nothing can touch.
 
     Args:
-        make_system: Makes the level's system with a contact term or without.
+        make_system: Makes the level's system with contact terms at positions.
         integrator: Any integrator.
         x: Start positions [m].
-        touched: The contact term that ``view`` gave for x.
-        view: The level's view of the bodies.
+        terms: The contact terms that ``view`` gave for x.
+        view: The level's view of what it may touch.
         level: Index for the reports.
-        budget: When to stop; its steps are shared by the rounds.
+        budget: When to stop; its steps are shared by the rounds. What first touches at the end gets a round's more.
 
     Returns:
-        Final positions [m], a report a round, and the last round's contact term.
+        Final positions [m], a report a round, and the last round's contact terms.
 
     Raises:
         SolveError: The energy is not finite.
     """
     reports: list[LevelReport] = []
     left, resume = budget.steps, None
+    share = -(-budget.steps // view.rounds)
     kept: list[Carry] = []
     while True:
-        share = left if touched is None else min(left, -(-budget.steps // view.rounds))
         kept.clear()
         x, report = solve_level(
-            make_system(touched),
+            make_system(terms, x),
             integrator,
             x,
             level=level,
-            budget=replace(budget, steps=share),
+            budget=replace(budget, steps=min(left, share) if terms else left),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
             resume=resume,
         )
         resume = kept[-1]
         reports.append(report)
         left -= report.steps
-        if left <= 0 or report.steps == 0 or report.stopped == "budget":
-            return x, reports, touched
-        last, touched = touched, view.term(x)
-        if last is None and touched is None:
-            return x, reports, None
+        if report.stopped == "budget" or (left <= 0 and terms):
+            return x, reports, terms
+        before, terms = terms, view.terms(x)
+        if not before and not terms:
+            return x, reports, ()
+        if left <= 0:
+            left = share
+        elif report.steps == 0:
+            return x, reports, terms

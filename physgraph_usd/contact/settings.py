@@ -12,7 +12,8 @@ class ContactSettings:
     """How contact is solved.
 
     Attributes:
-        form: "quadratic", "linear" as in the paper, or "off".
+        form: Against bodies: "quadratic", "linear" as in the paper, or "off".
+        cloth: Of cloth with cloth: "pairs" of points, faces and edges, "spheres" as in the paper, or "off".
         stiffness: k_c of the quadratic form, in stretch stiffnesses over the square of the cage's mean edge.
         pressure: k_c over the garment's area of the linear form, in weights of the cloth.
         rounds: How often in a level's steps closest points are found anew.
@@ -21,6 +22,7 @@ class ContactSettings:
     """
 
     form: str = "quadratic"
+    cloth: str = "pairs"
     stiffness: float = 15.0
     pressure: float = 5.0
     rounds: int = 3

@@ -124,7 +124,7 @@ class Elements:
         self,
         kernels: Mapping[torch.dtype, wp.Kernel],
         corners: Int[Tensor, "elements corners"],
-        parameters: Sequence[Float[Tensor, " elements"]],
+        parameters: Sequence[Float[Tensor, " elements"] | Float[Tensor, "elements 3"]],
         *,
         level: Level,
     ) -> None:
@@ -148,7 +148,7 @@ class Elements:
         self.energy = torch.zeros(self.count, dtype=dtype, device=device)
         self.corner_force = torch.zeros((self.count * width, 3), dtype=dtype, device=device)
         x = vectors(torch.zeros_like(level.rest))
-        own = [wp.from_torch(parameter) for parameter in parameters]
+        own = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
         buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
         self._kept = (corners, parameters)
         self._elements = Launch(kernels[dtype], self.count, [x, packed, *own, *buffers], device=device, lanes=lanes)
@@ -172,13 +172,16 @@ class Elements:
         return self.energy.sum(dtype=torch.float64)
 
 
-def element_overloads(kernel: wp.Kernel, *, width: int, parameters: int) -> dict[torch.dtype, wp.Kernel]:
+def element_overloads(
+    kernel: wp.Kernel, *, width: int, parameters: int, vector_parameters: int = 0
+) -> dict[torch.dtype, wp.Kernel]:
     """Instantiate a generic element kernel for float32 and float64.
 
     Args:
         kernel: Kernel of (first, x, corners, parameters..., energy, corner_force) with generic arrays.
         width: Corners of an element.
-        parameters: Number of scalar arrays between corners and energy.
+        parameters: Number of scalar arrays before energy.
+        vector_parameters: Number of arrays of vectors before them.
 
     Returns:
         The concrete kernel for each torch scalar type.
@@ -191,8 +194,8 @@ def element_overloads(kernel: wp.Kernel, *, width: int, parameters: int) -> dict
                 wp.int32,
                 wp.array(dtype=VECTOR[dtype]),
                 wp.array(dtype=packed),
-                *[wp.array(dtype=SCALAR[dtype])] * parameters,
-                wp.array(dtype=SCALAR[dtype]),
+                *[wp.array(dtype=VECTOR[dtype])] * vector_parameters,
+                *[wp.array(dtype=SCALAR[dtype])] * (parameters + 1),
                 wp.array(dtype=VECTOR[dtype]),
             ],
         )

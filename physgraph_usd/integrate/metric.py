@@ -45,6 +45,7 @@ class Metric:
             free: False where a vertex may not move: its row becomes the identity's.
             dtype: Scalar type of the right-hand sides.
         """
+        self._plain, self._dtype = matrix, dtype
         mask = free.cpu().numpy().ravel()
         diagonal = matrix.diagonal()
         mean = float(diagonal[mask].mean()) if mask.any() else 1.0
@@ -60,6 +61,11 @@ class Metric:
         values = torch.as_tensor(coo.data.astype(np.float64), device=free.device)
         self._solver = solver(matrix.shape[0], rows, columns, values, MatrixType.COO) if len(mask) else None
         self._mask = free
+
+    def plus(self, diagonal: Float[Tensor, " vertices"]) -> Metric:
+        """The metric of the same cloth held by springs of given stiffness [N/m], factorised anew."""
+        springs = sp.diags(diagonal.double().cpu().numpy())
+        return Metric(sp.csr_matrix(self._plain + springs), free=self._mask, dtype=self._dtype)
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero where a vertex may not move."""

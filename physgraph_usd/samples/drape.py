@@ -19,6 +19,9 @@ from .grid import springs
 GRAVITY = np.array([0.0, -9.81, 0.0])
 """Gravity of the samples' simulations [m/s^2]; they are made with Y up."""
 
+RENEWALS = 3
+"""Iterations of a step after which it is settled which points touch something."""
+
 
 @dataclass(frozen=True)
 class DrapeOptions:
@@ -32,6 +35,8 @@ class DrapeOptions:
         bend: Weight of the squared Laplacian [N/m], keeps the cage smooth.
         drag: Part of the velocity lost per second.
         density: Areal density [kg/m^2].
+        contact: Stiffness with which points that are moved out of something stay there, in springs; with 0 they
+            are moved but do not hold up their neighbours.
     """
 
     step: float = 1.0 / 48.0
@@ -41,6 +46,7 @@ class DrapeOptions:
     bend: float = 0.15
     drag: float = 1.0
     density: float = 0.2
+    contact: float = 0.0
 
 
 class Drape:
@@ -81,17 +87,23 @@ class Drape:
         self._inertia = self.options.density * _areas(rest, faces) / self.options.step**2
         self._hold = np.zeros(count)
         self._hold[pinned] = 1e3 * self.options.spring
-        self._solver = self._factorise(rest)
+        smooth = _smoothing(rest, faces)
+        self._elastic = self._gather @ self._difference, self.options.bend * self.options.spring * (smooth.T @ smooth)
+        self._touching = np.zeros(count, bool)
+        self._solver = self._factorise()
 
-    def _factorise(self, rest: np.ndarray) -> SuperLU:
-        """Factorise inertia + springs + bending + pins."""
-        smooth = _smoothing(rest, self.faces)
-        system = (
-            sparse.diags(self._inertia + self._hold)
-            + self._gather @ self._difference
-            + self.options.bend * self.options.spring * (smooth.T @ smooth)
-        )
-        return splu(sparse.csc_matrix(system))
+    def _factorise(self) -> SuperLU:
+        """Factorise inertia + springs + bending + pins + contact."""
+        fixed = self._inertia + self._hold + self._contact()
+        system = sparse.csc_matrix(sparse.diags(fixed) + self._elastic[0] + self._elastic[1])
+        if self.options.contact == 0.0:
+            return splu(system)
+        # factorised often: an ordering for symmetric matrices is quicker
+        return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    def _contact(self) -> np.ndarray:
+        """Stiffness that holds points where they were moved to [N/m]."""
+        return self.options.contact * self.options.spring * self._touching
 
     def step(self, targets: np.ndarray, *, force: np.ndarray | None = None) -> np.ndarray:
         """Advance one time step.
@@ -110,16 +122,27 @@ class Drape:
         right = self._inertia[:, None] * free
         right[self.pinned] += self._hold[self.pinned, None] * targets
         points = free
-        for _ in range(self.options.iterations):
+        for iteration in range(self.options.iterations):
             edge = self._difference @ points
             length = np.linalg.norm(edge, axis=1)
             wanted = np.clip(length, self.options.give * self._length, self._length)
-            points = self._solver.solve(right + self._gather @ (edge * (wanted / length)[:, None]))
+            kept = self._contact()[:, None] * points
+            points = self._solver.solve(right + kept + self._gather @ (edge * (wanted / length)[:, None]))
             if self._project is not None:
-                points = self._project(points, self.time)
+                moved = self._project(points, self.time)
+                if iteration < RENEWALS and self.options.contact > 0.0:
+                    self._touch(np.abs(moved - points).max(axis=1) > 1e-9, afresh=iteration == 0)
+                points = moved
         self.velocity = (points - self.points) / step
         self.points = points
         return points
+
+    def _touch(self, moved: np.ndarray, *, afresh: bool) -> None:
+        """Let the points that were moved count as touching, besides or in place of those that did."""
+        touching = moved if afresh else moved | self._touching
+        if not np.array_equal(touching, self._touching):
+            self._touching = touching
+            self._solver = self._factorise()
 
     def normals(self) -> np.ndarray:
         """Return unit vertex normals, shape (V, 3)."""

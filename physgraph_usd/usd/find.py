@@ -38,7 +38,7 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
         StageError: When an item, or nothing at all, is found; the message lists the meshes that there are.
     """
     if wanted:
-        chosen = {path for item in wanted for path in _match(stage, item, UsdGeom.Mesh)}
+        chosen = {path for item in wanted for path in find_paths(stage, item, UsdGeom.Mesh)}
         return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
     found = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API)]
     if not found:
@@ -68,9 +68,9 @@ def find_colliders(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Seque
     Raises:
         StageError: When a named one is not there.
     """
-    chosen: set[Sdf.Path] = set()
-    for prim in garments:
-        chosen |= felt_by(stage, prim, wanted)
+    chosen = {path for item in wanted for path in find_paths(stage, item, UsdGeom.Gprim)}
+    for prim in () if wanted else garments:
+        chosen |= felt_by(stage, prim)
     own = {prim.GetPath() for prim in garments}
     return [prim for prim in traverse(stage) if prim.GetPath() in chosen - own]
 
@@ -81,9 +81,9 @@ def felt_by(stage: Usd.Stage, garment: Usd.Prim, wanted: Sequence[str] = ()) -> 
     Raises:
         StageError: When a named one is not there.
     """
-    named = wanted or [str(target) for target in _targets(garment)]
+    named = wanted or [str(target) for target in targets_of(garment, _COLLIDERS_RELATIONSHIP)]
     if named:
-        return {path for item in named for path in _match(stage, item, UsdGeom.Gprim)}
+        return {path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)}
     return {path for prim in traverse(stage) if _collides(prim) for path in _gprims_below(prim, UsdGeom.Gprim)}
 
 
@@ -102,8 +102,9 @@ def traverse(stage: Usd.Stage) -> Iterator[Usd.Prim]:
     return iter(Usd.PrimRange.Stage(stage, TRAVERSAL))
 
 
-def _targets(prim: Usd.Prim) -> list[Sdf.Path]:
-    relationship = prim.GetRelationship(_COLLIDERS_RELATIONSHIP)
+def targets_of(prim: Usd.Prim, name: str) -> list[Sdf.Path]:
+    """What a relationship of a prim names; collections are named by their property paths."""
+    relationship = prim.GetRelationship(name)
     return relationship.GetForwardedTargets() if relationship else []
 
 
@@ -113,8 +114,17 @@ def _collides(prim: Usd.Prim) -> bool:
     return is_collision_prim(prim)
 
 
-def _match(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
-    """Paths of the prims of a kind that an item names."""
+def find_paths(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
+    """Paths of the prims of a kind that an item names.
+
+    Args:
+        stage: The stage.
+        item: A prim path (standing for what is below it), a prim name, a glob over paths or a collection.
+        kind: A class of UsdGeom.
+
+    Raises:
+        StageError: When there is none.
+    """
     roots: Iterable[Usd.Prim]
     if _COLLECTION in item:  # its members are told one by one, so that what it excludes stays out
         roots = [prim for prim in _collection(stage, item) if kind(prim)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -113,6 +114,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     rest = rest or _rest_on_stage(prim, matrix, request, edges=edges, start=start, first=first)
     values = find_values(prim, request.units, request.overrides)
     level, level_source = _level(prim, request)
+    (own, own_source), (layer, layer_source) = _feels_itself(prim, request), _layer(prim, request)
     garment = Garment(
         path=str(prim.GetPath()),
         mesh=cage.mesh,
@@ -120,12 +122,14 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         level=level,
         flipped=is_flipped(prim, matrix),
         bent_rest=rests_bent(prim),
-        colliders=(),
+        self_contact=own,
+        layer=layer,
         **_painted(prim, points.count, notices),
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
     skinned = prim.GetPath() in request.bake.skinned
-    named = {**values.sources, "refine:level": level_source, "rest": rest.source}
+    named = {"contact:selfCollision": own_source, "contact:layer": layer_source, "rest": rest.source}
+    named |= values.sources | {"refine:level": level_source}
     place_on_stage = (prim.GetPath(), cage.kept_faces, skinned, tuple(roots), times)
     return GarmentReader(
         garment, GarmentSource(*place_on_stage, named, values.animated), values, points, edges, notices
@@ -158,7 +162,18 @@ def _level(prim: Usd.Prim, request: Request) -> tuple[int, str]:
     return round(found.at(None) or 0.0), found.source
 
 
-def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, np.ndarray]:
+def _layer(prim: Usd.Prim, request: Request) -> tuple[int | None, str]:
+    found = find_value(prim, GARMENT["contact:layer"], request.overrides)
+    place = found.at(None)
+    return None if place is None else round(place), found.source
+
+
+def _feels_itself(prim: Usd.Prim, request: Request) -> tuple[bool, str]:
+    found = find_value(prim, GARMENT["contact:selfCollision"], request.overrides)
+    return bool(found.at(None)), found.source
+
+
+def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, Any]:
     """The painted arrays of a garment by field name; adds to the notices."""
     names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
     names |= {"detail_scale": "detailScale", "pin": "pin"}

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
-from .schema import COLLIDER_API, GARMENT, MATERIAL, Property, find_property
+from .schema import AUTO_LEVEL, COLLIDER_API, GARMENT, MATERIAL, Property, find_property
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
-_WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0, "auto": -1.0}
+_WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0}
 USER_PROPERTIES = "userProperties:"
 """Namespace in which Blender exports custom properties."""
 
@@ -88,7 +88,8 @@ def _parse_override(text: str) -> Override:
     if row.type == "rel" or row.interpolation:
         raise UsageError(f"{row.name} is not a single number; author it on the prim")
     try:
-        value = _WORDS[word] if word in _WORDS else float(word)
+        words = _WORDS | ({"auto": AUTO_LEVEL} if row is GARMENT["refine:level"] else {})
+        value = words[word] if word in words else float(word)
         return Override(Sdf.Path(match["prim"] or "/"), row, check_limits(row, value, text))
     except (ValueError, SchemaError) as error:
         raise UsageError(f"cannot use {text!r}: {error}") from error

@@ -20,6 +20,7 @@ from pxr import Sdf, Usd
 
 from ..errors import SchemaError, StageError, UsageError
 from ..scene import Frame, Scene
+from .apart import read_apart
 from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
@@ -68,17 +69,25 @@ class Shot:
         self._readers, self._request = tuple(readers), request
         self._bodies: tuple[ColliderReader, ...] = ()
 
-    def add_colliders(self, bodies: Sequence[ColliderReader], felt: Sequence[tuple[int, ...]]) -> None:
+    def add_colliders(
+        self, bodies: Sequence[ColliderReader], felt: Sequence[tuple[int, ...]], apart: Sequence[dict[str, str]]
+    ) -> None:
         """Take colliders into the scene.
 
         Args:
             bodies: The colliders.
             felt: For each garment, the numbers of those that it feels.
+            apart: For each garment, the paths of colliders and garments that it never touches, and what says so.
         """
         self._bodies = tuple(bodies)
-        garments = (replace(garment, colliders=own) for garment, own in zip(self.scene.garments, felt, strict=True))
+        paths = [garment.path for garment in self.scene.garments]
+        garments = (
+            replace(garment, colliders=own, apart_from=tuple(path for path in paths if path in excluded))
+            for garment, own, excluded in zip(self.scene.garments, felt, apart, strict=True)
+        )
         colliders = tuple(body.collider for body in bodies)
         self.scene = replace(self.scene, garments=tuple(garments), colliders=colliders)
+        self.sources = tuple(replace(s, apart_from=excluded) for s, excluded in zip(self.sources, apart, strict=True))
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
         """Matrix from a garment's local space to world metres.
@@ -210,17 +219,23 @@ def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) 
 
 
 def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str], *, notices: list[Notice]) -> None:
-    """Read the colliders and which garment feels which."""
+    """Read the colliders and which garment feels which; those that all are kept apart from are not read."""
+    prims = [shot.stage.GetPrimAtPath(source.path) for source in shot.sources]
+    named = [felt_by(shot.stage, prim, wanted) for prim in prims]
+    excluded, odd = read_apart(shot.stage, prims)
+    notices += odd
+    cloth = {prim.GetPath() for prim in prims}
+    apart = [{p: said for p, said in off.items() if p in own | cloth} for own, off in zip(named, excluded, strict=True)]
+    felt = [{str(path) for path in own - set(off)} for own, off in zip(named, apart, strict=True)]
     bodies = []
     for path in paths:
+        if not any(str(path) in own for own in felt):
+            continue
         body, odd = read_collider(shot.stage.GetPrimAtPath(path), shot.metres_per_unit)
         notices += odd
         bodies += [body] if body is not None else []
-    felt = []
-    for source in shot.sources:
-        own = {str(path) for path in felt_by(shot.stage, shot.stage.GetPrimAtPath(source.path), wanted)}
-        felt.append(tuple(index for index, body in enumerate(bodies) if body.collider.path in own))
-    shot.add_colliders(bodies, felt)
+    numbers = [tuple(i for i, body in enumerate(bodies) if body.collider.path in own) for own in felt]
+    shot.add_colliders(bodies, numbers, [{str(path): said for path, said in off.items()} for off in apart])
 
 
 def _read(

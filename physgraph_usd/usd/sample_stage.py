@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
-from ..fabric import Fabric
 from .plain import Look, PlainMesh, PlainStage, Skeleton
 
 
@@ -60,7 +59,7 @@ def _write_mesh(stage: Usd.Stage, record: PlainStage, mesh: PlainMesh) -> None:
     _write_primvars(usd, mesh)
     _write_looks(stage, usd, mesh)
     if mesh.role == "garment":
-        _write_garment(usd.GetPrim(), mesh.fabric, mesh.level)
+        _write_garment(usd.GetPrim(), mesh)
     elif mesh.role == "collider":
         usd.GetPrim().AddAppliedSchema("PhysGraphColliderAPI")
 
@@ -135,11 +134,14 @@ def _material(stage: Usd.Stage, look: Look) -> UsdShade.Material:
     return material
 
 
-def _write_garment(prim: Usd.Prim, fabric: Fabric | None, level: int) -> None:
-    """Apply the garment schema by name and author its material values."""
+def _write_garment(prim: Usd.Prim, mesh: PlainMesh) -> None:
+    """Apply the garment schema by name and author its values."""
     prim.AddAppliedSchema("PhysGraphGarmentAPI")
-    name, uniform = "physgraph:refine:level", Sdf.VariabilityUniform
-    prim.CreateAttribute(name, Sdf.ValueTypeNames.Int, False, uniform).Set(level)
+    for name, value in {"refine:level": mesh.level, "contact:layer": mesh.layer}.items():
+        if value is not None:
+            whole = Sdf.ValueTypeNames.Int
+            prim.CreateAttribute(f"physgraph:{name}", whole, False, Sdf.VariabilityUniform).Set(value)
+    fabric = mesh.fabric
     if fabric is None:
         return
     values = {

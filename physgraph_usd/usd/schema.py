@@ -20,7 +20,8 @@ MATERIAL = "physgraph:material:"
 AUTO_LEVEL = -1
 """Level that asks for as many subdivisions as the fabric's buckling wavelength needs."""
 
-_SI = " SI, whatever the stage's metersPerUnit."
+SI = " SI, whatever the stage's metersPerUnit."
+"""End of the doc of every property that has a unit."""
 _JERSEY = PRESETS["jersey"]
 
 
@@ -63,7 +64,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
 
     def row(name: str, fallback: float | None, unit: str, minimum: float, doc: str) -> Property:
         return Property(
-            schema, MATERIAL + name, "float", fallback if fallbacks else None, unit, minimum, None, doc + _SI
+            schema, MATERIAL + name, "float", fallback if fallbacks else None, unit, minimum, None, doc + SI
         )
 
     return (
@@ -90,19 +91,27 @@ PROPERTIES: tuple[Property, ...] = (
     *_material(GARMENT_API, fallbacks=True),
     Property(
         GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, None,
-        "How firmly the mean of the fine cloth follows the coarse animation." + _SI,
+        "How firmly the mean of the fine cloth follows the coarse animation." + SI,
     ),
     Property(
         GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, None,
-        "Distance kept from colliders." + _SI,
+        "Distance kept from colliders." + SI,
     ),
     Property(
         GARMENT_API, "physgraph:contact:selfCollision", "bool", True, "", None, None,
         "Whether the garment collides with itself.", True,
     ),
     Property(
+        GARMENT_API, "physgraph:contact:layer", "int", None, "", None, None,
+        "Order among garments: lower is nearer to the body; garments with equal or no layer are not ordered.", True,
+    ),
+    Property(
         GARMENT_API, "physgraph:colliders", "rel", None, "", None, None,
         "Colliders of this garment; empty means every collider prim on the stage.",
+    ),
+    Property(
+        GARMENT_API, "physgraph:contact:exclude", "rel", None, "", None, None,
+        "Colliders and garments that this garment never touches: prims, prims above them, or collections.",
     ),
     _scale("stretchScale", 1.0, None, "Painted multiplier of the stretch stiffness; vertex or constant."),
     _scale("bendScale", 1.0, None, "Painted multiplier of the bending stiffness; vertex or constant."),
@@ -115,7 +124,7 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None,
-        "Distance kept from this collider, added to the garment's." + _SI,
+        "Distance kept from this collider, added to the garment's." + SI,
     ),
     *_material(MATERIAL_API, fallbacks=False),
 )  # fmt: skip

@@ -11,7 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-from .schema import COLLIDER_API, GARMENT_API, MATERIAL_API, PROPERTIES, Property, schema_path
+from .schema import COLLIDER_API, GARMENT_API, MATERIAL_API, PROPERTIES, SI, Property, schema_path
 
 APPLIES_TO = {GARMENT_API: ["Mesh"], COLLIDER_API: ["Mesh", "Gprim"], MATERIAL_API: ["Material"]}
 """Prim types that each schema can be applied to."""
@@ -95,6 +95,25 @@ def schema_files() -> dict[str, str]:
         "plugInfo.json": json.dumps({"Plugins": [plugin]}, indent=4) + "\n",
         "schema.usda": f"{_HEADER}    subLayers = [\n        @usd/schema.usda@\n    ]\n)\n{_GLOBAL}{source}",
     }
+
+
+def attribute_table() -> str:
+    """Every property of the schemas as the table of docs/attributes.md."""
+    lines = ["| attribute | type | fallback | unit, limits | |", "|---|---|---|---|---|"]
+    for schema in APPLIES_TO:
+        lines.append(f"| **{schema}** | | | | |")
+        lines += [_table_row(row) for row in PROPERTIES if row.schema == schema]
+    return "\n".join(lines) + "\n"
+
+
+def _table_row(row: Property) -> str:
+    """One property as a line of Markdown."""
+    kind = f"uniform {row.type}" if row.uniform else row.type
+    fallback = "" if row.fallback is None else _number(row, row.fallback)
+    low, high = ("" if value is None else _number(row, value) for value in (row.minimum, row.maximum))
+    limits = f"{low} .. {high}".strip() if low or high else ""
+    unit = ", ".join(part for part in (row.unit, limits) if part)
+    return f"| `{row.name}` | {kind} | {fallback} | {unit} | {row.doc.removesuffix(SI)} |"
 
 
 def main(folder: Path | None = None) -> None:

@@ -59,6 +59,7 @@ class GarmentSource:
         times: The garment's own authored times in range; empty for a still one.
         sources: Which source won, by short name of the value.
         animated: Short names of the values whose source has time samples.
+        apart_from: What it never touches though it would, by path: colliders and garments, and what says so.
     """
 
     path: Sdf.Path
@@ -68,6 +69,7 @@ class GarmentSource:
     times: tuple[float, ...]
     sources: dict[str, str]
     animated: frozenset[str] = field(default=frozenset())
+    apart_from: dict[str, str] = field(default_factory=dict)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,297 @@
+"""Contact of a group's cloth with itself: the planes that parts see in one another, and the mending of new crossings.
+
+Penalty springs keep parts apart but promise nothing. The promise is `ClothView.mend`: positions are taken back towards
+the last good ones round each edge that newly passes through a face, until no more edges do so than before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..forces.self_contact import Gaps, SelfContact
+from ..level import Level
+from ..scene import Garment
+from .broad_phase import touch_one_another
+from .cloth_mesh import ClothMesh, Crossings, Pairs
+from .regions import Regions
+from .untangle import cut_off, gaps_out
+
+LEAST_OFFSET = 0.25
+"""Part of the thickness that parts keep where the input has them closer."""
+ZONE = 2
+"""Rings round a crossing of the input within which crossings may wander."""
+SMOOTHINGS = 4
+"""Passes that smooth the move round new crossings before any takes it back: a smooth move crosses nothing."""
+MENDS = 8
+"""Most passes in all; after them the whole group goes back."""
+TURNED = 0.5
+"""Cosine beyond which the way from one part to another counts as turned round since the input: one passed through."""
+OUT = 0.5
+"""How far crossing parts are moved past one another in a round, in mean edges."""
+FRONTAL = 0.3
+"""Cosine to the inner garment's normal under which a pair of ordered garments is beside it, not through it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClothState:
+    """Positions whose crossings are known.
+
+    Attributes:
+        x: Positions [m].
+        crossings: What crosses there.
+    """
+
+    x: Float[Tensor, "vertices 3"]
+    crossings: Crossings
+
+
+class ClothContact:
+    """What lasts over the shot: each level's hierarchy and patches, built when first needed."""
+
+    def __init__(self, levels: Sequence[Level], garments: Sequence[Garment]) -> None:
+        """Note which garments feel which.
+
+        Args:
+            levels: The group's levels, cage first.
+            garments: The garments.
+        """
+        self._levels = tuple(levels)
+        self.meets = np.array([[_meet(a, b) for b in garments] for a in garments], dtype=bool)
+        order = [np.nan if garment.layer is None else float(garment.layer) for garment in garments]
+        outward = [-1.0 if garment.flipped else 1.0 for garment in garments]
+        device, dtype = levels[0].device, levels[0].dtype
+        self.order, self.outward = (torch.tensor(each, dtype=dtype, device=device) for each in (order, outward))
+        self._meshes: dict[int, ClothMesh] = {}
+        self._regions: dict[int, Regions] = {}
+
+    def mesh(self, level: Level) -> ClothMesh:
+        """The hierarchy of a level."""
+        if level.index not in self._meshes:
+            self._meshes[level.index] = ClothMesh(level, self.meets)
+        return self._meshes[level.index]
+
+    def regions(self, level: Level) -> Regions:
+        """The patches of a level."""
+        if level.index not in self._regions:
+            self._regions[level.index] = Regions(self._levels[0], level, self.meets)
+        return self._regions[level.index]
+
+
+def _meet(a: Garment, b: Garment) -> bool:
+    """Whether two garments feel one another."""
+    if a is b:
+        return a.self_contact
+    return touch_one_another(a, b)
+
+
+class ClothView:
+    """One level's cloth in one frame.
+
+    Attributes:
+        tangled: Whether anything crossed where the term was asked for last.
+    """
+
+    def __init__(
+        self,
+        lasting: ClothContact,
+        level: Level,
+        base: Float[Tensor, "vertices 3"],
+        *,
+        thickness: Float[Tensor, " garments"],
+        stiffness: float,
+    ) -> None:
+        """Take the frame.
+
+        Args:
+            lasting: The group's cloth.
+            level: The level.
+            base: The upsampled cage [m]: distances that it has are not widened.
+            thickness: Of each garment [m].
+            stiffness: k_c [N/m^3].
+        """
+        self._lasting, self._level, self._base = lasting, level, base
+        self._mesh, self._regions = lasting.mesh(level), lasting.regions(level)
+        self._thickness, self._stiffness = thickness, stiffness
+        self._sides: Tensor | None = None
+        self.tangled = False
+        self._reach = float(thickness.max()) + float(level.spacing.mean())
+
+    @cached_property
+    def before(self) -> ClothState:
+        """The upsampled cage."""
+        return self.look(self._base)
+
+    def look(self, x: Float[Tensor, "vertices 3"]) -> ClothState:
+        """Find what crosses at x."""
+        busy = self._regions.busy(x, 0.0)
+        if not bool(busy.any()):
+            none = torch.zeros(0, dtype=torch.int64, device=x.device)
+            return ClothState(x, Crossings(none, none, 0))
+        self._mesh.move(x)
+        return ClothState(x, self._mesh.crossings(busy))
+
+    def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | None:
+        """The force between parts that are near one another, or None where no parts are.
+
+        Sides are those of the first positions asked for in which nothing crosses; what crosses is drawn out.
+        """
+        busy = self._regions.busy(x, self._reach)
+        self.tangled = False
+        if not bool(busy.any()):
+            return None
+        self._mesh.move(x)
+        crossings = self._mesh.crossings(busy)
+        self.tangled = crossings.count > 0
+        if self._sides is None or self.tangled:
+            self._sides = x
+        gaps = self._gaps(self._mesh.pairs(busy, torch.full_like(self._level.spacing, self._reach)), x, crossings)
+        if crossings.count:
+            step = OUT * float(self._level.spacing.mean())
+            gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=self._stiffness))
+        return SelfContact(self._level, gaps) if len(gaps.corners) else None
+
+    def mend(self, x: Float[Tensor, "vertices 3"], good: ClothState | None = None) -> ClothState:
+        """Smooth the move from good positions, and then take it back, wherever something crosses that did not.
+
+        Args:
+            x: Positions to mend [m].
+            good: Positions to fall back on; the upsampled cage when None.
+
+        Returns:
+            Positions with no more crossings than the good ones have, and none away from where those had some; where
+            that cannot be had, the positions found that have the fewest.
+        """
+        good = good or self.before
+        zone = self._mesh.grown(self._corners(good.crossings), ZONE)
+        best = state = self.look(x)
+        shift = x - good.x
+        for attempt in range(MENDS):
+            corners = self._mesh.corners_of(state.crossings)
+            new = ~zone[corners].all(dim=1)
+            if state.crossings.count > good.crossings.count:
+                new = torch.ones_like(new)
+            if not bool(new.any()):
+                return state
+            back = torch.zeros_like(zone)
+            back[corners[new].reshape(-1)] = True
+            if attempt < SMOOTHINGS:
+                shift = self._smoothed(shift, self._mesh.grown(back, attempt + 1), passes=4 << attempt)
+            else:
+                shift = shift * self._falling_off(back, attempt - SMOOTHINGS + 1)
+            state = self.look(good.x + shift)
+            best = min(best, state, key=lambda each: each.crossings.count)
+        return best
+
+    def measure(self, x: Float[Tensor, "vertices 3"]) -> dict[str, dict[str, int]]:
+        """What crosses before and after, as plain values.
+
+        Args:
+            x: The result [m].
+        """
+        said = {}
+        for name, state in (("before", self.before), ("after", self.look(x))):
+            table = self._mesh.between(state.crossings)
+            apart = int(np.triu(table, 1).sum())
+            said[name] = {"crossings": state.crossings.count, "between_garments": apart}
+        return said
+
+    def _smoothed(self, shift: Tensor, where: Bool[Tensor, " vertices"], *, passes: int) -> Tensor:
+        """Displacements averaged over neighbours again and again within a region; held outside."""
+        which = np.flatnonzero((where & self._level.free[:, 0]).cpu().numpy())
+        rows = self._mesh.beside[which]
+        share = 1.0 / np.maximum(np.asarray(rows.sum(axis=1)), 1.0)
+        values = shift.cpu().numpy().copy()
+        for _ in range(passes):
+            values[which] = share * (rows @ values)
+        return torch.as_tensor(values).to(shift)
+
+    def _falling_off(self, back: Bool[Tensor, " vertices"], rings: int) -> Float[Tensor, "vertices 1"]:
+        """0 within some rings of given vertices, rising to 1 over as many rings more."""
+        inner = self._mesh.grown(back, rings - 1)
+        kept = 1.0 - inner.to(self._base)
+        for step in range(rings):
+            inner_next = self._mesh.grown(inner, 1)
+            kept = torch.where(inner_next & ~inner, torch.full_like(kept, (step + 1) / (rings + 1)), kept)
+            inner = inner_next
+        return kept.unsqueeze(1)
+
+    def _corners(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
+        """Vertices of what crosses."""
+        out = torch.zeros_like(self._level.free[:, 0])
+        out[self._mesh.corners_of(crossings).reshape(-1)] = True
+        return out
+
+    def _gaps(self, pairs: Pairs, x: Float[Tensor, "vertices 3"], crossings: Crossings) -> Gaps:
+        """Planes between parts, each on the side that it had at the start or, if ordered, that it should have."""
+        corners = pairs.corners.long()
+        garment = self._level.vertex_garment.long()[corners[:, [0, 3]]]
+        ordered = self._lasting.order[garment[:, 0]] != self._lasting.order[garment[:, 1]]
+        ordered &= ~self._lasting.order[garment].isnan().any(dim=1)
+        off = cut_off(self._mesh, crossings) if crossings.count else torch.zeros_like(self._level.free[:, 0])
+        swapped, undecided = _swapped(off[corners], pairs.face, self._is_split(off)[garment])
+        kept = (~self._corners(crossings)[corners].any(dim=1) & ~undecided) | ordered
+        pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
+        corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
+        way, at_input, at_start = (
+            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, self._sides)
+        )
+        normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
+        distance = at_input.norm(dim=1)
+        turned = (normal * at_start).sum(dim=1) < -TURNED * at_start.norm(dim=1)
+        wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), turned ^ swapped)
+        normal = torch.where(wrong.unsqueeze(1), -normal, normal)
+        thickness = self._thickness[garment].mean(dim=1)
+        offset = torch.minimum(thickness, torch.maximum(distance, LEAST_OFFSET * thickness))
+        offset = torch.where(wrong & ordered, thickness, offset)
+        # What is on the wrong side comes back a little each round: all at once would tear the cloth.
+        most = OUT * float(self._level.spacing.mean())
+        offset = torch.where(wrong, torch.minimum(offset, most - way.norm(dim=1)), offset)
+        area = self._level.vertex_area[corners]
+        share = torch.where(pairs.face, area[:, 0], area.amin(dim=1) / 3.0)
+        return Gaps(pairs.corners, pairs.weight, normal.contiguous(), offset.contiguous(), self._stiffness * share)
+
+    def _is_split(self, off: Bool[Tensor, " vertices"]) -> Bool[Tensor, " garments"]:
+        """Which garments have pieces that are cut off."""
+        split = torch.zeros(len(self._level.spans), dtype=torch.bool, device=off.device)
+        split[self._level.vertex_garment.long()[off]] = True
+        return split
+
+    def _on_wrong_side(self, pairs: Pairs, garment: Tensor, normal: Tensor) -> Bool[Tensor, " pairs"]:
+        """Whether the outer of two ordered garments lies inside the inner one."""
+        order = self._lasting.order[garment]
+        first_is_outer = order[:, 0] > order[:, 1]
+        side = self._mesh.normals().to(normal)[pairs.corners.long()]
+        # A vertex-face pair has one corner first, an edge-edge pair two.
+        split = torch.where(pairs.face, 1, 2).unsqueeze(1)
+        is_first = torch.arange(4, device=normal.device).unsqueeze(0) < split
+        inner = torch.where(first_is_outer.unsqueeze(1), ~is_first, is_first)
+        out = (side * inner.unsqueeze(2)).sum(dim=1)
+        out = torch.nn.functional.normalize(out, dim=1, eps=1e-30)
+        owner = torch.where(first_is_outer, garment[:, 1], garment[:, 0])
+        cosine = (out * normal).sum(dim=1) * self._lasting.outward[owner]
+        cosine = torch.where(first_is_outer, cosine, -cosine)
+        return cosine < -FRONTAL
+
+
+def _swapped(
+    off: Bool[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], split: Bool[Tensor, "pairs 2"]
+) -> tuple[Bool[Tensor, " pairs"], Bool[Tensor, " pairs"]]:
+    """Which pairs are to change sides, and which are beside a contour and have none.
+
+    Args:
+        off: Whether each corner is of a piece that is cut off.
+        face: Whether the pair is a vertex and a face.
+        split: Whether the first and the second garment of each pair have such pieces at all.
+    """
+    first = torch.where(face, off[:, 0], off[:, :2].all(dim=1))
+    second = torch.where(face, off[:, 1:].all(dim=1), off[:, 2:].all(dim=1))
+    both = first & second
+    swapped = both | (first & ~split[:, 1]) | (second & ~split[:, 0])
+    return swapped, (first ^ second) & ~swapped

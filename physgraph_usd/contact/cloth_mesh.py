@@ -1,0 +1,237 @@
+"""One level's cloth as something that can be near itself: closest faces and edges, crossings, and where to look."""
+
+# Warp's arrays are typed by values that only Warp reads.
+# pyright: reportArgumentType=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..level import Level
+from ..mesh.lanes import Launch
+from ..mesh.topology import find_edges
+from .proximity import edges_near, faces_near, pierced
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of material points that are near one another.
+
+    Attributes:
+        corners: Vertices, shape (N, 4), int32: a vertex and a face, or two edges.
+        weight: From the second point to the first, shape (N, 4).
+        face: Whether the pair is a vertex and a face, shape (N,).
+    """
+
+    corners: Int[Tensor, "pairs 4"]
+    weight: Float[Tensor, "pairs 4"]
+    face: Bool[Tensor, " pairs"]
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Edges that pass through faces.
+
+    Attributes:
+        edge: Shape (N,).
+        face: Shape (N,).
+        count: Number of such pairs; at most four faces an edge are listed.
+    """
+
+    edge: Int[Tensor, " crossings"]
+    face: Int[Tensor, " crossings"]
+    count: int
+
+
+class ClothMesh:
+    """The faces and edges of a level in a hierarchy that moves with them.
+
+    Attributes:
+        level: The level.
+        beside: Adjacency of its vertices, shape (V, V).
+        opposite: Vertices opposite each edge in the first two of its faces, -1 where there is none, shape (E, 2).
+    """
+
+    def __init__(self, level: Level, meets: np.ndarray) -> None:
+        """Build the hierarchy at the rest shape.
+
+        Args:
+            level: The level.
+            meets: Which garments feel which, symmetric, shape (G, G), bool.
+        """
+        self.level = level
+        wp.init()
+        edges, triangles = (each.cpu().numpy() for each in (level.edges, level.triangles))
+        self.beside = _adjacency(edges, level.vertex_count)
+        self._garments = len(level.spans)
+        self._position = level.rest.to(torch.float32).contiguous().clone()
+        self._normal = torch.zeros_like(self._position)
+        self.triangles = level.triangles.long()
+        self._sides = _owned_sides(edges, triangles)
+        self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
+        self._static = {
+            "rest": _vectors(level.rest.to(torch.float32).contiguous()),
+            "edges": wp.array(edges, dtype=wp.vec2i, device=level.device),
+            "triangles": wp.array(triangles, dtype=wp.vec3i, device=level.device),
+            "sides": wp.array(self._sides, dtype=wp.vec3i, device=level.device),
+            "starts": wp.array(self.beside.indptr.astype(np.int32), dtype=wp.int32, device=level.device),
+            "ring": wp.array(self.beside.indices.astype(np.int32), dtype=wp.int32, device=level.device),
+            "garment": wp.from_torch(level.vertex_garment.contiguous()),
+            "meets": wp.array(np.asarray(meets).astype(np.int32).ravel(), dtype=wp.int32, device=level.device),
+        }
+        indices = wp.array(triangles.ravel(), dtype=wp.int32, device=level.device)
+        self._mesh = wp.Mesh(points=_vectors(self._position), indices=indices)
+
+    def move(self, x: Float[Tensor, "vertices 3"]) -> None:
+        """Take positions [m]; what is asked afterwards is asked of them."""
+        self._position.copy_(x)
+        self._mesh.refit()
+
+    def normals(self) -> Float[Tensor, "vertices 3"]:
+        """Unit vertex normals of the authored winding."""
+        corner = self._position[self.triangles]
+        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        total = torch.zeros_like(self._position)
+        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
+        for i in range(3):
+            total.index_put_((self.triangles[:, i],), area, accumulate=True)
+        return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
+
+    def pairs(self, busy: Bool[Tensor, " vertices"], reach: Float[Tensor, " vertices"]) -> Pairs:
+        """The closest parts above and below what is busy.
+
+        Args:
+            busy: Which vertices to ask; edges near what they find are asked too.
+            reach: Distance beyond which nothing is near [m].
+
+        Returns:
+            Vertex-face pairs, then edge-edge pairs; an edge-edge pair occurs once.
+        """
+        self._normal.copy_(self.normals())
+        limit = reach.to(torch.float32).contiguous()
+        of_faces = self._vertex_face(torch.nonzero(busy).squeeze(1).to(torch.int32), limit)
+        # An edge near another has a vertex near a face, or next to one that is.
+        close = torch.zeros_like(busy)
+        close[of_faces[0].reshape(-1)] = True
+        close = self.grown(close, 1)
+        ends = self.level.edges.long()
+        of_edges = self._edge_edge(torch.nonzero(close[ends].any(dim=1)).squeeze(1).to(torch.int32), limit)
+        face = torch.zeros(len(of_faces[0]) + len(of_edges[0]), dtype=torch.bool, device=busy.device)
+        face[: len(of_faces[0])] = True
+        corners, weight = (torch.cat(both) for both in zip(of_faces, of_edges, strict=True))
+        return Pairs(corners.to(torch.int32).contiguous(), weight.to(self.level.dtype).contiguous(), face)
+
+    def crossings(self, busy: Bool[Tensor, " vertices"]) -> Crossings:
+        """Edges with a busy end that pass through faces."""
+        ends = self.level.edges.long()
+        ask = torch.nonzero(busy[ends].any(dim=1)).squeeze(1).to(torch.int32)
+        count = torch.zeros(len(ask), dtype=torch.int32, device=ask.device)
+        faces = torch.full((len(ask), 4), -1, dtype=torch.int32, device=ask.device)
+        if len(ask):
+            arrays = [self._static[name] for name in ("edges", "triangles", "garment", "meets")]
+            inputs = [wp.from_torch(ask), _vectors(self._position), *arrays, wp.int32(self._garments)]
+            self._run(pierced, len(ask), [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
+        listed = torch.nonzero(faces >= 0)
+        return Crossings(ask.long()[listed[:, 0]], faces.long()[listed[:, 0], listed[:, 1]], int(count.sum()))
+
+    def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
+        """Vertices at most some edges away from given ones."""
+        mask = vertices.cpu().numpy()
+        for _ in range(rings if mask.any() else 0):
+            mask = mask | (self.beside @ mask.astype(np.float32) > 0)
+        return torch.as_tensor(mask, device=vertices.device)
+
+    def corners_of(self, crossings: Crossings) -> Int[Tensor, "crossings 5"]:
+        """Vertices of the edge and of the face of each crossing."""
+        return torch.cat([self.level.edges.long()[crossings.edge], self.triangles[crossings.face]], dim=1)
+
+    def between(self, crossings: Crossings) -> np.ndarray:
+        """Number of listed crossings between garments, the lower number first, shape (G, G)."""
+        garment = self.level.vertex_garment.cpu().numpy()
+        ends = garment[self.corners_of(crossings)[:, [0, 2]].cpu().numpy()]
+        table = np.zeros((self._garments, self._garments), np.int64)
+        np.add.at(table, (ends.min(axis=1), ends.max(axis=1)), 1)
+        return table
+
+    def _vertex_face(self, ask: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """Corners and weights of the pairs of a vertex and a face."""
+        face = torch.full((len(ask), 2), -1, dtype=torch.int32, device=ask.device)
+        either = [torch.zeros((len(ask), 3), dtype=torch.float32, device=ask.device) for _ in range(2)]
+        if len(ask):
+            outputs = [wp.from_torch(face, dtype=wp.vec2i), *[_vectors(each) for each in either]]
+            self._run(faces_near, len(ask), [*self._asked(ask, reach, "triangles"), *outputs])
+        corners, weights = [], []
+        for side, weight in enumerate(either):
+            found = torch.nonzero(face[:, side] >= 0).squeeze(1)
+            three = self.triangles[face[found, side].long()]
+            corners.append(torch.cat([ask[found].long().unsqueeze(1), three], dim=1))
+            weights.append(torch.cat([torch.ones_like(weight[found, :1]), -weight[found]], dim=1))
+        return torch.cat(corners), torch.cat(weights)
+
+    def _edge_edge(self, ask: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """Corners and weights of the pairs of two edges."""
+        other = torch.full((len(ask), 2), -1, dtype=torch.int32, device=ask.device)
+        either = [torch.zeros((len(ask), 2), dtype=torch.float32, device=ask.device) for _ in range(2)]
+        if len(ask):
+            outputs = [wp.from_torch(other, dtype=wp.vec2i), *[wp.from_torch(each, dtype=wp.vec2f) for each in either]]
+            self._run(edges_near, len(ask), [*self._asked(ask, reach, "edges", "sides"), *outputs])
+        first, second, along = [], [], []
+        for side, place in enumerate(either):
+            found = torch.nonzero(other[:, side] >= 0).squeeze(1)
+            first.append(ask[found].long())
+            second.append(other[found, side].long())
+            along.append(place[found])
+        a, b, st = torch.cat(first), torch.cat(second), torch.cat(along)
+        # The pair that either edge found is one pair.
+        key = torch.minimum(a, b) * len(self.level.edges) + torch.maximum(a, b)
+        kept = torch.as_tensor(np.unique(key.cpu().numpy(), return_index=True)[1], device=a.device)
+        a, b, s, t = a[kept], b[kept], st[kept, 0], st[kept, 1]
+        ends = self.level.edges.long()
+        return torch.cat([ends[a], ends[b]], dim=1), torch.stack([1 - s, s, t - 1, -t], dim=1)
+
+    def _asked(self, ask: Tensor, reach: Tensor, *elements: str) -> list[object]:
+        """What both proximity kernels are told first."""
+        moving = [_vectors(self._position), _vectors(self._normal), self._static["rest"]]
+        lasting = [self._static[name] for name in (*elements, "starts", "ring", "garment", "meets")]
+        return [wp.from_torch(ask), wp.from_torch(reach), *moving, *lasting, wp.int32(self._garments)]
+
+    def _run(self, kernel: wp.Kernel, count: int, inputs: list[object]) -> None:
+        Launch(kernel, count, [self._mesh.id, *inputs], device=self.level.device, lanes=self.level.lanes)({})
+
+
+def _adjacency(edges: np.ndarray, count: int) -> sp.csr_matrix:
+    """Which vertices an edge joins."""
+    both = np.concatenate([edges, edges[:, ::-1]])
+    return sp.csr_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count))
+
+
+def _owned_sides(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The edges that each face owns, shape (T, 3): each edge once, -1 elsewhere."""
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edge = find_edges(edges, sides)
+    owned = np.full(len(sides), -1, np.int32)
+    kept = np.unique(edge, return_index=True)[1]
+    owned[kept] = edge[kept]
+    return owned.reshape(-1, 3)
+
+
+def _opposite(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Vertices opposite each edge in the first two of its faces, shape (E, 2), -1 where there is none."""
+    edge = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
+    third = triangles[:, [2, 0, 1]].reshape(-1).astype(np.int64)
+    out = np.full((len(edges), 2), -1, np.int64)
+    for place in (1, 0):  # The first face is written last: an edge of one face has it in the first place.
+        kept = np.unique(edge[:: 1 - 2 * place], return_index=True)
+        out[kept[0], place] = third[:: 1 - 2 * place][kept[1]]
+    out[out[:, 0] == out[:, 1], 1] = -1
+    return out
+
+
+def _vectors(tensor: Tensor) -> wp.array:
+    return wp.from_torch(tensor, dtype=wp.vec3f, requires_grad=False)

@@ -1,0 +1,114 @@
+"""One frame's contact as the solve of a level sees it: bodies and cloth together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..forces.contact import Contact
+from ..forces.self_contact import SelfContact, Spheres
+from ..level import Level
+from .bodies import FrameBodies, LevelBodies
+from .cloth import ClothContact, ClothView
+from .settings import ContactSettings
+
+Touch = Contact | SelfContact | Spheres
+"""A term that stands for something near."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelContact:
+    """One level's view of what it may touch.
+
+    Attributes:
+        bodies: Its view of the bodies, or None when there are none.
+        cloth: Its view of the cloth, or None when cloth is not to touch cloth.
+        rounds: How often in the level's steps pairs and planes are found anew.
+    """
+
+    bodies: LevelBodies | None
+    cloth: ClothView | None
+    rounds: int
+
+    @property
+    def tangled(self) -> bool:
+        """Whether cloth crossed cloth where the terms were asked for last."""
+        return self.cloth is not None and self.cloth.tangled
+
+    def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
+        """The forces of what is near positions x [m]; empty where nothing is."""
+        parts = [part.term(x) for part in (self.bodies, self.cloth) if part is not None]
+        return tuple(term for term in parts if term is not None)
+
+
+class FrameContact:
+    """What a group may touch in one frame."""
+
+    def __init__(
+        self,
+        levels: Sequence[Level],
+        coarse: Float[Tensor, "coarse 3"],
+        *,
+        bodies: FrameBodies | None,
+        cloth: ClothContact | None,
+        thickness: Sequence[float],
+        settings: ContactSettings,
+    ) -> None:
+        """Look at the upsampled cage.
+
+        Args:
+            levels: The group's levels.
+            coarse: Cage positions [m], recentred.
+            bodies: The bodies, or None when there are none.
+            cloth: The group's cloth, or None when cloth is not to touch cloth.
+            thickness: Of each garment's cloth [m].
+            settings: How contact is solved, with k_c itself as its stiffness.
+        """
+        self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
+        self._bodies, self._cloth = bodies, cloth
+        self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
+        self._views: dict[int, LevelContact] = {}
+
+    def at(self, level: Level) -> LevelContact:
+        """The view of one level, the same at each call."""
+        if level.index not in self._views:
+            bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
+            cloth = None
+            if self._cloth is not None:
+                base, stiffness = level.base.apply(self._coarse), self._settings.stiffness
+                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, stiffness=stiffness)
+            self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds)
+        return self._views[level.index]
+
+    def finish(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, object]]:
+        """Push the solved cloth out of bodies and take back what newly crosses.
+
+        Returns:
+            Positions [m], x itself where nothing had to move; and what had to move.
+        """
+        view = self.at(self._levels[-1])
+        moved: dict[str, object] = {}
+        good = None if view.cloth is None else view.cloth.mend(x)
+        x = x if good is None else good.x
+        if view.bodies is not None:
+            projected, moved["projected"] = view.bodies.project(x)
+            x = projected if view.cloth is None or projected is x else view.cloth.mend(projected, good).x
+        return x, moved
+
+    def measure(self, x: Float[Tensor, "vertices 3"]) -> dict[str, object]:
+        """What is in bodies and what crosses, before and after, as plain values.
+
+        Args:
+            x: The result [m].
+        """
+        finest = self._levels[-1]
+        view, said = self.at(finest), {}
+        if self._bodies is not None:
+            said |= self._bodies.measure(finest, finest.base.apply(self._coarse), x)
+        if view.cloth is not None:
+            said["cloth"] = view.cloth.measure(x)
+        return said

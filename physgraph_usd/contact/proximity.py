@@ -1,0 +1,291 @@
+"""Which parts of the cloth are near which, and which edges pass through which faces: one hierarchy a level.
+
+Queries are exact for what is asked: the closest face above and below a vertex, the closest edge above and below an
+edge. Parts that share a corner, or are one edge apart, are no pairs.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false
+from __future__ import annotations
+
+import warp as wp
+
+LEAST = 1e-9
+"""Distance under which two parts have no direction from one to the other [m]."""
+IN_PLANE = 0.5
+"""Cosine to the normal under which a neighbour lies in the plane of the cloth rather than above or below it."""
+CLOSED_IN = 0.5
+"""Distance over rest distance above which such a neighbour is where it belongs."""
+SLOTS = 4
+"""Faces kept for each edge that passes through some."""
+
+
+@wp.func
+def closest_on_triangle(p: wp.vec3f, a: wp.vec3f, b: wp.vec3f, c: wp.vec3f):  # noqa: PLR0911 - one region each
+    """Barycentric coordinates of the closest point (Ericson 2005, 5.1.5)."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec3f(1.0, 0.0, 0.0)
+    bp = p - b
+    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec3f(0.0, 1.0, 0.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        return wp.vec3f(1.0 - v, v, 0.0)
+    cp = p - c
+    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec3f(0.0, 0.0, 1.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        return wp.vec3f(1.0 - w, 0.0, w)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return wp.vec3f(0.0, 1.0 - w, w)
+    total = va + vb + vc
+    return wp.vec3f(va / total, vb / total, vc / total)
+
+
+@wp.func
+def is_beside(v: wp.int32, u: wp.int32, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
+    """Whether u is v or a neighbour of v."""
+    found = v == u
+    for k in range(starts[v], starts[v + 1]):
+        if ring[k] == u:
+            found = True
+    return found
+
+
+@wp.func
+def are_beside(e: wp.vec2i, g: wp.vec2i, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
+    """Whether two edges share a vertex or are joined by an edge."""
+    of_first = is_beside(e[0], g[0], starts, ring) or is_beside(e[0], g[1], starts, ring)
+    return of_first or is_beside(e[1], g[0], starts, ring) or is_beside(e[1], g[1], starts, ring)
+
+
+@wp.func
+def is_inside(s: float, t: float):
+    """Whether both places are inside their edges."""
+    return s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
+
+
+@wp.func
+def belongs(distance: float, rest_distance: float, cosine: float):
+    """Whether a part of the same garment is a neighbour in the plane, where it belongs."""
+    return wp.abs(cosine) < IN_PLANE and distance > CLOSED_IN * rest_distance
+
+
+@wp.kernel
+def faces_near(
+    first: wp.int32,
+    mesh: wp.uint64,
+    ask: wp.array(dtype=wp.int32),
+    reach: wp.array(dtype=wp.float32),
+    x: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+    rest: wp.array(dtype=wp.vec3f),
+    triangles: wp.array(dtype=wp.vec3i),
+    starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    garment: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    face: wp.array(dtype=wp.vec2i),
+    above: wp.array(dtype=wp.vec3f),
+    below: wp.array(dtype=wp.vec3f),
+):
+    """For each vertex asked, the closest face on either side within its reach, -1 where there is none."""
+    i = first + wp.tid()
+    v = ask[i]
+    p, n = x[v], normal[v]
+    far = wp.float32(reach[v])
+    best_up = wp.float32(far)
+    best_down = wp.float32(far)
+    up = wp.int32(-1)
+    down = wp.int32(-1)
+    grow = wp.vec3f(far, far, far)
+    query = wp.mesh_query_aabb(mesh, p - grow, p + grow)
+    f = wp.int32(0)
+    while wp.mesh_query_aabb_next(query, f):
+        t = triangles[f]
+        if meets[garment[v] * garments + garment[t[0]]] == 0:
+            continue
+        weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
+        way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
+        distance = wp.length(way)
+        if distance >= wp.max(best_up, best_down) or distance < LEAST:
+            continue
+        if is_beside(v, t[0], starts, ring) or is_beside(v, t[1], starts, ring) or is_beside(v, t[2], starts, ring):
+            continue
+        cosine = wp.dot(way, n) / distance
+        if garment[v] == garment[t[0]]:
+            at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
+            if belongs(distance, wp.length(at_rest), cosine):
+                continue
+        if cosine > 0.0:
+            if distance < best_up:
+                best_up = distance
+                up = f
+                above[i] = weight
+        elif distance < best_down:
+            best_down = distance
+            down = f
+            below[i] = weight
+    face[i] = wp.vec2i(up, down)
+
+
+@wp.kernel
+def edges_near(
+    first: wp.int32,
+    mesh: wp.uint64,
+    ask: wp.array(dtype=wp.int32),
+    reach: wp.array(dtype=wp.float32),
+    x: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+    rest: wp.array(dtype=wp.vec3f),
+    edges: wp.array(dtype=wp.vec2i),
+    sides: wp.array(dtype=wp.vec3i),
+    starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    garment: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    other: wp.array(dtype=wp.vec2i),
+    above: wp.array(dtype=wp.vec2f),
+    below: wp.array(dtype=wp.vec2f),
+):
+    """For each edge asked, the closest edge on either side within reach, inside both; -1 where there is none.
+
+    ``sides`` are the edges that each face owns, -1 for those that another face owns.
+    """
+    i = first + wp.tid()
+    e = ask[i]
+    a, b = edges[e][0], edges[e][1]
+    far = 0.5 * (reach[a] + reach[b])
+    n = normal[a] + normal[b]
+    n = n / wp.max(wp.length(n), 1.0e-20)
+    best_up = wp.float32(far)
+    best_down = wp.float32(far)
+    up = wp.int32(-1)
+    down = wp.int32(-1)
+    grow = wp.vec3f(far, far, far)
+    query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]) - grow, wp.max(x[a], x[b]) + grow)
+    f = wp.int32(0)
+    while wp.mesh_query_aabb_next(query, f):
+        for side in range(3):
+            g = sides[f][side]
+            if g < 0 or g == e:
+                continue
+            c, d = edges[g][0], edges[g][1]
+            if meets[garment[a] * garments + garment[c]] == 0:
+                continue
+            found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[d], 1.0e-12)
+            s, t, distance = found[0], found[1], found[2]
+            if not is_inside(s, t) or distance >= wp.max(best_up, best_down) or distance < LEAST:
+                continue
+            if are_beside(edges[e], edges[g], starts, ring):
+                continue
+            way = (1.0 - s) * x[a] + s * x[b] - (1.0 - t) * x[c] - t * x[d]
+            cosine = wp.dot(way, n) / distance
+            if garment[a] == garment[c]:
+                at_rest = (1.0 - s) * rest[a] + s * rest[b] - (1.0 - t) * rest[c] - t * rest[d]
+                if belongs(distance, wp.length(at_rest), cosine):
+                    continue
+            if cosine > 0.0:
+                if distance < best_up:
+                    best_up = distance
+                    up = g
+                    above[i] = wp.vec2f(s, t)
+            elif distance < best_down:
+                best_down = distance
+                down = g
+                below[i] = wp.vec2f(s, t)
+    other[i] = wp.vec2i(up, down)
+
+
+@wp.func
+def volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Six times the signed volume of a tetrahedron."""
+    return wp.dot(b - a, wp.cross(c - a, d - a))
+
+
+@wp.func
+def wide(v: wp.vec3f):
+    """The same in double precision."""
+    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+
+@wp.func
+def passes_through(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d):
+    """Whether the inside of a segment passes through the inside of a triangle; touching is not passing."""
+    zero = wp.float64(0.0)
+    if volume(p, q, r, a) * volume(p, q, r, b) >= zero:
+        return False
+    u, v, w = volume(a, b, p, q), volume(a, b, q, r), volume(a, b, r, p)
+    return (u > zero and v > zero and w > zero) or (u < zero and v < zero and w < zero)
+
+
+@wp.kernel
+def pierced(
+    first: wp.int32,
+    mesh: wp.uint64,
+    ask: wp.array(dtype=wp.int32),
+    x: wp.array(dtype=wp.vec3f),
+    edges: wp.array(dtype=wp.vec2i),
+    triangles: wp.array(dtype=wp.vec3i),
+    garment: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    count: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec4i),
+):
+    """For each edge asked, how many faces it passes through, and the first of them."""
+    i = first + wp.tid()
+    a, b = edges[ask[i]][0], edges[ask[i]][1]
+    start, end = wide(x[a]), wide(x[b])
+    found = wp.vec4i(-1, -1, -1, -1)
+    total = wp.int32(0)
+    query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]), wp.max(x[a], x[b]))
+    f = wp.int32(0)
+    while wp.mesh_query_aabb_next(query, f):
+        t = triangles[f]
+        if a == t[0] or a == t[1] or a == t[2] or b == t[0] or b == t[1] or b == t[2]:
+            continue
+        if meets[garment[a] * garments + garment[t[0]]] == 0:
+            continue
+        if passes_through(start, end, wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])):
+            if total < SLOTS:
+                found[total] = f
+            total += 1
+    count[i] = total
+    faces[i] = found
+
+
+@wp.kernel
+def patches_meet(
+    first: wp.int32,
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    starts: wp.array(dtype=wp.int32),
+    near: wp.array(dtype=wp.int32),
+    garment: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    flag: wp.array(dtype=wp.int32),
+):
+    """Whether the box of a patch meets that of another patch that is no near neighbour of it."""
+    i = first + wp.tid()
+    query = wp.bvh_query_aabb(tree, low[i], high[i])
+    j = wp.int32(0)
+    found = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        if found == 0 and meets[garment[i] * garments + garment[j]] == 1:
+            if not is_beside(i, j, starts, near):
+                found = 1
+    flag[i] = found

@@ -1,0 +1,200 @@
+"""Contact of cloth with cloth: springs that keep parts apart, each pair seen as a plane.
+
+    E = 1/2 sum_g k_g phi_g^2,   phi_g = max(offset_g - n_g . sum_i w_gi x_i, 0)          (`SelfContact`)
+    E = (k_sc / A) sum_uv (a_u + a_v) psi_uv^2,   psi_uv = max(R - |x_u - x_v|, 0)         (`Spheres`, PAPER P10)
+
+| symbol | here | meaning |
+|---|---|---|
+| sum_i w_gi x_i | ``Gaps`` | from one point to the other: vertex and face (1, -b0, -b1, -b2), two edges (1-s, s, t-1, -t) |
+| n_g | ``Gaps.normal`` | the side on which the first point lies, a unit vector |
+| k_g | ``Gaps.stiffness`` | k_c times the pair's area [N/m] |
+| A | sum of a_u + a_v over pairs nearer than R | [m^2]; its jumps are no forces (PAPER A12) |
+
+Pairs, weights and normals stay while the term lives, so it is a function of x alone, and a convex one.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..level import Level
+from .base import Elements, element_overloads
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """Pairs of material points that keep to their sides of one another.
+
+    Attributes:
+        corners: Vertices of each pair, shape (N, 4), int32.
+        weight: Their weights, shape (N, 4); each row sums to 0.
+        normal: From the second point to the first, unit, shape (N, 3).
+        offset: Distance kept [m], shape (N,).
+        stiffness: [N/m], shape (N,).
+    """
+
+    corners: Int[Tensor, "gaps 4"]
+    weight: Float[Tensor, "gaps 4"]
+    normal: Float[Tensor, "gaps 3"]
+    offset: Float[Tensor, " gaps"]
+    stiffness: Float[Tensor, " gaps"]
+
+    def with_more(self, other: Gaps) -> Gaps:
+        """These pairs and others."""
+        return Gaps(*(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)))
+
+    def vectors(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "gaps 3"]:
+        """From the second point to the first [m]."""
+        return (self.weight.unsqueeze(2) * x[self.corners.long()]).sum(dim=1)
+
+    def lacks(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " gaps"]:
+        """How far each pair is under its offset [m], not below zero."""
+        return (self.offset - (self.normal * self.vectors(x)).sum(dim=1)).clamp_min(0.0)
+
+
+@wp.kernel
+def _keep_apart(
+    first: wp.int32,
+    x: wp.array(dtype=Any),
+    corners: wp.array(dtype=wp.vec4i),
+    g0: wp.array(dtype=Any),
+    g1: wp.array(dtype=Any),
+    g2: wp.array(dtype=Any),
+    g3: wp.array(dtype=Any),
+    offset: wp.array(dtype=Any),
+    stiffness: wp.array(dtype=Any),
+    energy: wp.array(dtype=Any),
+    corner_force: wp.array(dtype=Any),
+):
+    i = first + wp.tid()
+    c = corners[i]
+    gap = wp.dot(g0[i], x[c[0]]) + wp.dot(g1[i], x[c[1]]) + wp.dot(g2[i], x[c[2]]) + wp.dot(g3[i], x[c[3]])
+    lack = wp.max(offset[i] - gap, offset.dtype(0.0))
+    push = stiffness[i] * lack
+    energy[i] = offset.dtype(0.5) * push * lack
+    corner_force[4 * i] = push * g0[i]
+    corner_force[4 * i + 1] = push * g1[i]
+    corner_force[4 * i + 2] = push * g2[i]
+    corner_force[4 * i + 3] = push * g3[i]
+
+
+_KEEP_APART = element_overloads(_keep_apart, width=4, parameters=2, vector_parameters=4)
+
+
+class SelfContact:
+    """Springs that keep pairs of material points apart.
+
+    Attributes:
+        gaps: The pairs.
+    """
+
+    name = "self_contact"
+
+    def __init__(self, level: Level, gaps: Gaps) -> None:
+        """Take the pairs."""
+        self.gaps = gaps
+        along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
+        self._elements = Elements(_KEEP_APART, gaps.corners, [*along, gaps.offset, gaps.stiffness], level=level)
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the force [N] in place and return the energy [J]."""
+        return self._elements.evaluate(x, force)
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """k w^2 / 3 of the pairs that push, summed at each vertex [N/m]."""
+        value = (self.gaps.lacks(x) > 0).to(x).unsqueeze(1) * self.gaps.stiffness.unsqueeze(1) * self.gaps.weight**2
+        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
+        out = torch.zeros_like(x[:, 0])
+        return out.index_put_((self.gaps.corners.long().reshape(-1),), value.reshape(-1) / 3.0, accumulate=True)
+
+    def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
+        """Which vertices belong to a pair."""
+        seen = torch.zeros_like(level.free)
+        seen[self.gaps.corners.long().reshape(-1)] = True
+        return seen
+
+    def rest_matrix(self) -> sp.csr_matrix | None:
+        """None: at rest nothing touches."""
+        return None
+
+
+@wp.kernel
+def _spheres(
+    first: wp.int32,
+    x: wp.array(dtype=Any),
+    corners: wp.array(dtype=wp.vec2i),
+    weight: wp.array(dtype=Any),
+    radius: wp.array(dtype=Any),
+    energy: wp.array(dtype=Any),
+    corner_force: wp.array(dtype=Any),
+):
+    i = first + wp.tid()
+    way = x[corners[i][1]] - x[corners[i][0]]
+    distance = wp.length(way)
+    lack = wp.max(radius[i] - distance, radius.dtype(0.0))
+    push = way * (radius.dtype(2.0) * weight[i] * lack / wp.max(distance, radius[i] * radius.dtype(1.0e-6)))
+    energy[i] = weight[i] * lack * lack
+    corner_force[2 * i] = -push
+    corner_force[2 * i + 1] = push
+
+
+_SPHERES = element_overloads(_spheres, width=2, parameters=2)
+
+
+class Spheres:
+    """The paper's self contact: vertices are spheres that push one another apart."""
+
+    name = "self_contact"
+
+    def __init__(
+        self,
+        level: Level,
+        pairs: Int[Tensor, "pairs 2"],
+        *,
+        radius: Float[Tensor, " pairs"],
+        stiffness: float,
+        area: float,
+    ) -> None:
+        """Weigh the pairs.
+
+        Args:
+            level: The level.
+            pairs: Vertices of each pair, once, int32.
+            radius: R of each pair [m].
+            stiffness: k_sc [N/m].
+            area: Sum of a_u + a_v over pairs nearer than R when the pairs were found [m^2]; its jumps are no forces.
+        """
+        ends = pairs.long()
+        self._pairs, self._radius = ends, radius
+        self._weight = stiffness / max(area, 1e-30) * (level.vertex_area[ends[:, 0]] + level.vertex_area[ends[:, 1]])
+        self._elements = Elements(_SPHERES, pairs, [self._weight, radius], level=level)
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the force [N] in place and return the energy [J]."""
+        return self._elements.evaluate(x, force)
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """2 w / 3 of the pairs that push, summed at both ends [N/m]."""
+        distance = (x[self._pairs[:, 1]] - x[self._pairs[:, 0]]).norm(dim=1)
+        value = torch.where(distance < self._radius, 2.0 / 3.0 * self._weight, torch.zeros_like(distance))
+        out = torch.zeros_like(x[:, 0])
+        return out.index_put_((self._pairs.reshape(-1),), value.repeat_interleave(2), accumulate=True)
+
+    def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
+        """Which vertices belong to a pair."""
+        seen = torch.zeros_like(level.free)
+        seen[self._pairs.reshape(-1)] = True
+        return seen
+
+    def rest_matrix(self) -> sp.csr_matrix | None:
+        """None: at rest nothing touches."""
+        return None

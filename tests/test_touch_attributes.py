@@ -1,0 +1,172 @@
+"""What a garment says of touching itself, other garments and colliders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pxr import Usd, UsdGeom
+from stages import COLLIDER_API, add_sheet, author, new_stage, save
+
+from physgraph_usd.cli import _outline
+from physgraph_usd.errors import SchemaError, UsageError
+from physgraph_usd.scene import Garment
+from physgraph_usd.shot import inspect_shot
+from physgraph_usd.usd.reader import Shot, open_shot
+
+CLOTH = "/World/rig/cloth"
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Usd.Stage:
+    made = new_stage(tmp_path / "s.usda")
+    add_sheet(made, CLOTH)
+    return made
+
+
+def garment(stage: Usd.Stage, *overrides: str) -> tuple[Garment, dict[str, str]]:
+    shot = open_shot(save(stage), overrides=overrides)
+    return shot.scene.garments[0], shot.sources[0].sources
+
+
+class TestSelfContactAndLayer:
+    def test_a_garment_feels_itself_and_has_no_layer_unless_it_says_so(self, stage: Usd.Stage):
+        read, sources = garment(stage)
+        assert (read.self_contact, read.layer) == (True, None)
+        assert (sources["contact:selfCollision"], sources["contact:layer"]) == ("fallback", "fallback")
+
+    @pytest.mark.parametrize("layer", [0, 3, -1])
+    def test_both_are_read_with_their_source(self, stage: Usd.Stage, layer: int):
+        prim = stage.GetPrimAtPath(CLOTH)
+        author(prim, "physgraph:contact:selfCollision", False, kind="bool")
+        author(prim, "physgraph:contact:layer", layer, kind="int")
+        read, sources = garment(stage)
+        assert (read.self_contact, read.layer) == (False, layer)
+        assert sources["contact:layer"] == f"<{CLOTH}>.physgraph:contact:layer"
+
+    def test_an_ancestor_gives_them_in_any_numeric_type(self, stage: Usd.Stage):
+        author(stage.GetPrimAtPath("/World/rig"), "userProperties:physgraph:contact:layer", 2.0, kind="double")
+        author(stage.GetPrimAtPath("/World/rig"), "userProperties:physgraph:contact:selfCollision", 0, kind="int")
+        read, _ = garment(stage)
+        assert (read.self_contact, read.layer) == (False, 2)
+        assert type(read.layer) is int
+
+    def test_set_goes_before_the_stage(self, stage: Usd.Stage):
+        author(stage.GetPrimAtPath(CLOTH), "physgraph:contact:layer", 1, kind="int")
+        read, sources = garment(stage, "layer=4", "selfCollision=off")
+        assert (read.self_contact, read.layer) == (False, 4)
+        assert sources["contact:layer"] == "--set"
+
+    def test_a_layer_between_two_layers_is_refused(self, stage: Usd.Stage):
+        author(stage.GetPrimAtPath("/World/rig"), "physgraph:contact:layer", 1.5)
+        with pytest.raises(SchemaError, match="must be a whole number"):
+            garment(stage)
+
+    def test_auto_is_a_level_and_no_layer(self, stage: Usd.Stage):
+        with pytest.raises(UsageError, match="layer=auto"):
+            garment(stage, "layer=auto")
+
+
+class TestExclusion:
+    @pytest.fixture
+    def dressed(self, stage: Usd.Stage) -> Usd.Stage:
+        """A cloth and a belt, a body with a torso and two hands, all in one place."""
+        add_sheet(stage, "/World/belt")
+        for name in ("torso", "hands/left", "hands/right"):
+            UsdGeom.Sphere.Define(stage, f"/World/body/{name}").GetPrim().AddAppliedSchema(COLLIDER_API)
+        return stage
+
+    def exclude(self, stage: Usd.Stage, *targets: str, by: str = CLOTH) -> None:
+        stage.GetPrimAtPath(by).CreateRelationship("physgraph:contact:exclude").SetTargets(list(targets))
+
+    def felt(self, shot: Shot) -> list[list[str]]:
+        paths = [collider.path.removeprefix("/World/body/") for collider in shot.scene.colliders]
+        return [[paths[index] for index in garment.colliders] for garment in shot.scene.garments]
+
+    def test_a_collider_is_excluded_for_one_garment_only(self, dressed: Usd.Stage):
+        self.exclude(dressed, "/World/body/hands/left")
+        shot = open_shot(save(dressed))
+        assert self.felt(shot) == [["torso", "hands/right"], ["torso", "hands/left", "hands/right"]]
+        said = f"<{CLOTH}>.physgraph:contact:exclude"
+        assert shot.sources[0].apart_from == {"/World/body/hands/left": said}
+        assert shot.sources[1].apart_from == {}
+
+    @pytest.mark.parametrize("target", ["/World/body/hands", "/World/body.collection:hands"])
+    def test_everything_below_an_ancestor_or_in_a_collection_is_excluded(self, dressed: Usd.Stage, target: str):
+        body = dressed.GetPrimAtPath("/World/body")
+        Usd.CollectionAPI.Apply(body, "hands").IncludePath("/World/body/hands")
+        self.exclude(dressed, target)
+        shot = open_shot(save(dressed))
+        assert self.felt(shot)[0] == ["torso"]
+        by = f"<{CLOTH}>.physgraph:contact:exclude = <{target}>"
+        assert set(shot.sources[0].apart_from.values()) == {by}
+
+    def test_it_goes_before_what_includes(self, dressed: Usd.Stage):
+        self.exclude(dressed, "/World/body/hands")
+        dressed.GetPrimAtPath(CLOTH).CreateRelationship("physgraph:colliders").SetTargets(["/World/body"])
+        shot = save(dressed)
+        assert self.felt(open_shot(shot))[0] == ["torso"]
+        assert self.felt(open_shot(shot, colliders=["/World/body/*"]))[0] == ["torso"]
+
+    def test_garments_are_apart_when_either_says_so(self, dressed: Usd.Stage):
+        self.exclude(dressed, CLOTH, by="/World/belt")
+        shot = open_shot(save(dressed))
+        assert [garment.apart_from for garment in shot.scene.garments] == [("/World/belt",), (CLOTH,)]
+        said = "</World/belt>.physgraph:contact:exclude"
+        assert [source.apart_from for source in shot.sources] == [{"/World/belt": said}, {CLOTH: said}]
+
+    def test_an_ancestor_of_the_garment_itself_leaves_its_self_contact(self, dressed: Usd.Stage):
+        self.exclude(dressed, "/World")
+        shot = open_shot(save(dressed))
+        assert shot.scene.garments[0].apart_from == ("/World/belt",)
+        assert (shot.scene.garments[0].self_contact, shot.scene.garments[0].colliders) == (True, ())
+
+    def test_a_collider_that_all_exclude_is_not_read(self, dressed: Usd.Stage):
+        self.exclude(dressed, "/World/body/hands")
+        self.exclude(dressed, "/World/body/hands", by="/World/belt")
+        shot = open_shot(save(dressed))
+        assert self.felt(shot) == [["torso"], ["torso"]]
+        assert len(shot.frame(1.0).colliders) == 1
+
+    def test_what_would_not_touch_anyway_is_not_told(self, dressed: Usd.Stage):
+        UsdGeom.Sphere.Define(dressed, "/World/body/hair")
+        self.exclude(dressed, "/World/body/hair")
+        assert open_shot(save(dressed)).sources[0].apart_from == {}
+
+    def test_a_target_that_is_not_there_is_told_and_stops_nothing(self, dressed: Usd.Stage):
+        self.exclude(dressed, "/World/body/tail", "/World/body/torso")
+        shot = open_shot(save(dressed))
+        assert self.felt(shot)[0] == ["hands/left", "hands/right"]
+        told = [str(notice) for notice in shot.warnings if "excludes nothing" in str(notice)]
+        assert len(told) == 1
+        assert "</World/body/tail>" in told[0]
+
+    def test_targets_inside_an_instance_are_the_instance_s_own(self, dressed: Usd.Stage, tmp_path: Path):
+        self.exclude(dressed, "/World/body/hands")
+        save(dressed)
+        outer = new_stage(tmp_path / "outer.usda")
+        for name in ("one", "two"):
+            copy = outer.DefinePrim(f"/World/{name}", "Xform")
+            copy.GetReferences().AddReference("s.usda")
+            copy.SetInstanceable(True)
+        shot = open_shot(save(outer))
+        assert shot.scene.garments[0].path == "/World/one/rig/cloth"
+        assert set(shot.sources[0].apart_from) == {f"/World/one/body/hands/{side}" for side in ("left", "right")}
+        feels = [shot.scene.colliders[index].path for index in shot.scene.garments[0].colliders]
+        assert "/World/two/body/hands/left" in feels
+
+    def test_inspect_and_report_tell_what_is_excluded_and_by_what(self, dressed: Usd.Stage):
+        self.exclude(dressed, "/World/body", "/World/belt")
+        found = inspect_shot(save(dressed))
+        cloth, belt = found["garments"]
+        assert set(cloth["apart_from"]) == {f"/World/body/{n}" for n in ("torso", "hands/left", "hands/right")} | {
+            "/World/belt"
+        }
+        assert cloth["apart_from"]["/World/body/torso"] == f"<{CLOTH}>.physgraph:contact:exclude = </World/body>"
+        assert (cloth["colliders"], len(belt["colliders"])) == ([], 3)
+        assert "\n".join(_outline(found)).count("physgraph:contact:exclude") == 5
+
+    def test_contact_is_left_out_for_the_reason_that_holds(self, dressed: Usd.Stage):
+        dressed.RemovePrim("/World/belt")
+        self.exclude(dressed, "/World/body")
+        assert "excluded" in inspect_shot(save(dressed))["left_out"]["contact"]
