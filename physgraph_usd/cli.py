@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Never
 import click
 
 from . import __version__
+from .cli_types import FrameRange, PictureSize, RefineLevel
 from .errors import PhysGraphError, UsageError
 
 if TYPE_CHECKING:
@@ -46,54 +47,6 @@ class Commands(click.Group):
             if missing not in EXTRAS:
                 raise
             _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
-
-
-class FrameRange(click.ParamType):
-    """Time codes ``A:B``, or one time code ``A``."""
-
-    name = "A:B"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Turn the text into the first and the last time code."""
-        if isinstance(value, tuple):
-            return value
-        first, colon, last = value.partition(":")
-        try:
-            span = float(first), float(last if colon else first)
-        except ValueError:
-            self.fail(f"{value!r} is not a frame range; write A:B or A, for example 1001:1024", param, ctx)
-        if not span[0] <= span[1]:
-            self.fail(f"{value!r} ends before it starts", param, ctx)
-        return span
-
-
-class RefineLevel(click.ParamType):
-    """A number of subdivisions, or ``auto``, which is passed on as -1."""
-
-    name = "level"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Turn the text into a level."""
-        if value == "auto":
-            return -1
-        if not str(value).isdecimal():
-            self.fail(f"{value!r} is neither a whole number nor 'auto'", param, ctx)
-        return int(value)
-
-
-class PictureSize(click.ParamType):
-    """Width and height in pixels, ``1280x640``."""
-
-    name = "WxH"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Turn the text into width and height."""
-        if isinstance(value, tuple):
-            return value
-        width, _, height = value.partition("x")
-        if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-            self.fail(f"{value!r} is not a size; write WxH, for example 1280x640", param, ctx)
-        return int(width), int(height)
 
 
 def _together(*options: Decorator) -> Decorator:
@@ -137,7 +90,12 @@ layer_options = _together(
     click.option("--mode", type=click.Choice(["over", "sibling"]), help="Refine in place, or beside the coarse mesh."),
     click.option("--velocities", is_flag=True, help="Also write point velocities."),
     click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),
-    click.option("--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write what was done as JSON."),
+    click.option(
+        "--report",
+        type=click.Path(path_type=Path),
+        metavar="FILE.json|DIR",
+        help="Write what was done; DIR: as a page.",
+    ),
     overwrite_option,
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )
@@ -172,7 +130,7 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
     """
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
     none = [None] * len(shots)
-    reports = none if report is None else _one_each(shots, report, "--report", suffix=".json")
+    reports = none if report is None else _reports(shots, report)
     roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda")
     given = {name: value for name, value in options.items() if value is not None}
     if len(shots) > 1 and given.get("workers", 1) > 1:
@@ -348,6 +306,14 @@ def _one_each(
         raise UsageError(f"{option} {to}: two shots would both be written to {twice[0]}; refine them one by one")
     to.mkdir(parents=True, exist_ok=True)
     return files
+
+
+def _reports(shots: tuple[str, ...], to: Path) -> Sequence[Path]:
+    """One report per shot: a JSON file, or a folder with a page, inside ``to`` where there are several shots."""
+    if to.suffix == ".json" and not to.is_dir():
+        return _one_each(shots, to, "--report", suffix=".json")
+    to.mkdir(parents=True, exist_ok=True)
+    return [to] if len(shots) == 1 else _one_each(shots, to, "--report", suffix="")
 
 
 @contextmanager

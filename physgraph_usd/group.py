@@ -29,7 +29,7 @@ from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .level_forces import LevelForces, build_forces
 from .mesh.subdivide import Refinement
-from .resolution import sharp_folds
+from .resolution import edge_strain, sharp_folds
 from .scene import Garment, GarmentFrame
 
 WORTH = 2.0
@@ -395,13 +395,3 @@ def _recentred(garment: Garment) -> Garment:
     if not len(garment.rest):
         return garment
     return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))
-
-
-def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
-    """Size of the edges' relative extension: median, 99th percentile and largest."""
-    if not len(level.edges):
-        return {"p50": 0.0, "p99": 0.0, "max": 0.0}
-    ends = level.edges.long()
-    strain = ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) / level.rest_length - 1.0).abs().cpu().numpy()
-    p50, p99 = np.percentile(strain, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(strain.max())}

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from ..forces.base import ForceModule
-from ..group import Group, edge_strain
+from ..group import Group
 from ..pipeline import Refiner
+from ..resolution import edge_strain
 from ..scene import Frame
 
 

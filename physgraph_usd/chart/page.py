@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
 from pathlib import Path
 
 import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.subplots import make_subplots
 
+from ..page.document import document, table
 from .methods import DEFAULT, SMOOTH, UPSAMPLED
 from .styles import Style, styles
 from .table import Chart
@@ -25,14 +25,6 @@ HOW = (
     "take four times as many at each coarser one. Energies, strain and contact are judged in float64, by one ruler for "
     "all. Phi0 is plain upsampling's energy, Phi* the least that anybody found."
 )
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; padding: 0 1rem; color: #26282c }
-h1 { font-size: 1.3rem } h2 { font-size: 1.1rem; margin-top: 2.5rem }
-table { border-collapse: collapse; font-size: .9rem } .wide { overflow-x: auto }
-th, td { padding: .3rem .8rem; border-bottom: 1px solid #e2e2e2; text-align: right } th:first-child, td:first-child,
-td.words, th.words { text-align: left }
-p.note { color: #606468; font-size: .9rem }
-"""
 
 
 def write_page(chart: Chart, file: Path) -> None:
@@ -50,11 +42,7 @@ def write_page(chart: Chart, file: Path) -> None:
         config={"displaylogo": False, "responsive": True},
     )
     body = "\n".join([f"<h1>{html.escape(title(chart))}</h1>", _lead(chart), figure, _terms(chart), _notes(chart)])
-    head = f"<meta charset='utf-8'><title>{html.escape(title(chart))}</title><link rel='icon' href='data:,'>"
-    file.write_text(
-        f"<!doctype html><html lang='en'><head>{head}<style>{STYLE}</style></head><body>{body}</body></html>\n",
-        encoding="utf-8",
-    )
+    file.write_text(document(title(chart), body), encoding="utf-8")
 
 
 def _figure(chart: Chart) -> go.Figure:
@@ -133,7 +121,7 @@ def _terms(chart: Chart) -> str:
     ]
     return (
         "<h2>What each part of the model costs and buys</h2>"
-        + _table("terms", ("part", "costs [ms]", "of the frame", "moves [mm]", "buys"), rows)
+        + table("terms", ("part", "costs [ms]", "of the frame", "moves [mm]", "buys"), rows, numbers=(1, 2, 3))
         + "<p class='note'>By refine's default, with the part less without it; a level less the one below it. The "
         "result moves by the RMS distance between the two; gaps are by the full potential at the finest level.</p>"
     )
@@ -154,20 +142,8 @@ def _notes(chart: Chart) -> str:
     return "".join(
         [
             f"<h2>How it was measured</h2><p>{HOW.format(repeats=plan.get('repeats', '?'))}</p>",
-            _table("references", ("frame", "Phi0 [J]", "Phi* [J]", "found by"), rows),
-            "<h2>Runs that failed</h2>" + _table("failed", ("method", "steps", "error"), failed) if failed else "",
+            table("references", ("frame", "Phi0 [J]", "Phi* [J]", "found by"), rows, numbers=(0, 1, 2)),
+            "<h2>Runs that failed</h2>" + table("failed", ("method", "steps", "error"), failed) if failed else "",
             f"<p class='note'>The long form would take about {longer:.0f} minutes here.</p>" if longer else "",
         ]
     )
-
-
-def _table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose last column holds words."""
-    *numbers, words = head
-    top = "".join(f"<th>{html.escape(each)}</th>" for each in numbers) + f"<th class='words'>{html.escape(words)}</th>"
-    lines = (
-        "".join(f"<td>{html.escape(each)}</td>" for each in row[:-1]) + f"<td class='words'>{html.escape(row[-1])}</td>"
-        for row in rows
-    )
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
-    return f"<div class='wide'><table id='{name}'><tr>{top}</tr>{body}</table></div>"
