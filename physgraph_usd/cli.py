@@ -220,7 +220,11 @@ def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) 
 @out_option("DIR", "Folder to write into; a chart that was begun there goes on.")
 @scene_options
 @click.option("--device", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--clock", type=click.Choice(["wall", "cpu"]), help="cpu: one core's own time, for busy machines.")
 @click.option("--method", "methods", multiple=True, metavar="NAME", help="Integrator to measure; repeatable.")
+@click.option(
+    "--peer", "peers", multiple=True, metavar="NAME=PYTHON", help="Solver outside, and the Python that has it."
+)
 @click.option("--count", type=click.IntRange(min=1), metavar="N", help="Frames to measure.")
 @click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="How often each time is taken.")
 @click.option("--short", is_flag=True, help="Take less than 15 minutes.")

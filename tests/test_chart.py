@@ -231,14 +231,14 @@ def test_budgets_grow_by_the_size_s_factor():
 
 @pytest.mark.parametrize("default_ms", [5.0, 300.0, 1500.0])
 def test_the_short_form_is_planned_under_its_time(default_ms: float):
-    plan = make_plan(SHORT, curves=12, default_ms=default_ms, judge_ms=0.2 * default_ms)
+    plan = make_plan(SHORT, curves=12, default_ms=default_ms, elapsed_ms=default_ms, judge_ms=0.2 * default_ms)
     assert plan.minutes <= 12.0
     assert plan.frames >= 1
     assert plan.repeats >= SHORT.repeats
-    assert make_plan(LONG, curves=12, default_ms=default_ms, judge_ms=0.0).minutes > plan.minutes
+    assert make_plan(LONG, curves=12, default_ms=default_ms, elapsed_ms=default_ms, judge_ms=0.0).minutes > plan.minutes
 
 
-@pytest.mark.parametrize("changes", [{"count": 0}, {"budget_minutes": -1.0}, {"device": "tpu"}])
+@pytest.mark.parametrize("changes", [{"count": 0}, {"budget_minutes": -1.0}, {"device": "tpu"}, {"clock": "sun"}])
 def test_wrong_options_are_refused(changes: dict[str, Any]):
     with pytest.raises(UsageError):
         replace(ChartOptions(), **changes).check()

@@ -114,7 +114,7 @@ class _Bench:
                 self._journal.add("failed", error=str(error), **key)
                 continue
             found = {} if repeat else asdict(self._judge.judge(frame, solved.points))
-            found |= {"made": solved.steps, "waited": solved.waited}
+            found |= {"made": solved.steps, "elapsed": solved.elapsed, "waited": solved.waited}
             self._add(name, frame, solved.milliseconds, steps=steps, repeat=repeat, **about, **found)
 
     def is_done(self, name: str, steps: int, *, growth: float) -> bool:

@@ -14,6 +14,9 @@ LONGEST_SHORT = 15.0
 """Minutes up to which a chart has the short form's size."""
 
 
+CLOCKS = ("wall", "cpu")
+
+
 @dataclass(frozen=True)
 class Size:
     """How much is measured.
@@ -51,7 +54,9 @@ class ChartOptions:
         overrides: "</Prim>.attribute=value" or "attribute=value".
         rest_frame: Time code whose points are the rest shape, or None.
         device: "cpu" or "cuda".
+        clock: "wall", or "cpu" to count one core's own time, which other programs do not change.
         methods: Names of `integrate.METHODS` to measure; empty takes all.
+        peers: "NAME=PYTHON" for each solver outside to measure; see `peers.run.PEERS`.
         count: Frames to measure, or None for the size's own number.
         short: Take the short size.
         budget_minutes: Minutes to plan with, or None.
@@ -67,7 +72,9 @@ class ChartOptions:
     overrides: Sequence[str] = ()
     rest_frame: float | None = None
     device: str = "cpu"
+    clock: str = "wall"
     methods: Sequence[str] = ()
+    peers: Sequence[str] = ()
     count: int | None = None
     short: bool = False
     budget_minutes: float | None = None
@@ -87,6 +94,8 @@ class ChartOptions:
                 raise UsageError(f"{name} of {value:g}: give a number above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
+        if self.clock not in CLOCKS or (self.clock == "cpu" and self.device != "cpu"):
+            raise UsageError(f"clock '{self.clock}' on {self.device}; known: wall, and on the cpu cpu")
 
     def size(self) -> Size:
         """How much is to be measured."""
@@ -102,5 +111,5 @@ class ChartOptions:
 
     def plain(self) -> dict[str, Any]:
         """What decides the problem that is measured, ready for JSON."""
-        names = ("garments", "colliders", "overrides", "level", "rest_frame", "device")
+        names = ("garments", "colliders", "overrides", "level", "rest_frame", "device", "clock")
         return {name: list(v) if isinstance(v := getattr(self, name), list | tuple) else v for name in names}

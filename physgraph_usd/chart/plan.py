@@ -45,20 +45,21 @@ class Plan:
         return asdict(self)
 
 
-def make_plan(size: Size, *, curves: int, default_ms: float, judge_ms: float) -> Plan:
+def make_plan(size: Size, *, curves: int, default_ms: float, elapsed_ms: float, judge_ms: float) -> Plan:
     """Fit a size into its time: fewer frames first, then shorter curves.
 
     Args:
         size: What is wanted.
         curves: Number of methods.
-        default_ms: Time of a frame by refine's default [ms].
+        default_ms: Time of a frame by refine's default, as the chart counts it [ms].
+        elapsed_ms: Wall time of the same and of what goes with it [ms].
         judge_ms: Time of judging a result [ms].
     """
     frames, reach, repeats = size.frames, size.reach, size.repeats
 
     def seconds() -> float:
         """Time of all curves: each is a geometric series that ends at the reach; every result is judged once."""
-        series = size.growth / (size.growth - 1.0) * reach * default_ms
+        series = size.growth / (size.growth - 1.0) * reach * elapsed_ms
         return 1e-3 * frames * curves * (repeats * series + RUNGS * judge_ms)
 
     if size.minutes is not None:
@@ -70,7 +71,7 @@ def make_plan(size: Size, *, curves: int, default_ms: float, judge_ms: float) ->
         while repeats < size.more and seconds() < room * repeats / (repeats + 1):
             repeats += 1
     reference = REFERENCE_SECONDS if size.minutes is None else 60.0 * FOR_REFERENCE * size.minutes / frames
-    total = seconds() + frames * reference + TERM_SOLVES * 1e-3 * (default_ms + judge_ms)
+    total = seconds() + frames * reference + TERM_SOLVES * 1e-3 * (elapsed_ms + judge_ms)
     return Plan(frames, repeats, size.growth, reach * default_ms, reference, round(total / 60.0, 1))
 
 

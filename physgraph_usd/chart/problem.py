@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -31,13 +32,15 @@ class Solved:
 
     Attributes:
         points: Fine world positions [m] of each garment.
-        milliseconds: Wall time of preparing and solving the frame, without reading, writing and telemetry.
+        milliseconds: Time of preparing and solving the frame, without reading, writing and telemetry.
+        elapsed: Wall time of all of it [ms].
         steps: Steps made at the finest levels.
         waited: Milliseconds that its threads waited for a core that others had, or None where that is not known.
     """
 
     points: tuple[np.ndarray, ...]
     milliseconds: float
+    elapsed: float
     steps: int
     waited: float | None
 
@@ -52,7 +55,14 @@ class Problem:
     """
 
     def __init__(
-        self, scene: Scene, levels: Sequence[int], *, device: str, lanes: int, dtype: torch.dtype = torch.float32
+        self,
+        scene: Scene,
+        levels: Sequence[int],
+        *,
+        device: str,
+        lanes: int,
+        dtype: torch.dtype = torch.float32,
+        clock: str = "wall",
     ) -> None:
         """Build the levels.
 
@@ -62,7 +72,9 @@ class Problem:
             device: "cpu" or a CUDA device.
             lanes: Most threads of a kernel.
             dtype: Scalar type of the solve.
+            clock: "wall", or "cpu" to count the processor's time alone.
         """
+        self._clock = clock
         garments = tuple(replace(each, detail_scale=np.ones_like(each.detail_scale)) for each in scene.garments)
         scene = replace(scene, garments=garments)
         self.scene = scene
@@ -82,16 +94,18 @@ class Problem:
 
     def next(self, frame: Frame) -> Solved:
         """Solve a frame from where the last one ended, with the settings in use."""
-        before = _waited()
+        before, began, worked = _waited(), time.perf_counter(), time.process_time()
         state = self.refiner.solve(frame)
-        after = _waited()
+        after, elapsed, worked = _waited(), time.perf_counter() - began, time.process_time() - worked
         entries: list[Any] = list({id(entry): entry for entry in state.telemetry}.values())
         spent = [value for each in entries for name, value in each.get("milliseconds", {}).items() if name != "measure"]
         reports = [each for entry in entries for each in entry.get("levels", [])]
         last = max((each["level"] for each in reports), default=0)
         steps = sum(each["steps"] for each in reports if each["level"] == last)
         waited = None if before is None or after is None else after - before
-        return Solved(tuple(p for p in state.points if p is not None), sum(spent), steps, waited)
+        share = worked / elapsed if self._clock == "cpu" else 1.0
+        points = tuple(p for p in state.points if p is not None)
+        return Solved(points, share * sum(spent), 1e3 * elapsed, steps, waited)
 
     def go_on(
         self, frame: Frame, settings: SolveSettings, kept: Sequence[Carried | None]

@@ -21,10 +21,11 @@ from ..shot import MOST_LANES, prepare_device
 from ..usd.provenance import file_hashes
 from ..usd.reader import Shot, open_shot
 from .journal import Journal
-from .measure import measure_curves
+from .measure import measure_curves, rungs
 from .methods import Curve, find_curves
 from .options import LONG, ChartOptions
 from .page import write_page
+from .peers.run import measure_peers, parse_peers
 from .plan import Clock, Plan, make_plan
 from .plot import draw_chart
 from .problem import COLD, Problem, plain_detail
@@ -33,6 +34,8 @@ from .table import Chart, collate
 from .terms import RUN, Bench, measure_terms
 
 DEFAULTS = ChartOptions()
+MOST_PEER_STEPS = 1024
+"""Largest budget of a solver outside."""
 
 
 def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEFAULTS) -> Chart:
@@ -53,6 +56,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
         SolveError: A frame cannot be solved.
     """
     options.check()
+    parse_peers(options.peers)
     prepare_device(options.device)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -83,8 +87,8 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
     levels = tuple(choice.level for choice in choose_levels(opened.scene, opened.frame))
 
     def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:
-        lanes = min(MOST_LANES, os.cpu_count() or 1)
-        return Problem(scene, levels, device=options.device, lanes=lanes, dtype=dtype)
+        lanes = min(MOST_LANES, os.cpu_count() or 1) if options.clock == "wall" else 1
+        return Problem(scene, levels, device=options.device, lanes=lanes, dtype=dtype, clock=options.clock)
 
     problems = build(opened.scene, levels), build(opened.scene, levels, torch.float64)
     about = _about(opened, folder, levels, options) | {"vertices": problems[0].vertex_count}
@@ -99,6 +103,9 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
             found = find_reference(problems[1], frame, seconds=plan.reference_seconds)
             journal.add("reference", frame=frame.time, **found.plain())
     measure_curves(journal, problems, frames, curves=curves, plan=plan, clock=clock)
+    budgets = [steps for steps in rungs(plan.growth) if steps <= MOST_PEER_STEPS]
+    place = {"plan": plan, "clock": clock, "clock_name": options.clock, "steps": budgets}
+    measure_peers(journal, problems, frames, peers=parse_peers(options.peers), **place)
     run = tuple(_frame(opened, time) for time in _run_up_to(opened, frames[-1].time))
     bench = Bench(*problems, opened.scene, levels, frames=frames, run=run, build=build)
     measure_terms(journal, bench, clock)
@@ -124,6 +131,7 @@ def _plan(
     costs = {
         "curves": len(curves),
         "default_ms": statistics.median(each.milliseconds for each in spent[1:]),
+        "elapsed_ms": statistics.median(each.elapsed for each in spent[1:]),
         "judge_ms": 1e3 * (time.perf_counter() - began),
     }
     plan = make_plan(options.size(), **costs)
@@ -142,6 +150,7 @@ def _about(opened: Shot, folder: Path, levels: Sequence[int], options: ChartOpti
         "device": device,
         "processor": name or platform.machine(),
         "cores": os.cpu_count(),
+        "clock": options.clock,
         "default": {"integrator": RefineOptions().integrator, "steps": COLD.steps, "tolerance": COLD.tolerance},
         "options": options.plain(),
         "frames": list(options.frames or ()),

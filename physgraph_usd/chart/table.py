@@ -49,6 +49,7 @@ class Point:
         tangles: Edges of cloth through faces of cloth, summed over the frames.
         frames: Number of frames.
         repeats: Number of times that the time was taken.
+        note: What a solver outside was given of the problem, "" for ours.
     """
 
     method: str
@@ -71,6 +72,7 @@ class Point:
     tangles: int
     frames: int
     repeats: int
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class Chart:
     def busy(self) -> str:
         """A warning where other programs had the cores, or ""."""
         waited = self.about["waited"]
-        if waited < BUSY:
+        if waited < BUSY or self.about.get("clock") == "cpu":
             return ""
         return f"the machine was busy: threads waited for a core {waited:.0%} of the time, so trust no single time"
 
@@ -213,7 +215,7 @@ def collate(journal: Journal) -> Chart:
     points = [_point([r for r in rows if (r["method"], r["steps"]) == key], found) for key in keys]
     plan = journal.one("plan") or {}
     about = journal.rows("problem")[0]["problem"] | {name: plan.get(name) for name in ("plan", "long_minutes")}
-    about["waited"] = sum(r.get("waited") or 0.0 for r in rows) / max(sum(r["ms"] for r in rows), TINY)
+    about["waited"] = sum(r.get("waited") or 0.0 for r in rows) / max(sum(r.get("elapsed", 0.0) for r in rows), TINY)
     return Chart(
         about,
         tuple(point for point in points if point is not None),
@@ -255,6 +257,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, dict[str, Any]]
         tangles=sum(v["tangles"] for v in values),
         frames=len(values),
         repeats=min(len(each) for each in times),
+        note=first.get("note", ""),
     )
 
 

@@ -37,6 +37,7 @@ def title(chart: Chart) -> str:
     frames = len(chart.references)
     levels = ", ".join(map(str, sorted(set(about["levels"]))))
     where = about["device"] if about["device"] == "cpu" else about["processor"]
+    where += ", processor time of one core" if about.get("clock") == "cpu" else ""
     plural = "s" if frames > 1 else ""
     return f"{about['shot']}: {about['vertices']:,} fine vertices, level {levels}, {frames} cold frame{plural}, {where}"
 
@@ -54,7 +55,8 @@ def settings(point: Point) -> str:
         return f"at most {point.steps} steps at the finest level, tolerance {point.tolerance:g} edge lengths"
     if not point.integrator:
         return "no physics"
-    return f"{point.integrator}, {'nested' if point.nested else 'finest level only'}, {point.steps} steps there"
+    where = "nested" if point.nested else "finest level only"
+    return f"{point.integrator}, {where}, {point.steps} steps there" + (f" ({point.note})" if point.note else "")
 
 
 def figures(point: Point, *, touches: bool) -> list[str]:
