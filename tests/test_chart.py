@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,24 @@ from physgraph_usd.chart.journal import Journal
 from physgraph_usd.chart.measure import rungs
 from physgraph_usd.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
 from physgraph_usd.chart.options import LONG, SHORT, ChartOptions
+from physgraph_usd.chart.peers.run import PEERS, Peer, parse_peers
 from physgraph_usd.chart.plan import make_plan
 from physgraph_usd.chart.run import chart_shot
 from physgraph_usd.chart.table import Chart, Point, typical
+from physgraph_usd.chart.words import settings
 from physgraph_usd.errors import UsageError
 from physgraph_usd.integrate import METHODS, Method
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
+
+ECHO = """
+import sys
+import numpy as np
+problem = np.load(sys.argv[1])
+x = problem[f"base{int(problem['levels']) - 1}"]
+ms = np.array([5.0, 5.0])
+np.savez(sys.argv[2], x_0_1=x, ms_0_1=ms, x_1_1=x, ms_1_1=ms)
+"""
+"""A solver outside that does nothing."""
 
 OPTIONS = ChartOptions(
     level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=0.12
@@ -252,3 +265,34 @@ def test_a_line_that_was_cut_off_is_dropped(tmp_path: Path):
     again = Journal(tmp_path, {"shot": "a"}, overwrite=False)
     again.add("point", method="b", ms=math.pi)
     assert [row["method"] for row in Journal(tmp_path, {"shot": "a"}, overwrite=False).rows("point")] == ["a", "b"]
+
+
+def test_a_solver_outside_is_measured_by_the_same_ruler(
+    made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any
+):
+    """A peer that hands back the plain upsampling has a gap of 1."""
+    adapter = tmp_path / "echo.py"
+    adapter.write_text(ECHO, encoding="utf-8")
+    monkeypatch.setitem(PEERS, "echo", Peer("Echo", str(adapter), "nothing of the problem"))
+    shot = made[0]
+    options = replace(QUICK, methods=("gd",), peers=(f"echo={sys.executable}",))
+    chart = chart_shot(shot, tmp_path / "out", options)
+    assert [(p.steps, p.nested, p.repeats) for p in chart.curve("Echo, nested")] == [(1, True, 2)]
+    assert chart.curve("Echo")[0].gap == pytest.approx(1.0, abs=1e-6)
+    assert chart.curve("Echo")[0].ms == 5.0
+    assert "nothing of the problem" in settings(chart.curve("Echo")[0])
+
+
+def test_a_solver_outside_that_fails_is_told(made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any):
+    adapter = tmp_path / "broken.py"
+    adapter.write_text("raise SystemExit('out of luck')", encoding="utf-8")
+    monkeypatch.setitem(PEERS, "broken", Peer("Broken", str(adapter), ""))
+    options = replace(QUICK, methods=("gd",), peers=(f"broken={sys.executable}",))
+    chart = chart_shot(made[0], tmp_path / "out", options)
+    assert [row["error"] for row in chart.failed] == ["Broken ended with code 1: out of luck"]
+
+
+@pytest.mark.parametrize("given", ["nobody=python", "newton", "newton=no/such/python"])
+def test_wrong_peers_are_refused(given: str):
+    with pytest.raises(UsageError, match="peer"):
+        parse_peers([given])

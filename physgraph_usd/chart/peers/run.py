@@ -35,20 +35,17 @@ class Peer:
     Attributes:
         name: Its name in the chart.
         adapter: The script that its Python runs.
-        argument: What the adapter is told to use.
         note: What of the problem it was given, in words.
     """
 
     name: str
     adapter: str
-    argument: str
     note: str
 
 
 PEERS = {
-    "newton": (
-        Peer("Newton VBD", "newton_adapter.py", "VBD", "our springs and hinges, no bodies"),
-        Peer("Newton XPBD", "newton_adapter.py", "XPBD", "our springs and hinges, no bodies"),
+    "newton": Peer(
+        "Newton VBD", "newton_adapter.py", "our springs, hinges, guide and gravity; no bodies; 3 iterations a step"
     )
 }
 """Peers by the name that ``--peer`` takes."""
@@ -67,7 +64,7 @@ def parse_peers(given: Sequence[str]) -> list[tuple[Peer, str]]:
             raise UsageError(f"peer '{each}': write NAME=PYTHON; known names: {', '.join(PEERS)}")
         if not Path(python).is_file():
             raise UsageError(f"peer '{each}': {python} is no program; give the Python that has {name}")
-        found += [(peer, python) for peer in PEERS[name]]
+        found.append((PEERS[name], python))
     return found
 
 
@@ -129,7 +126,7 @@ def _run(
     with tempfile.TemporaryDirectory() as folder:
         given, result = Path(folder) / "problem.npz", Path(folder) / "result.npz"
         np.savez(given, **dict(_problem(problem, frame, part)))
-        line = [python, str(HERE / peer.adapter), str(given), str(result), peer.argument]
+        line = [python, str(HERE / peer.adapter), str(given), str(result)]
         line += ["--steps", ",".join(map(str, steps)), "--repeats", str(plan.repeats)]
         line += ["--most-ms", str(plan.most_ms), "--clock", clock_name]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
@@ -189,11 +186,11 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
         "hinges": level.hinges,
         "rest_angle": level.rest_angle,
         "hinge": hinges.weight,
-        "diagonal": springs.diagonal(base),
     }
     for name, value in values.items():
         yield f"{name}{index}", value.double().cpu().numpy() if value.is_floating_point() else value.cpu().numpy()
     yield f"bound{index}", guide.rest_matrix().diagonal()
+    yield f"diagonal{index}", springs.rest_matrix().diagonal()
     yield from _sparse("", index, guide.hessian())
 
 
