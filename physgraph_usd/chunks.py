@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import threading
 import time as clock
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -39,12 +39,14 @@ class Outcome:
         points: Fine world positions [m] of each garment, None where it has no sample; () when the solve failed.
         reused: For each garment, True when it kept the previous frame's points.
         record: Telemetry, or {"error": message}, ready for JSON.
+        heat: Heat maps of each garment by name, None where it has no sample; () when none was asked for.
     """
 
     time: float | None
     points: tuple[np.ndarray | None, ...]
     reused: tuple[bool, ...]
     record: dict[str, object]
+    heat: tuple[dict[str, np.ndarray] | None, ...] = ()
 
 
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
@@ -115,6 +117,8 @@ def _solve_chunk(solver: Solver, times: list[float | None], skip: int, folder: P
         index = first + position - skip
         partial = folder / f"{index}.part.npz"
         arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
+        maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
+        arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
         np.savez(partial, **arrays)
         partial.rename(folder / f"{index}.npz")
@@ -133,8 +137,15 @@ def _collect(file: Path, time: float | None, future: Future[None]) -> Outcome:
         reused = tuple(bool(value) for value in data["reused"])
         names = [f"points{k}" for k in range(len(reused))]
         points = tuple(data[name] if name in data.files else None for name in names)
+        heat = tuple(_heat_of(data, k) if points[k] is not None else None for k in range(int(data["heated"])))
     file.unlink()
-    return Outcome(time, points, reused, record)
+    return Outcome(time, points, reused, record, heat)
+
+
+def _heat_of(data: Mapping[str, np.ndarray], index: int) -> dict[str, np.ndarray]:
+    """The heat maps of one garment in a frame's file."""
+    prefix = f"heat{index}."
+    return {name.removeprefix(prefix): data[name] for name in data if name.startswith(prefix)}
 
 
 def _raise_if_dead(future: Future[None]) -> None:

@@ -83,12 +83,14 @@ solve_options = _together(
     click.option("--device", metavar="cpu|cuda", help="Where to compute."),
     click.option("--potential", type=click.Choice(["continuum", "paper"]), help="Which form of the energy."),
     click.option("--contact", type=click.Choice(["quadratic", "paper", "off"]), help="How bodies push the cloth."),
+    click.option("--self-contact", type=click.Choice(["auto", "paper", "off"]), help="How cloth pushes cloth."),
     click.option("--temporal", type=click.Choice(["tether", "warm", "off"]), help="How a frame uses the last one."),
     click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes that share the frames."),
 )
 layer_options = _together(
     click.option("--mode", type=click.Choice(["over", "sibling"]), help="Refine in place, or beside the coarse mesh."),
     click.option("--velocities", is_flag=True, help="Also write point velocities."),
+    click.option("--heat-map", is_flag=True, help="Also write depth inside bodies and crossings as primvars."),
     click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),
     click.option(
         "--report",
@@ -161,6 +163,8 @@ def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
 @garment_option
 @collider_option
 @click.option("--preset", metavar="FABRIC", help="Fabric of the garments, such as denim; see docs/fabrics.md.")
+@click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
+@click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
     """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""

@@ -132,7 +132,11 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
         "guide": "ties the local average to the coarse animation",
     }
     if _touching(opened) and options.contact != "off":
-        modelled["contact"] = f"{options.contact} form, with {', '.join(_touching(opened))}, in frames where it is near"
+        bodies = ", ".join(_touching(opened))
+        modelled["contact"] = f"{options.contact} form, with {bodies}, in frames where it is near"
+    if options.self_contact != "off":
+        form = {"auto": "pairs of points", "paper": "spheres"}[options.self_contact]
+        modelled["self contact"] = f"{form}, where parts come near one another; garments that do are solved together"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
@@ -147,9 +151,13 @@ def _in_plane(report: RefineReport) -> dict[str, str]:
 
 
 def _touching(opened: Shot) -> list[str]:
-    """Paths of the colliders that some garment feels."""
+    """Paths of the colliders that some garment feels, each with its side where that was chosen."""
     felt = {path for garment in opened.scene.garments for path in _felt(opened, garment)}
-    return [collider.path for collider in opened.scene.colliders if collider.path in felt]
+    return [
+        collider.path + ("" if collider.side == "auto" else f" (side: {collider.side})")
+        for collider in opened.scene.colliders
+        if collider.path in felt
+    ]
 
 
 def _felt(opened: Shot, garment: Garment) -> list[str]:
@@ -167,9 +175,11 @@ def _why_no_contact(opened: Shot) -> str:
 
 def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
-        "self contact": "not in this version",
         "network": "not in this version; quasi-Newton integrates",
+        "friction": "out of scope: shapes at rest under pressure alone; the guide and the tether hold cloth in place",
     }
+    if "self contact" not in report.modelled:
+        left_out["self contact"] = "switched off by --self-contact"
     if "contact" not in report.modelled:
         left_out["contact"] = _why_no_contact(opened)
     if "membrane" not in report.modelled:

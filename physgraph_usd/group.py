@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,7 +17,7 @@ from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
 from .contact.rounds import solve_rounds, untangle
 from .contact.settings import ContactSettings
-from .detail import Carried, MovingFrames, Reset
+from .detail import Carried, MovingFrames, Reset, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
@@ -30,20 +30,18 @@ from .level import Level, build_levels
 from .level_forces import LevelForces, build_forces
 from .mesh.subdivide import Refinement
 from .resolution import edge_strain, sharp_folds
-from .scene import Garment, GarmentFrame
+from .scene import Garment, GarmentFrame, recentred
 
 WORTH = 2.0
-"""Elastic energy of carried detail, over that of the upsampled cage, beyond which a frame starts cold: detail that is
-worth carrying takes compression up and lowers it; carried by a crumpled cage it tears the cloth."""
+"""Elastic energy of carried detail, over that of the upsampled cage and of the last result, beyond which a frame is
+cold: detail that is worth carrying takes compression up and lowers it; carried by a crumpled cage it tears cloth."""
 LEAST_STRAIN = 1e-2
 """Strain of the whole garment under which that ratio is not looked at."""
 UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
-import os
-
-REFACTORED = int(os.environ.get("REF", "8000"))
-"""Vertices up to which a level's metric takes up the stiffness of what touches: factorising costs more than it saves above."""
+REFACTORED = 8000
+"""Vertices up to which a level's metric takes up the stiffness of what touches; above, factorising costs too much."""
 COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
 COARSE_TOLERANCE = 0.1
@@ -110,7 +108,7 @@ class Group:
         self.garments = tuple(garments)
         self._gravity, self._settings = gravity, settings
         self.levels = build_levels(
-            [_recentred(g) for g in garments], refinements, dtype=dtype, device=device, lanes=lanes
+            [recentred(g) for g in garments], refinements, dtype=dtype, device=device, lanes=lanes
         )
         self._guide_maps = [GuideMap(level) for level in self.levels]
         cage, finest = self.levels[0], self.levels[-1]
@@ -131,7 +129,7 @@ class Group:
         *,
         at: float | None,
         touching: Sequence[Touching] = (),
-    ) -> tuple[list[np.ndarray], Carried, dict[str, object]]:
+    ) -> Solved:
         """Solve one frame.
 
         Args:
@@ -139,9 +137,6 @@ class Group:
             kept: The previous frame's result, or None for a cold start.
             at: The time code, for errors.
             touching: Surfaces that the garments may touch.
-
-        Returns:
-            World positions [m] of each garment, what the next frame needs, and telemetry.
 
         Raises:
             SolveError: A term of the potential is not finite.
@@ -166,11 +161,15 @@ class Group:
             x = x if scaled else result
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
-        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
+        elastic = forces[-1].elastic_energy(x)
+        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames, elastic)
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
+        crossing = torch.zeros_like(self.levels[-1].free[:, 0])
         if contact is not None:
-            telemetry["contact"] = contact.measure(result) | moved
+            measured, crossing = contact.measure(result)
+            if measured:
+                telemetry["contact"] = measured | moved
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -178,7 +177,8 @@ class Group:
         }
         points = result.double().cpu().numpy() + origin
         points[self._fixed] = self._place_fixed @ world
-        return [points[span] for span in self.levels[-1].spans], carried, telemetry
+        spans, crosses = self.levels[-1].spans, crossing.cpu().numpy()
+        return Solved([points[span] for span in spans], carried, telemetry, [crosses[span] for span in spans])
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
@@ -253,8 +253,12 @@ class Group:
         predicted = torch.where(finest.free, predicted, base)
         carried, plain = (self._forces[-1].elastic_energy(x) for x in (predicted, base))
         least = LEAST_STRAIN**2 * self._stretch * float(finest.vertex_area.sum())
-        if carried > WORTH * max(plain, least):
-            return None, f"cold: carried detail has {carried / max(plain, least):.3g} times the upsampled cage's energy"
+        usual = max(plain, least, kept.energy)
+        if carried > WORTH * usual:
+            return (
+                None,
+                f"cold: carried detail has {carried / usual:.3g} times the energy of cage and last frame",
+            )
         return predicted, "warm"
 
     def _contact(
@@ -388,10 +392,3 @@ class Group:
         where = ", ".join(f"<{garment.path}>" for garment in self.garments)
         when = "" if at is None else f" at time code {at:g}"
         return f"{where}{when}: {error}; terms that are not finite: {', '.join(broken)}"
-
-
-def _recentred(garment: Garment) -> Garment:
-    """The garment with its rest shape about the origin: far away, float32 would lose its edges."""
-    if not len(garment.rest):
-        return garment
-    return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))

@@ -20,6 +20,8 @@ CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
 """Forms of contact by their names on the command line."""
 REPORT_NAME = "report.json"
 """Name of the report in a folder of its own."""
+SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
+"""Forms of contact of cloth with cloth by their names on the command line."""
 _NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
 
 
@@ -41,12 +43,14 @@ class RefineOptions:
         mode: "over" or "sibling".
         temporal: "tether", "warm" or "off": how a frame uses the last one.
         potential: "continuum" or "paper".
-        contact: "quadratic", "paper" (its linear form) or "off".
+        contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
+        self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
         workers: Processes that share the frames.
         report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
         velocities: Also write point velocities.
+        heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
         rest_frame: Time code whose points are the rest shape, or None.
         root: A .usda to write that lays the new layer over the shot, or None.
         progress: Called with (frames done, frames in all), or None.
@@ -66,19 +70,27 @@ class RefineOptions:
     temporal: str = "tether"
     potential: str = "continuum"
     contact: str = "quadratic"
+    self_contact: str = "auto"
     workers: int = 1
     report: Path | None = None
     overwrite: bool = False
     dry_run: bool = False
     velocities: bool = False
+    heat_map: bool = False
     rest_frame: float | None = None
     root: Path | None = None
     progress: Callable[[int, int], None] | None = None
 
     def plain(self) -> dict[str, Any]:
         """The options that decide the result, ready for JSON."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_OF_THE_RESULT}
+        names = {f.name for f in dataclasses.fields(self)} - _NOT_OF_THE_RESULT
+        names -= set() if self.heat_map else {"heat_map"}  # a layer without one is as it was before there were any
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    def contact_settings(self) -> ContactSettings:
+        """The part that concerns contact."""
+        return ContactSettings(CONTACTS[self.contact], cloth=SELF_CONTACTS[self.self_contact])
 
     def solve_settings(self) -> SolveSettings:
         """The part that concerns the solver."""
@@ -89,7 +101,7 @@ class RefineOptions:
             budget_ms=self.budget_ms,
             temporal=self.temporal,
             potential=self.potential,
-            contact=ContactSettings(CONTACTS[self.contact]),
+            contact=self.contact_settings(),
         )
 
     def check(self) -> None:
@@ -104,6 +116,7 @@ class RefineOptions:
             ("potential", self.potential, POTENTIALS),
             ("mode", self.mode, MODES),
             ("contact", self.contact, tuple(CONTACTS)),
+            ("self contact", self.self_contact, tuple(SELF_CONTACTS)),
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")

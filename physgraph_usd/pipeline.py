@@ -12,21 +12,25 @@ import torch
 from .colliders.pose import Pose
 from .contact.bodies import Touching
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
+from .contact.heat import body_crossings, penetration_map
+from .contact.passed import Passed
 from .detail import Carried, join, split
 from .errors import GarmentError
 from .group import Group, SolveSettings
 from .level import refine_garments
 from .mesh.subdivide import Refinement
+from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State
 
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """One garment's last solved frame, with whom it was solved, and the bodies that it could touch there."""
+    """One garment's last solved frame, what crosses in it, with whom it was solved, and the bodies it could touch."""
 
     frame: GarmentFrame
     points: np.ndarray
     carried: Carried
+    crossing: np.ndarray
     part: tuple[int, ...]
     near: dict[int, Pose | None]
 
@@ -49,6 +53,7 @@ class Refiner:
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
         lanes: int = 1,
+        heat_map: bool = False,
     ) -> None:
         """Subdivide the garments.
 
@@ -59,6 +64,7 @@ class Refiner:
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
             lanes: Most threads that a kernel uses on the CPU; the result does not depend on it.
+            heat_map: Whether states hold a heat map.
 
         Raises:
             GarmentError: A rest shape cannot be solved on.
@@ -71,8 +77,9 @@ class Refiner:
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
         self._place = {"dtype": dtype, "device": device, "lanes": lanes}
         self._groups: dict[tuple[int, ...], Group] = {}
-        self._scene = scene
+        self._scene, self._device, self._heat_map = scene, device, heat_map
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
+        self._passed = Passed(scene.garments, scene.colliders, device=device, lanes=lanes)
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
         self._last: list[_Known | None] = [None] * len(scene.garments)
         self._time: float | None = None
@@ -97,6 +104,7 @@ class Refiner:
 
     def forget(self) -> None:
         """Start the next frame cold."""
+        self._passed.forget()
         self._last = [None] * len(self._last)
         self._time = None
 
@@ -135,6 +143,8 @@ class Refiner:
             wanted: For each garment, whether it is asked for; all when None.
         """
         gap = self._is_gap(frame.time)
+        if gap:
+            self._passed.forget()
         self._bodies.pose(frame.colliders)
         count = len(frame.garments)
         asked = [True] * count if wanted is None else list(wanted)
@@ -148,15 +158,17 @@ class Refiner:
                 reused[index] = same
             if not any(asked[index] for index in part):
                 continue
+            entries: list[dict[str, object]] = [{"start": "reused: the input equals the last frame's"}] * len(part)
             if not same:
                 known, entries = self._solve_part(part, frame, gap=gap)
-            else:
-                entries = [{"start": "reused: the input equals the last frame's"}] * len(part)
             for index, each, entry in zip(part, known, entries, strict=True):
                 if asked[index] and each is not None:
                     points[index], telemetry[index] = each.points, entry
         self._time = frame.time
-        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused))
+        for index, passed in enumerate(self._passed.look(frame)):
+            telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
+        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
@@ -168,11 +180,12 @@ class Refiner:
         group, near = self.group_of(part), self._near(part, frames)
         while True:
             touching = self._touching(part, frames, near)
-            solved, carried, entry = group.solve(frames, kept, at=frame.time, touching=touching)
-            more = self._reached(part, frames, solved)
+            solved = group.solve(frames, kept, at=frame.time, touching=touching)
+            more = self._reached(part, frames, solved.points)
             if more <= set(near):
                 break
             near = tuple(sorted({*near, *more}))
+        entry = solved.telemetry
         if any(self._scene.garments[index].colliders for index in part):
             entry["near"] = [self._scene.colliders[each].path for each in near]
         if len(part) > 1:
@@ -180,9 +193,9 @@ class Refiner:
         if gap:
             entry["start"] = "cold: the time between samples is too long"
         poses = {each: self._bodies.pose_of(each) for each in near}
-        own = split(carried, group.levels[0].spans, group.levels[-1].spans)
-        for index, each, xs, detail in zip(part, frames, solved, own, strict=True):
-            self._last[index] = _Known(each, xs, detail, part, poses)
+        own = split(solved.carried, group.levels[0].spans, group.levels[-1].spans)
+        for index, each, xs, detail, crossing in zip(part, frames, solved.points, own, solved.crossing, strict=True):
+            self._last[index] = _Known(each, xs, detail, crossing, part, poses)
         return [self._last[index] for index in part], [entry] * len(part)
 
     def _touching(
@@ -194,6 +207,22 @@ class Refiner:
             for index, each in zip(part, frames, strict=True)
         ]
         return self._bodies.touching(near, offsets)
+
+    def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
+        """Where a garment is inside bodies whose bounds it meets, pushed by them or not, and where cloth crosses."""
+        if points is None:
+            return None
+        garment, chain = self._scene.garments[index], self.refinements[index]
+        met = self._bodies.near(garment, bounds_of(points), 0.0)
+        surfaces = [each.surface for each in self._bodies.touching(met, [[0.0] * len(met)])]
+        finest, rest = (chain[-1].mesh, None) if chain else (garment.mesh, garment.rest)
+        triangles = finest.triangulate(rest).triangles
+        edges = edges_of(triangles, len(points)).vertices
+        known = self._last[index]
+        crossing = np.zeros(len(points), bool) if known is None else known.crossing
+        crossing = crossing | body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
+        depth = penetration_map(surfaces, points, edges, device=self._device)
+        return {"penetration": depth, "crossing": crossing.astype(np.float32)}
 
     def _near(self, part: Sequence[int], frames: Sequence[GarmentFrame]) -> tuple[int, ...]:
         """Numbers of the bodies that garments may touch."""

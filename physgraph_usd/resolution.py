@@ -111,16 +111,6 @@ def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
     return float((np.abs(angle) > SHARP_FOLD).mean())
 
 
-def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
-    """Size of the edges' relative extension: median, 99th percentile and largest."""
-    if not len(level.edges):
-        return {"p50": 0.0, "p99": 0.0, "max": 0.0}
-    ends = level.edges.long()
-    strain = ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) / level.rest_length - 1.0).abs().cpu().numpy()
-    p50, p99 = np.percentile(strain, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(strain.max())}
-
-
 def too_coarse(path: str, level: int, shares: Mapping[float | None, float]) -> str:
     """A warning where the mesh was too coarse for the folds, or "".
 
@@ -137,3 +127,13 @@ def too_coarse(path: str, level: int, shares: Mapping[float | None, float]) -> s
         f"<{path}>{at}: {shares[worst]:.2g} of the edges fold by more than 45 degrees: level {level} is too coarse for "
         f"this fabric and shows wrinkles of the mesh's own size; use level {level + 1} or raise bendStiffness"
     )
+
+
+def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
+    """Size of the edges' relative extension: median, 99th percentile and largest."""
+    if not len(level.edges):
+        return {"p50": 0.0, "p99": 0.0, "max": 0.0}
+    ends = level.edges.long()
+    strain = ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) / level.rest_length - 1.0).abs().cpu().numpy()
+    p50, p99 = np.percentile(strain, [50, 99])
+    return {"p50": float(p50), "p99": float(p99), "max": float(strain.max())}

@@ -5,7 +5,7 @@ Everything here is SI, in world space, and knows no USD. Only ``usd/`` converts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -113,9 +113,20 @@ class State:
         points: Fine positions [m], world space, shape (V, 3), float64, per garment; None where it was not asked for.
         telemetry: Plain numbers and words per garment, ready for JSON.
         reused: For each garment, True when its input equalled the previous frame's and its points were kept.
+        heat: Per garment, where a heat map was asked for: "penetration", depth in the deepest body [mm], and
+            "crossing", 1 at corners of what crosses a face and 0 elsewhere, each of shape (V,), float32; what is not
+            known is left out. None as in points; () when none was asked for.
     """
 
     time: float | None
     points: tuple[np.ndarray | None, ...]
     telemetry: tuple[dict[str, object], ...] = field(default=())
     reused: tuple[bool, ...] = field(default=())
+    heat: tuple[dict[str, np.ndarray] | None, ...] = field(default=())
+
+
+def recentred(garment: Garment) -> Garment:
+    """The garment with its rest shape about the origin: far away, float32 would lose its edges."""
+    if not len(garment.rest):
+        return garment
+    return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))

@@ -18,6 +18,7 @@ import warp as wp
 
 from . import __version__
 from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
+from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .options import RefineOptions, json_of
@@ -169,7 +170,8 @@ class _ShotSolver:
         prepare_device(device)
         shot = self._opened or _open(self._shot, self._options)
         settings = self._options.solve_settings()
-        refiner = Refiner(shot.scene, settings, levels=self.levels, device=device, lanes=self._lanes)
+        options = {"device": device, "lanes": self._lanes, "heat_map": self._options.heat_map}
+        refiner = Refiner(shot.scene, settings, levels=self.levels, **options)
         for time in times:
             began = clock.perf_counter()
             try:
@@ -181,7 +183,7 @@ class _ShotSolver:
                 yield Outcome(time, (), (), {"time": time, "error": str(error)})
                 continue
             record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
-            yield Outcome(time, state.points, state.reused, record)
+            yield Outcome(time, state.points, state.reused, record, state.heat)
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:
@@ -227,7 +229,7 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
         start = clock.perf_counter()
         writer.close()
         report.seconds["close"] = clock.perf_counter() - start
-        report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report)
+        report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report) + _passed(report)
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
@@ -242,7 +244,7 @@ def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
         report.warnings.append(f"no sample is written at time code {name}: {report.failed[name]}")
         return 0.0
     start = clock.perf_counter()
-    writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused])
+    writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused], heat=outcome.heat)
     return clock.perf_counter() - start
 
 
@@ -261,6 +263,15 @@ def _coarse_garments(report: RefineReport) -> list[str]:
         shares = {time: entry["sharp_folds"] for time, entry in entries.items() if "sharp_folds" in entry}
         said.append(too_coarse(garment["path"], garment["level"], shares))
     return [warning for warning in said if warning]
+
+
+def _passed(report: RefineReport) -> list[str]:
+    """A warning for each body that a coarse garment passes right through."""
+    said = []
+    for index, garment in enumerate(report.garments):
+        entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
+        said += told(garment["path"], {t: e["passed_through"] for t, e in entries.items() if "passed_through" in e})
+    return said
 
 
 def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:

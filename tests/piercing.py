@@ -81,11 +81,16 @@ def _meet(segments: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def depths(points: np.ndarray, body: PlainMesh, frame: int) -> np.ndarray:
     """How deep points are in the deepest of a body's closed parts [stage units], shape (V,); negative outside."""
-    places, faces = place(body, frame), triangles_of(body)
-    links = sparse.coo_matrix((np.ones(len(faces)), (faces[:, 0], faces[:, 1])), shape=(len(places), len(places)))
-    links = links + sparse.coo_matrix((np.ones(len(faces)), (faces[:, 0], faces[:, 2])), shape=links.shape)
-    count, part = connected_components(links, directed=False)
-    return -np.min([signed(points, places, faces[part[faces[:, 0]] == i]) for i in range(count)], axis=0)
+    places, faces, part = place(body, frame), triangles_of(body), parts(body)
+    return -np.min([signed(points, places, faces[part[faces[:, 0]] == i]) for i in range(part.max() + 1)], axis=0)
+
+
+def parts(body: PlainMesh) -> np.ndarray:
+    """Number of the connected part of each vertex, shape (V,)."""
+    faces, size = triangles_of(body), len(body.points)
+    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = sparse.coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
+    return connected_components(links, directed=False)[1]
 
 
 def signed(points: np.ndarray, places: np.ndarray, faces: np.ndarray) -> np.ndarray:

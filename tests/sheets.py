@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,8 @@ def garment_of(mesh: PolygonMesh, rest: np.ndarray, *, bent: bool = False, **pai
     """A garment with unit paint and no pins unless given."""
     one = np.ones(mesh.vertex_count)
     paint = {"stretch_scale": one, "bend_scale": one, "guide_scale": one, "detail_scale": one, "pin": 0 * one}
-    return Garment("/World/Sheet", mesh, rest, 0, False, bent, **(paint | painted), colliders=())
+    values: dict[str, Any] = paint | painted
+    return Garment("/World/Sheet", mesh, rest, 0, False, bent, **values)
 
 
 def level_of(

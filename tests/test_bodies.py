@@ -8,8 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bodies import box, surfaces
-from pxr import Gf, Usd, UsdGeom, UsdPhysics, Vt
-from stages import COLLIDER_API, add_sheet, add_skeleton, author, bind_skin, new_stage, save, set_matrix, vec3
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+from stages import (
+    COLLIDER_API,
+    add_sheet,
+    add_skeleton,
+    author,
+    bind_skin,
+    new_stage,
+    save,
+    set_matrix,
+    skinned_points,
+    vec3,
+)
 
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.colliders.primitives import ShapeSurface
@@ -100,6 +111,64 @@ class TestMeshes:
         assert np.abs(first - last).max() > 0.1
         sides = [np.linalg.norm(points[0] - points[1]) for points in (first, last)]
         assert sides[0] == pytest.approx(sides[1], abs=1e-5)
+
+    @pytest.mark.parametrize("frames", [None, (3.0, 5.0)])
+    def test_skinned_bodies_turn_between_the_skeletons_samples(self, tmp_path: Path, frames: tuple | None):
+        """The skeleton has samples at 1 and 21, 115 degrees apart; the cloth has whole time codes between them."""
+        stage = new_stage(tmp_path / "a.usda", metres=1.0)
+        add_sheet(stage, times=(3.0, 4.0, 5.0, 12.5))
+        add_skeleton(stage, "/World/root", (1.0, 21.0))
+        mesh = add_box(stage, "/World/root/body")
+        bind_skin(mesh, "/World/root", joints=[1] * 8)
+        shot = save(stage)
+        for time in (3.0, 5.0) if frames else (3.0, 12.5):
+            expected = skinned_points(box((1.0, 2.0, 3.0))[0], [1] * 8, time)
+            np.testing.assert_allclose(mesh_of(read(shot, time, frames=frames)[1]).points, expected, atol=1e-5)
+
+    def test_samples_between_the_cloths_are_met_at_the_cloths_times(self, tmp_path: Path):
+        """Points at 1.25 and 2.75, a turning parent at 0.5 and 2.5: at the cloth's time both are in between."""
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        turning = UsdGeom.Xform.Define(stage, "/World/rig").AddRotateZOp()
+        for time, degrees in ((0.5, 0.0), (2.5, 80.0)):
+            turning.Set(degrees, time)
+        add_box(stage, "/World/rig/body", times=(1.25, 2.75))
+        angle = np.radians(80.0 * (2.0 - 0.5) / 2.0)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        expected = box((1.0, 2.0, 3.0))[0] + np.array([2.0, 0.0, 0.0])
+        expected[:, :2] = expected[:, :2] @ turn.T
+        np.testing.assert_allclose(mesh_of(read(save(stage), 2.0)[1]).points, expected, atol=1e-5)
+
+    def test_outside_its_samples_a_body_is_held(self, tmp_path: Path):
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        add_box(stage, times=(1.5, 2.5))
+        shot = save(stage)
+        means = [mesh_of(read(shot, time)[1]).points[:, 0].mean() for time in (1.0, 2.0, 3.0)]
+        np.testing.assert_allclose(means, [1.5, 2.0, 2.5])
+
+    def test_a_body_in_an_offset_layer_is_posed_in_the_shots_time(self, tmp_path: Path):
+        asset = new_stage(tmp_path / "body.usda", metres=1.0)
+        add_box(asset, "/World/body", times=(101.0, 105.0))
+        asset.SetDefaultPrim(asset.GetPrimAtPath("/World/body"))
+        asset.Save()
+        stage = shot_with(tmp_path / "a.usda", metres=1.0)
+        prim = stage.DefinePrim("/World/copy")
+        prim.GetReferences().AddReference("body.usda", Sdf.LayerOffset(-50.0, 0.5))
+        mean = mesh_of(read(save(stage), 2.0)[1]).points[:, 0].mean()
+        assert mean == pytest.approx(104.0)
+
+    def test_between_two_topologies_the_earlier_one_holds(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "a.usda", metres=1.0)
+        add_sheet(stage, times=(1.0, 1.9, 2.0))
+        mesh = add_box(stage)
+        points, triangles = box()
+        for time, count, more in ((1.0, 12, 0), (2.0, 6, 3)):
+            mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.full(count, 3, np.int32)), time)
+            mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(triangles[:count].ravel()), time)
+            mesh.GetPointsAttr().Set(vec3(np.concatenate([time * points, np.zeros((more, 3))])), time)
+        shot = save(stage)
+        pose = mesh_of(read(shot, 1.9)[1])
+        assert (len(pose.triangles), len(pose.points)) == (12, 8)
+        np.testing.assert_allclose(pose.points, points, atol=1e-6)
 
     def test_broken_faces_leave_it_out_with_a_word(self, tmp_path: Path):
         stage = shot_with(tmp_path / "a.usda")

@@ -167,7 +167,6 @@ def test_an_interrupted_run_goes_on(made: tuple[Path, Path, Chart], tmp_path: Pa
     both = energies.keys() & known.keys()
     assert len(both) > 5
     assert {key: energies[key] for key in both} == {key: known[key] for key in both}
-    assert {row["term"] for row in again.terms} == {row["term"] for row in chart.terms}
 
 
 def test_another_shot_in_the_same_folder_is_refused(made: tuple[Path, Path, Chart]):

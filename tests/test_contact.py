@@ -204,7 +204,7 @@ class TestLeftOut:
         def refuse(*args: object, **options: object) -> None:
             raise AssertionError("contact code ran")
 
-        monkeypatch.setattr(physgraph_usd.contact.bodies.FrameContact, "begin", refuse)
+        monkeypatch.setattr(physgraph_usd.contact.bodies.FrameBodies, "begin", refuse)
         monkeypatch.setattr(MeshBody, "pose", refuse)
         near = mesh_pose(ball())
         assert refiner((MESH, REST), felt=()).solve(frame(draped(0.1), near)).points[0] is not None

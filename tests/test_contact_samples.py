@@ -13,11 +13,14 @@ import pytest
 
 pytest.importorskip("pxr", reason="samples are written with usd-core")
 
-from piercing import depths, piercings, place, signed, triangles_of
+from piercing import depths, parts, piercings, place, signed, triangles_of
 from pxr import Usd
+from scipy.spatial import cKDTree
 from shots import faults, refine, sample_times
 
+from physgraph_usd.samples.panel import sew
 from physgraph_usd.samples.solids import box, join, lathe, off_box, off_torus, torus
+from physgraph_usd.samples.tshirt import SHIRT, dress
 from physgraph_usd.usd.plain import Look, PlainMesh, PlainStage
 
 DEEP = 1e-4
@@ -37,6 +40,8 @@ class Told:
 SHOTS = {
     "crossing": Told(("Front", "Back"), (), 12),
     "torus": Told(("Sheet",), ("Ring",), 28),
+    "hood": Told(("Hood",), ("Head", "Bust"), 24),
+    "armpit": Told(("Shirt",), ("Form",), 30, inside=0.02, deepest_mm=8.0),
     "layers": Told(("Trousers", "Shirt", "Belt"), ("Form",), 30),
     "block": Told(("Sheet",), ("Block",), 24),
 }
@@ -123,7 +128,8 @@ def test_bodies_are_closed_and_face_out(name: str) -> None:
         assert len(forth) == len(directed), "two faces run along an edge in the same direction"
         np.testing.assert_array_equal(forth, back, "an edge has one face only")
         corners = place(mesh, 0)[faces]
-        assert np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() > 0.0
+        volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+        assert np.bincount(parts(mesh)[faces[:, 0]], volumes).min() > 1e-4, "a part is inside out"
 
 
 @pytest.mark.parametrize("name", SHOTS)
@@ -173,6 +179,42 @@ def test_sheets_start_crossed_near_their_lower_edges() -> None:
         assert mesh.samples is not None
         assert mesh.pin is not None
         assert np.ptp(mesh.samples[:, mesh.pin == 1], axis=0).max() == 0.0
+
+
+def test_the_hood_lies_on_itself_and_the_head_turns_in_it() -> None:
+    hood, head = of_role("hood", "garment")[0], of_role("hood", "collider")[0]
+    points, faces = place(hood, 0), triangles_of(hood)
+    corners = points[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    behind = np.abs(corners.mean(axis=1)[:, 0]) < 0.03
+    back = normal[behind & (corners.mean(axis=1)[:, 2] < -0.1) & (corners.mean(axis=1)[:, 1] < 0.08)]
+    assert (back[:, 2] < 0).any()
+    assert (back[:, 2] > 0).any(), "the middle layer of the fold faces the other way"
+    assert head.transforms is not None
+    turned = [np.degrees(np.arctan2(matrix[0, 2], matrix[2, 2])) for matrix in head.transforms]
+    assert max(turned) > 25
+    assert min(turned) < -15
+
+
+def test_the_armpit_is_pinched_in_the_middle_and_open_at_the_ends() -> None:
+    shirt, form = build("armpit").meshes
+    assert form.samples is not None
+    faces, level = triangles_of(form), dress(sew(SHIRT))
+    part = parts(form)
+    torso, arm = part == part[0], part == part[np.argmax(form.samples[0, :, 0])]
+    lower = arm & (form.samples[14, :, 1] < 0.36) & (form.samples[14, :, 1] > 0.25)
+    under = (level[:, 0] > 0.22) & (np.abs(level[:, 1] - SHIRT.armpit) < 0.005)
+    side = (np.abs(level[:, 0] - SHIRT.half_width) < 0.01) & (level[:, 1] < 0.39) & (level[:, 1] > 0.25)
+    bodies, layers = [], []
+    for frame in (0, 14, 29):
+        bodies.append(signed(form.samples[frame, lower], form.samples[frame], faces[torso[faces].all(axis=1)]).min())
+        points = place(shirt, frame)
+        layers.append(np.median(cKDTree(points[side]).query(points[under])[0]))
+    assert 0.002 < bodies[1] < 0.012, "between arm and side there is less room than two layers of cloth ask for"
+    assert layers[1] < 0.015, "sleeve and side lie on one another"
+    assert min(bodies[0], bodies[2], layers[0], layers[2]) > 0.03
+    gaps = -depths(place(shirt, 0), form, 0)
+    assert 0.003 < gaps.min() < np.median(gaps) < 0.02
 
 
 def test_the_body_walks() -> None:

@@ -57,7 +57,7 @@ def test_s33_a_solved_frame_agrees_and_repeats() -> None:
     answers = []
     for device in ("cpu", "cuda", "cuda"):
         one, frames = cloth(device, torch.float64, steps=60, tolerance=1e-7)
-        answers.append(one.solve(frames, None, at=None)[0][0])
+        answers.append(one.solve(frames, None, at=None).points[0])
     here, there, again = answers
     assert there.tobytes() == again.tobytes()
     assert np.abs(here - there).max() < 1e-4 * EDGE / 4

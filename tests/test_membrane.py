@@ -142,8 +142,8 @@ def test_a_mixed_group_is_what_its_garments_are_alone(dtype: torch.dtype):
         garments = [garment_of(mesh, points) for _ in chosen]
         refinements = refine_garments(garments, [1] * len(garments))
         group = Group(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=dtype, device="cpu")
-        shapes, _, telemetry = group.solve(chosen, None, at=None)
-        energies = telemetry["energy_joules"]
+        solved = group.solve(chosen, None, at=None)
+        shapes, energies = solved.points, solved.telemetry["energy_joules"]
         assert isinstance(energies, dict)
         return shapes, energies["output"]
 

@@ -97,8 +97,14 @@ class TestReuse:
 
     def test_each_garment_by_itself(self):
         two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
+        far = np.array([0.0, 0.0, 1.0])
+        two.solve(pair(wave(REST), wave(OTHER_REST) + far, 1.0))
+        assert two.solve(pair(wave(REST), wave(OTHER_REST, phase=1.0) + far, 2.0)).reused == (True, False)
+
+    def test_not_beside_one_that_moves(self):
+        two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
         two.solve(pair(wave(REST), wave(OTHER_REST), 1.0))
-        assert two.solve(pair(wave(REST), wave(OTHER_REST, phase=1.0), 2.0)).reused == (True, False)
+        assert two.solve(pair(wave(REST), wave(OTHER_REST, phase=1.0), 2.0)).reused == (False, False)
 
     def test_a_still_frame_does_not_lose_the_detail_of_the_next(self):
         states = list(refiner().refine(frame_of(wave(REST, phase=p), float(t)) for t, p in enumerate([0, 0, 0.1])))
@@ -193,8 +199,10 @@ def test_animated_stiffness_rebuilds_the_metric_and_returns_to_the_same_bytes():
     assert again.points[0].tobytes() == first.points[0].tobytes()
 
 
-def test_garments_do_not_feel_one_another():
-    two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
+def test_garments_kept_apart_do_not_feel_one_another():
+    two = refiner_of(
+        [replace(garment_of(MESH, REST), apart_from=("/Other",)), replace(garment_of(OTHER, OTHER_REST), path="/Other")]
+    )
     state = two.solve(pair(wave(REST), wave(OTHER_REST)))
     assert state.points[0].tobytes() == solved(MESH, REST, wave(REST)).points[0].tobytes()
     assert state.points[1].tobytes() == solved(OTHER, OTHER_REST, wave(OTHER_REST)).points[0].tobytes()

@@ -250,7 +250,7 @@ def test_samples_are_quick() -> None:
     start = time.process_time()
     for name in SAMPLES:
         build(name)
-    assert time.process_time() - start < 10.0
+    assert time.process_time() - start < 20.0
 
 
 def test_unknown_sample_is_named() -> None:

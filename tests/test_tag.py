@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from layers import COAT, TIMES, make_shot
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from physgraph_usd.errors import StageError, UsageError
 from physgraph_usd.fabric import PRESETS
@@ -52,6 +52,32 @@ def test_a_collider_can_be_tagged_alone(untagged: Path, tmp_path: Path) -> None:
     stage = Usd.Stage.Open(str(tag(untagged, tmp_path / "tagged.usda", colliders=["/World/ball"])))
     assert schemas(stage, "/World/ball") == ["PhysGraphColliderAPI"]
     assert schemas(stage, COAT) == []
+
+
+def test_a_layer_and_a_side_are_authored_where_they_mean_something(untagged: Path, tmp_path: Path) -> None:
+    out = tag(untagged, tmp_path / "tagged.usda", garments=[COAT], colliders=["/World/ball"], layer=2, side="start")
+    stage = Usd.Stage.Open(str(out))
+    coat, ball = (stage.GetPrimAtPath(path) for path in (COAT, "/World/ball"))
+    layer, side = coat.GetAttribute("physgraph:contact:layer"), ball.GetAttribute("physgraph:collider:side")
+    assert (layer.Get(), str(layer.GetTypeName()), layer.GetVariability()) == (2, "int", Sdf.VariabilityUniform)
+    assert (side.Get(), str(side.GetTypeName()), side.GetVariability()) == ("start", "token", Sdf.VariabilityUniform)
+    scene = open_shot(str(out)).scene
+    assert (scene.garments[0].layer, scene.colliders[0].side) == (2, "start")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"garments": [COAT], "side": "front"}, "a side for colliders; name one"),
+        ({"colliders": ["/World/ball"], "layer": 1}, "a layer is for garments"),
+        ({"colliders": ["/World/ball"], "side": "up"}, "unknown side 'up'; known sides: auto, winding, start"),
+    ],
+)
+def test_what_is_for_nothing_that_was_named_is_refused(
+    untagged: Path, tmp_path: Path, given: dict, message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        tag(untagged, tmp_path / "a.usda", **given)
 
 
 def test_wrong_requests_name_the_choices(untagged: Path, tmp_path: Path) -> None:

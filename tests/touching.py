@@ -25,6 +25,7 @@ def refiner(
     kinds: Sequence[str] = ("mesh",),
     *,
     felt: Sequence[int] | None = None,
+    side: str = "auto",
     form: str = "quadratic",
     pin: np.ndarray | None = None,
     gravity: np.ndarray = DOWN,
@@ -36,7 +37,7 @@ def refiner(
     mesh, rest = cloth
     feels = tuple(range(len(kinds)) if felt is None else felt)
     garment = replace(garment_of(mesh, rest, pin=np.zeros(mesh.vertex_count) if pin is None else pin), colliders=feels)
-    colliders = tuple(Collider(f"/World/Body{index}", kind) for index, kind in enumerate(kinds))
+    colliders = tuple(Collider(f"/World/Body{index}", kind, side=side) for index, kind in enumerate(kinds))
     settings = settings_of(contact=ContactSettings(form), **options)
     return Refiner(Scene((garment,), gravity, (), colliders), settings, levels=[level], dtype=dtype)
 

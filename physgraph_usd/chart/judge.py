@@ -86,4 +86,4 @@ def _part(
     x = torch.as_tensor(np.concatenate(points) - origin, dtype=finest.dtype, device=finest.device)
     touched = () if contact is None else contact.at(finest).terms(x)
     energies = ForceModule((*module.forces, *touched)).energies(x)
-    return energies, edge_strain(finest, x)["p99"], {} if contact is None else contact.measure(x)
+    return energies, edge_strain(finest, x)["p99"], {} if contact is None else contact.measure(x)[0]

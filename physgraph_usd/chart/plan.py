@@ -11,6 +11,8 @@ from .options import Size
 
 FOR_REFERENCE, FOR_CURVES, FOR_TERMS = 0.25, 0.55, 0.15
 """Parts of the time."""
+LATEST = 1.1
+"""Part of the time after which nothing more is begun; a rerun goes on."""
 LEAST_REACH = 2.0
 REFERENCE_SECONDS = 300.0
 """Time for a frame's Phi* where there is no limit."""
@@ -98,6 +100,11 @@ class Clock:
     def late(self) -> bool:
         """Whether the curves have to end."""
         return self._minutes is not None and self.spent > 60.0 * (1.0 - FOR_TERMS) * self._minutes
+
+    @property
+    def over(self) -> bool:
+        """Whether no further measurement may begin."""
+        return self._minutes is not None and self.spent > 60.0 * LATEST * self._minutes
 
     def expect(self, seconds: float) -> None:
         """Correct the time that all of it will take."""

@@ -120,9 +120,9 @@ class Problem:
         carried = []
         for part, own in zip(self.refiner.parts_of(frame), kept, strict=True):
             frames, touching = [frame.garments[index] for index in part], self.refiner.touching(part, frame)
-            found, after, _ = self.refiner.group_of(part).solve(frames, own, at=frame.time, touching=touching)
-            points.update(zip(part, found, strict=True))
-            carried.append(after)
+            solved = self.refiner.group_of(part).solve(frames, own, at=frame.time, touching=touching)
+            points.update(zip(part, solved.points, strict=True))
+            carried.append(solved.carried)
         return tuple(points[index] for index in sorted(points)), carried
 
     def judge(self, frame: Frame, points: Sequence[np.ndarray]) -> Judgement:

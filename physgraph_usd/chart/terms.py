@@ -91,18 +91,21 @@ class Bench:
 
 def measure_terms(journal: Journal, bench: Bench, clock: Clock) -> None:
     """Measure every term, the last frame's detail and every level into the journal."""
-    for each in bench.terms:
-        if not journal.one("term", term=each.term):
-            clock.say(f"{each.term}, left out")
-            _record(journal, each.term, "term", lambda each=each: _one_term(bench, each))
-    if len(bench.run) >= 4 and not journal.one("term", kind="time"):
-        for name in ("tether", "warm"):
-            clock.say(f"a run of {len(bench.run)} frames, {name}")
-            _record(journal, name, "time", lambda name=name: _one_run(bench, name))
-    for level in range(max(bench.levels) + 1):
-        if not journal.one("term", term=f"level {level}"):
-            clock.say(f"level {level} alone")
-            _record(journal, f"level {level}", "level", lambda level=level: _one_level(bench, level))
+    tasks: list[tuple[str, str, Callable[[], dict[str, Any]]]] = [
+        (each.term, "term", lambda each=each: _one_term(bench, each)) for each in bench.terms
+    ]
+    tasks += [
+        (f"level {level}", "level", lambda level=level: _one_level(bench, level))
+        for level in range(max(bench.levels) + 1)
+    ]
+    if len(bench.run) >= 4:
+        tasks += [(name, "time", lambda name=name: _one_run(bench, name)) for name in ("tether", "warm")]
+    for name, kind, measured in tasks:
+        if clock.over:
+            return
+        if not journal.one("term", term=name):
+            clock.say(f"what {name} costs and buys")
+            _record(journal, name, kind, measured)
 
 
 def _record(journal: Journal, term: str, kind: str, measured: Callable[[], dict[str, Any]]) -> None:

@@ -37,12 +37,20 @@ class Surface(Protocol):
 
     Attributes:
         closed: Whether it has an inside.
+        fixed_side: Side of an open surface on which cloth belongs, 1 its normals' or -1; None where the start decides.
+        certain: Whether the side that `closest` gives is final, so that `inside` need not be asked.
         origin: World position of the origin of the coordinates that it is asked in [m], shape (3,), float64.
         bounds: Least and greatest corner [m], in its own coordinates, shape (2, 3), float64.
     """
 
     @property
     def closed(self) -> bool: ...  # noqa: D102
+
+    @property
+    def fixed_side(self) -> float | None: ...  # noqa: D102
+
+    @property
+    def certain(self) -> bool: ...  # noqa: D102
 
     @property
     def origin(self) -> np.ndarray: ...  # noqa: D102

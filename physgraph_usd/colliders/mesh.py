@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..mesh.lanes import Launch
 from .base import Nearest
-from .orient import Pieces, pieces_of
+from .orient import FIXED, Pieces, pieces_of
 from .pose import MeshPose
 
 Rim = tuple[np.ndarray, np.ndarray]
@@ -69,6 +69,8 @@ class MeshSurface:
 
     Attributes:
         closed: Whether it has an inside.
+        fixed_side: Side of an open surface on which cloth belongs, 1 its normals' or -1; None where the start decides.
+        certain: Whether winding numbers give every side, also where the surface has holes.
         origin: World position of its coordinates' origin [m], shape (3,), float64.
         bounds: Least and greatest corner [m], shape (2, 3), float64.
         triangles: Corners, shape (T, 3), int32.
@@ -81,6 +83,7 @@ class MeshSurface:
         triangles: np.ndarray,
         rim: tuple[np.ndarray, np.ndarray] | None,
         *,
+        side: str = "auto",
         device: str,
         lanes: int,
     ) -> None:
@@ -90,10 +93,13 @@ class MeshSurface:
             pose: Any pose.
             triangles: The pieces' triangles, shape (T, 3).
             rim: Rim edges and rim corners of open pieces, or None for closed ones.
+            side: One of `pose.SIDES`.
             device: "cpu" or a CUDA device.
             lanes: Most threads that a query uses on the CPU.
         """
         self.closed = rim is None
+        self.fixed_side = None if self.closed else FIXED.get(side)
+        self.certain = self.closed and side == "winding"
         self.triangles = triangles
         self.edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
         self._device, self._lanes = device, lanes
@@ -126,9 +132,11 @@ class MeshSurface:
         """The closest points within reach [m].
 
         The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface that is right unless the face
-        is buried in another part of the surface; there it is left to `inside`.
+        is buried in another part of the surface; there it is left to `inside`. A certain surface asks `inside` for all.
         """
         found = self._closest(self.mesh, x, reach)
+        if self.certain:
+            return replace(found, side=1.0 - 2.0 * self.inside(x).to(x))
         if self.closed and len(x):
             found.side[self._is_buried(found.face)] = 0.0
         return found
@@ -225,9 +233,9 @@ class MeshSurface:
 class MeshBody:
     """One mesh collider over the shot: its surfaces, kept while the topology stays the same."""
 
-    def __init__(self, *, device: str, lanes: int) -> None:
-        """Remember where to build."""
-        self._device, self._lanes = device, lanes
+    def __init__(self, *, side: str = "auto", device: str, lanes: int) -> None:
+        """Remember where and how to build; ``side`` is one of `pose.SIDES`."""
+        self._side, self._device, self._lanes = side, device, lanes
         self._triangles: np.ndarray | None = None
         self._count = 0
         self._surfaces: tuple[MeshSurface, ...] = ()
@@ -242,19 +250,18 @@ class MeshBody:
             for surface in self._surfaces:
                 surface.repose(pose)
             return self._surfaces
-        pieces = pieces_of(pose.points, pose.triangles)
+        pieces = pieces_of(pose.points, pose.triangles, side=self._side)
         self._surfaces = tuple(self._build(pose, pieces))
         self._triangles, self._count = (pose.triangles if finite else None), len(pose.points)
         return self._surfaces
 
     def _build(self, pose: MeshPose, pieces: Pieces) -> list[MeshSurface]:
-        options = {"device": self._device, "lanes": self._lanes}
-        made = []
-        if len(pieces.closed):
-            made.append(MeshSurface(pose, pieces.closed, None, **options))
-        if len(pieces.open):
-            made.append(MeshSurface(pose, pieces.open, (pieces.rim, pieces.rim_vertex), **options))
-        return made
+        rims = (None, (pieces.rim, pieces.rim_vertex))
+        return [
+            MeshSurface(pose, triangles, rim, side=self._side, device=self._device, lanes=self._lanes)
+            for triangles, rim in zip((pieces.closed, pieces.open), rims, strict=True)
+            if len(triangles)
+        ]
 
 
 def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh:

@@ -18,6 +18,10 @@ HOLES = 0.03
 """Part of a piece's area that its holes may have for it to count as closed: the winding number closes them."""
 
 
+FIXED = {"front": 1.0, "back": -1.0}
+"""Side of an open piece's normals on which cloth belongs, by the word for it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Pieces:
     """A mesh's sound faces.
@@ -35,12 +39,14 @@ class Pieces:
     rim_vertex: np.ndarray
 
 
-def pieces_of(points: np.ndarray, triangles: np.ndarray) -> Pieces:
+def pieces_of(points: np.ndarray, triangles: np.ndarray, *, side: str = "auto") -> Pieces:
     """Sort a mesh's triangles into closed and open pieces and turn them.
 
     Args:
         points: Positions [m], shape (V, 3); those that are not finite take their faces with them.
         triangles: Corners, shape (T, 3).
+        side: One of `pose.SIDES`: "winding" counts every piece as closed, "start" none; open pieces are left as they
+            are wound for "front" and "back".
 
     Returns:
         The pieces. Corners are welded: they use the first vertex at each place.
@@ -57,11 +63,13 @@ def pieces_of(points: np.ndarray, triangles: np.ndarray) -> Pieces:
     faces[turned] = faces[turned][:, ::-1]
     edge = np.where(turned[:, None], edge[:, [1, 0, 2]], edge)  # reversed corners: sides 2-1, 1-0, 0-2
     closed = sound & _is_closed(points, faces, edge, count=count, piece=piece)
-    volume = np.bincount(piece, _volumes(points, faces), piece.max() + 1)
+    volume = np.bincount(piece, _volumes(points, faces, piece), piece.max() + 1)
+    closed = {"winding": np.ones_like(closed), "start": np.zeros_like(closed)}.get(side, closed)
     inward = closed[piece] & (volume[piece] < 0)
+    outer = ~closed[piece]
+    inward |= outer & turned & (side in FIXED)  # turned back
     faces[inward] = faces[inward][:, ::-1]
     edge = np.where(inward[:, None], edge[:, [1, 0, 2]], edge)
-    outer = ~closed[piece]
     on_rim = count[edge[outer]] == 1  # of the sides 0-1, 1-2, 2-0
     rim_vertices = np.zeros(len(points), bool)
     sides = np.stack([faces[outer], np.roll(faces[outer], -1, axis=1)], axis=2)
@@ -127,7 +135,9 @@ def _is_closed(
     return rim**2 / (4.0 * np.pi) <= HOLES * np.bincount(piece, area, piece.max() + 1)
 
 
-def _volumes(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Signed volume under each face, about the mesh's middle."""
-    corners = points[faces] - points[faces].mean(axis=(0, 1))
+def _volumes(points: np.ndarray, faces: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Signed volume under each face, about the middle of its piece."""
+    middles = points[faces].mean(axis=1)
+    sums = np.stack([np.bincount(piece, middles[:, axis]) for axis in range(3)], axis=1)
+    corners = points[faces] - (sums / np.bincount(piece)[:, None])[piece][:, None]
     return np.einsum("fc,fc->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0

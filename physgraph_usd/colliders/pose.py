@@ -7,6 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 KINDS = ("mesh", "sphere", "capsule", "cylinder", "cube", "plane")
+SIDES = ("auto", "winding", "start", "front", "back")
+"""How to tell on which side of a mesh cloth belongs.
+
+"auto": outside of pieces that are closed, and of the others the side on which the coarse cloth around a vertex is.
+"winding": outside of every piece, closed or not, by the generalised winding number.
+"start": the side on which the coarse cloth is, of every piece, closed or not.
+"front", "back": that side of the authored faces of open pieces; outside of closed ones.
+"""
 
 
 @dataclass(frozen=True)
@@ -17,11 +25,13 @@ class Collider:
         path: Prim path, its name in reports.
         kind: One of `KINDS`.
         offset: Distance kept from it [m], added to the garment's.
+        side: One of `SIDES`.
     """
 
     path: str
     kind: str
     offset: float = 0.0
+    side: str = "auto"
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +40,8 @@ class MeshPose:
 
     Attributes:
         points: Positions [m], world space, shape (V, 3), float64.
-        triangles: Corners, as authored, shape (T, 3), int32; the same array while the topology stays the same.
+        triangles: Corners, shape (T, 3), int32; the same array while the topology stays the same. Wound as authored;
+            for the sides "front" and "back" so that the front is where they are counterclockwise in the world.
     """
 
     points: np.ndarray

@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from .base import Surface
+from .base import Nearest, Surface
 
 MARGIN = 1.001
 """Distances are float32: a segment counts as clear of the surface with this to spare."""
@@ -23,7 +23,9 @@ MARGIN = 1.001
 def signed_distances(
     surface: Surface, x: Float[Tensor, "vertices 3"], edges: Int[Tensor, "edges 2"], *, reach: float
 ) -> Float[Tensor, " vertices"]:
-    """Distances to a surface [m], negative inside closed ones; a lower bound over ``reach`` for points farther away.
+    """Distances to a surface [m], negative inside closed ones and behind open ones with a fixed side.
+
+    For points farther away than ``reach`` a lower bound.
 
     Args:
         surface: The surface.
@@ -39,9 +41,23 @@ def signed_distances(
         return out
     found = surface.closest(x[near], torch.full_like(near, float("inf"), dtype=x.dtype))
     out[near] = found.distance
-    if surface.closed:
+    if surface.fixed_side is not None:
+        out[near] *= torch.where(behind(found, surface.fixed_side), -1.0, 1.0).to(x.dtype)
+    elif surface.certain:
+        out[near] *= found.side
+    elif surface.closed:
         out[near] *= _sides(surface, x, out, near=near, told=found.side, edges=edges)
     return out
+
+
+def behind(found: Nearest, side: Float[Tensor, " points"] | float) -> Bool[Tensor, " points"]:
+    """Which points are behind an open surface: on the other side than theirs, and not past its rim.
+
+    Args:
+        found: Their closest points.
+        side: The side where they belong: 1 the normals', -1 the other, 0 undecided.
+    """
+    return (found.side * side < 0) & ~found.rim
 
 
 def _sides(

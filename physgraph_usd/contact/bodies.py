@@ -13,18 +13,20 @@ from dataclasses import asdict, dataclass, field, fields, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
-from ..colliders.sign import MARGIN, signed_distances
+from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
-from .measure import penetration, pinched
+from .measure import penetration, pierced, pinched
 from .settings import ContactSettings
 
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
+LIFT = 0.1
+"""How much farther out the corners of what a body comes through are moved at a time, in mean edges."""
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
 
@@ -103,8 +105,9 @@ class _Track:
     def _signs(self, which: Tensor, found: Nearest, asked: Tensor, moved: Tensor) -> Tensor:
         """1 outside, or on the start side of an open surface; -1 inside or behind it."""
         if not self.surface.closed:
-            behind = (found.side * self.side[which] < 0) & ~found.rim
-            return torch.where(behind, -torch.ones_like(moved), torch.ones_like(moved))
+            return torch.where(behind(found, self.side[which]), -torch.ones_like(moved), torch.ones_like(moved))
+        if self.surface.certain:
+            return found.side
         known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
         may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
         ask = may_have_crossed & (found.side != known)
@@ -146,17 +149,32 @@ class LevelBodies:
         return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form)
 
     def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, int | float]]:
-        """Move free vertices that are under the least clearance to it.
+        """Move free vertices that are under the least clearance to it, and farther where a body comes through a face.
 
         Returns:
             Positions [m]; x itself when none had to move; and how many moved, how far at most [mm] and in how many
             passes.
         """
+        extra = torch.zeros_like(x[:, 0])
+        out, passes = self._out(x, extra)
+        for _ in range(self._settings.lifts):
+            through = self._through(out)
+            if not bool(through.any()):
+                break
+            extra = torch.where(through, extra + LIFT * self._reach, extra)
+            out, more = self._out(out, extra)
+            passes += more
+        shifts = (out - x).norm(dim=1)
+        far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
+        return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
+
+    def _out(self, x: Tensor, extra: Tensor) -> tuple[Tensor, int]:
+        """Push out to the least clearance and more, body by body; returns positions and the passes made."""
         out, passes = x, 0
         for _ in range(self._settings.projections):
             moved = False
             for track in self._tracks:
-                least = self._settings.clearance * track.offset
+                least = self._settings.clearance * track.offset + extra
                 vertex, normal, signed = track.refresh(out, least)
                 lack = least[vertex] - signed
                 push = (lack > 1e-7) & self._level.free[vertex, 0]
@@ -167,9 +185,17 @@ class LevelBodies:
             if not moved:
                 break
             passes += 1
-        shifts = (out - x).norm(dim=1)
-        far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
-        return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
+        return out, passes
+
+    def _through(self, x: Tensor) -> Bool[Tensor, " vertices"]:
+        """Vertices whose edges or faces bodies pass through, though they are outside themselves."""
+        out = torch.zeros_like(self._level.free[:, 0])
+        for track in self._tracks:
+            moved = (x - track.at).norm(dim=1)
+            found = pierced(track.surface, self._level, x + track.shift, (track.known.abs() - moved).clamp_min(0.0))
+            out[self._level.edges.long()[found.edges].reshape(-1)] = True
+            out[self._level.triangles.long()[found.triangles].reshape(-1)] = True
+        return out
 
 
 @dataclass(eq=False)
@@ -258,8 +284,8 @@ class FrameBodies:
 
 def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"], finest: Level) -> Float[Tensor, " vertices"]:
     """The side on which the cage around each fine vertex lies: 1 or -1, 0 where it is undecided or has no meaning."""
-    if surface.closed:
-        return torch.zeros(finest.vertex_count, dtype=cage.dtype, device=cage.device)
+    if surface.closed or surface.fixed_side is not None:
+        return torch.full((finest.vertex_count,), surface.fixed_side or 0.0, dtype=cage.dtype, device=cage.device)
     found = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
     side = torch.where(found.rim, torch.zeros_like(found.side), found.side)
     return finest.base.apply(side.unsqueeze(1).expand(-1, 3).contiguous())[:, 0].sign()

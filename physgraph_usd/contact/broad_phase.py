@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -42,14 +43,15 @@ class Parts:
         edge to spare, since a vertex may be near an edge's middle.
         """
         count = len(frames)
-        near = sparse.lil_matrix((count, count), dtype=bool)
+        near = np.zeros((count, count), bool)
         trees: dict[int, cKDTree] = {}
         for a in range(count if self._together else 0):
             for b in range(a + 1, count):
                 near[a, b] = touch_one_another(self._garments[a], self._garments[b]) and self._close(
                     a, b, frames, trees
                 )
-        labels = csgraph.connected_components(near.tocsr(), directed=False)[1]
+        graph: Any = sparse.csr_matrix(near)
+        labels = csgraph.connected_components(graph, directed=False)[1]
         return [tuple(np.flatnonzero(labels == label).tolist()) for label in dict.fromkeys(labels.tolist())]
 
     def _close(self, a: int, b: int, frames: Sequence[GarmentFrame], trees: dict[int, cKDTree]) -> bool:
@@ -80,7 +82,7 @@ class Bodies:
         """Prepare one body for each collider; nothing is built before something is near it."""
         self.colliders = tuple(colliders)
         self._device = device
-        self._meshes = [MeshBody(device=device, lanes=lanes) if c.kind == "mesh" else None for c in colliders]
+        self._meshes = [MeshBody(side=c.side, device=device, lanes=lanes) for c in colliders]
         self._poses: Sequence[Pose | None] = ()
         self._surfaces: dict[int, tuple[Surface, ...]] = {}
         self._bounds: dict[int, np.ndarray] = {}
@@ -138,7 +140,6 @@ class Bodies:
             if isinstance(pose, ShapePose):
                 self._surfaces[index] = (ShapeSurface(pose, device=self._device),)
             elif isinstance(pose, MeshPose):
-                mesh = mesh or MeshBody(device=self._device, lanes=1)
                 self._surfaces[index] = mesh.pose(pose)
             else:
                 self._surfaces[index] = ()

@@ -13,14 +13,16 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..forces.self_contact import Gaps, SelfContact
+from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
 from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh, Crossings, Pairs
 from .regions import Regions
+from .settings import ContactSettings
 from .untangle import cut_off, gaps_out
 
 LEAST_OFFSET = 0.25
@@ -33,6 +35,12 @@ MENDS = 8
 """Most passes in all; after them the whole group goes back."""
 TURNED = 0.5
 """Cosine beyond which the way from one part to another counts as turned round since the input: one passed through."""
+SPHERE = 0.8
+"""R of the paper's form, in mean edges (PAPER A13)."""
+AHEAD = 0.5
+"""How much farther than the thickness it is looked for pairs above the cage, in mean edges: the move of a round."""
+STALE, FEW = 0.2, 1e-3
+"""Pairs are found anew once more than this part of the vertices has moved by more than so many edges."""
 OUT = 0.5
 """How far crossing parts are moved past one another in a round, in mean edges."""
 FRONTAL = 0.3
@@ -46,10 +54,20 @@ class ClothState:
     Attributes:
         x: Positions [m].
         crossings: What crosses there.
+        near: Whether any parts are near enough to cross.
     """
 
     x: Float[Tensor, "vertices 3"]
     crossings: Crossings
+    near: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Pairs, and the positions in which they were found."""
+
+    x: Tensor
+    pairs: Pairs
 
 
 class ClothContact:
@@ -105,7 +123,7 @@ class ClothView:
         base: Float[Tensor, "vertices 3"],
         *,
         thickness: Float[Tensor, " garments"],
-        stiffness: float,
+        settings: ContactSettings,
     ) -> None:
         """Take the frame.
 
@@ -114,14 +132,17 @@ class ClothView:
             level: The level.
             base: The upsampled cage [m]: distances that it has are not widened.
             thickness: Of each garment [m].
-            stiffness: k_c [N/m^3].
+            settings: How contact is solved, in SI.
         """
+        self._settings = settings
         self._lasting, self._level, self._base = lasting, level, base
         self._mesh, self._regions = lasting.mesh(level), lasting.regions(level)
-        self._thickness, self._stiffness = thickness, stiffness
+        self._thickness, self._stiffness = thickness, settings.cloth_stiffness
         self._sides: Tensor | None = None
+        self._found: _Found | None = None
+        self._looked: ClothState | None = None
         self.tangled = False
-        self._reach = float(thickness.max()) + float(level.spacing.mean())
+        self._reach = float(thickness.max()) + (AHEAD if level.index else 1.0) * float(level.spacing.mean())
 
     @cached_property
     def before(self) -> ClothState:
@@ -129,33 +150,73 @@ class ClothView:
         return self.look(self._base)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ClothState:
-        """Find what crosses at x."""
+        """Find what crosses at x; the answer is kept for the same tensor."""
+        if self._looked is None or self._looked.x is not x:
+            self._looked = self._look(x)
+        return self._looked
+
+    def _look(self, x: Tensor) -> ClothState:
         busy = self._regions.busy(x, 0.0)
         if not bool(busy.any()):
-            none = torch.zeros(0, dtype=torch.int64, device=x.device)
-            return ClothState(x, Crossings(none, none, 0))
+            return ClothState(x, _nothing(x), near=False)
         self._mesh.move(x)
         return ClothState(x, self._mesh.crossings(busy))
 
-    def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | None:
+    def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | Spheres | None:
         """The force between parts that are near one another, or None where no parts are.
 
         Sides are those of the first positions asked for in which nothing crosses; what crosses is drawn out.
         """
-        busy = self._regions.busy(x, self._reach)
-        self.tangled = False
-        if not bool(busy.any()):
-            return None
-        self._mesh.move(x)
-        crossings = self._mesh.crossings(busy)
+        if self._settings.cloth == "spheres":
+            return self._spheres(x)
+        pairs, crossings = self._near(x)
         self.tangled = crossings.count > 0
         if self._sides is None or self.tangled:
             self._sides = x
-        gaps = self._gaps(self._mesh.pairs(busy, torch.full_like(self._level.spacing, self._reach)), x, crossings)
+        if pairs is None:
+            return None
+        gaps = self._gaps(pairs, x, crossings)
         if crossings.count:
             step = OUT * float(self._level.spacing.mean())
             gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=self._stiffness))
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
+
+    def _spheres(self, x: Tensor) -> Spheres | None:
+        """The paper's form: every two vertices nearer than R that are no near neighbours (PAPER P10, A13, A27)."""
+        level, points = self._level, x.double().cpu().numpy()
+        radius = SPHERE * float(level.spacing.mean())
+        pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+        garment = level.vertex_garment.cpu().numpy()[pairs]
+        kept = self._lasting.meets[garment[:, 0], garment[:, 1]]
+        kept &= ~np.asarray(self._mesh.within_two[pairs[:, 0], pairs[:, 1]]).ravel().astype(bool)
+        pairs = pairs[kept]
+        if not len(pairs):
+            return None
+        area = float(level.vertex_area[torch.as_tensor(pairs, device=x.device).reshape(-1)].sum())
+        ends = torch.as_tensor(pairs.astype(np.int32), device=x.device)
+        limit = torch.full((len(pairs),), radius, dtype=x.dtype, device=x.device)
+        return Spheres(level, ends, radius=limit, stiffness=self._settings.sphere_stiffness, area=area)
+
+    def _near(self, x: Tensor) -> tuple[Pairs | None, Crossings]:
+        """What is near what, and what crosses.
+
+        Pairs found before serve again while hardly anything has moved; where nothing crossed at the start of a level,
+        only its end is looked at again.
+        """
+        known, none = self._found, _nothing(x)
+        if known is not None and not self.tangled:
+            moved = (x - known.x).norm(dim=1) > STALE * self._level.spacing
+            if float(moved.to(x.dtype).mean()) < FEW:
+                return known.pairs, none
+        busy = self._regions.busy(x, self._reach)
+        if not bool(busy.any()):
+            self._found = None
+            return None, none
+        self._mesh.move(x)
+        crossings = self._mesh.crossings(busy) if self._sides is None or self.tangled else none
+        pairs = self._mesh.pairs(busy, torch.full_like(self._level.spacing, self._reach))
+        self._found = _Found(x, pairs)
+        return pairs, crossings
 
     def mend(self, x: Float[Tensor, "vertices 3"], good: ClothState | None = None) -> ClothState:
         """Smooth the move from good positions, and then take it back, wherever something crosses that did not.
@@ -165,20 +226,21 @@ class ClothView:
             good: Positions to fall back on; the upsampled cage when None.
 
         Returns:
-            Positions with no more crossings than the good ones have, and none away from where those had some; where
-            that cannot be had, the positions found that have the fewest.
+            The positions found that have the fewest crossings; no more than the good ones have, but where that cannot
+            be had.
         """
+        best = state = self.look(x)
+        if not state.crossings.count:
+            return state
         good = good or self.before
         zone = self._mesh.grown(self._corners(good.crossings), ZONE)
-        best = state = self.look(x)
         shift = x - good.x
         for attempt in range(MENDS):
             corners = self._mesh.corners_of(state.crossings)
-            new = ~zone[corners].all(dim=1)
-            if state.crossings.count > good.crossings.count:
-                new = torch.ones_like(new)
-            if not bool(new.any()):
-                return state
+            too_many = self._excess(state, good) > 0
+            new = torch.ones_like(corners[:, 0], dtype=torch.bool) if too_many else ~zone[corners].all(dim=1)
+            if not bool(new.any()) or (attempt >= SMOOTHINGS and not too_many):
+                return best
             back = torch.zeros_like(zone)
             back[corners[new].reshape(-1)] = True
             if attempt < SMOOTHINGS:
@@ -186,21 +248,34 @@ class ClothView:
             else:
                 shift = shift * self._falling_off(back, attempt - SMOOTHINGS + 1)
             state = self.look(good.x + shift)
-            best = min(best, state, key=lambda each: each.crossings.count)
+            best = min(best, state, key=lambda each: (self._excess(each, good), each.crossings.count))
         return best
 
-    def measure(self, x: Float[Tensor, "vertices 3"]) -> dict[str, dict[str, int]]:
-        """What crosses before and after, as plain values.
+    def worse(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """Whether more crosses than in the upsampled cage, in all or between garments."""
+        state = self.look(x)
+        return state.crossings.count > 0 and self._excess(state, self.before) > 0
+
+    def _excess(self, state: ClothState, good: ClothState) -> int:
+        """By how much more crosses than in good positions, in all or between garments."""
+        apart = [int(np.triu(self._mesh.between(each.crossings), 1).sum()) for each in (state, good)]
+        return max(state.crossings.count - good.crossings.count, apart[0] - apart[1], 0)
+
+    def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, dict[str, int]], Bool[Tensor, " vertices"]]:
+        """What crosses before and after, as plain values, and the vertices of what does after; nothing where no part
+        is near another.
 
         Args:
             x: The result [m].
         """
-        said = {}
-        for name, state in (("before", self.before), ("after", self.look(x))):
+        said, after = {}, self.look(x)
+        if not (after.near or self.before.near):
+            return {}, torch.zeros_like(self._level.free[:, 0])
+        for name, state in (("before", self.before), ("after", after)):
             table = self._mesh.between(state.crossings)
             apart = int(np.triu(table, 1).sum())
             said[name] = {"crossings": state.crossings.count, "between_garments": apart}
-        return said
+        return said, self._corners(after.crossings)
 
     def _smoothed(self, shift: Tensor, where: Bool[Tensor, " vertices"], *, passes: int) -> Tensor:
         """Displacements averaged over neighbours again and again within a region; held outside."""
@@ -239,8 +314,9 @@ class ClothView:
         kept = (~self._corners(crossings)[corners].any(dim=1) & ~undecided) | ordered
         pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
         corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
+        start = x if self._sides is None else self._sides
         way, at_input, at_start = (
-            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, self._sides)
+            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, start)
         )
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
         distance = at_input.norm(dim=1)
@@ -278,6 +354,12 @@ class ClothView:
         cosine = (out * normal).sum(dim=1) * self._lasting.outward[owner]
         cosine = torch.where(first_is_outer, cosine, -cosine)
         return cosine < -FRONTAL
+
+
+def _nothing(x: Tensor) -> Crossings:
+    """No crossings."""
+    none = torch.zeros(0, dtype=torch.int64, device=x.device)
+    return Crossings(none, none, 0)
 
 
 def _swapped(

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -87,6 +88,11 @@ class ClothMesh:
         }
         indices = wp.array(triangles.ravel(), dtype=wp.int32, device=level.device)
         self._mesh = wp.Mesh(points=_vectors(self._position), indices=indices)
+
+    @cached_property
+    def within_two(self) -> sp.csr_matrix:
+        """Which vertices are at most two edges apart."""
+        return sp.csr_matrix(self.beside @ self.beside + self.beside)
 
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions [m]; what is asked afterwards is asked of them."""

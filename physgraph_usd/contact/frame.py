@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..forces.contact import Contact
@@ -16,6 +16,8 @@ from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
 from .settings import ContactSettings
 
+FINISHES = 3
+"""How often cloth is mended and pushed out of bodies in turn, while either undoes the other."""
 Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
 
@@ -79,8 +81,8 @@ class FrameContact:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             cloth = None
             if self._cloth is not None:
-                base, stiffness = level.base.apply(self._coarse), self._settings.stiffness
-                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, stiffness=stiffness)
+                base = level.base.apply(self._coarse)
+                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds)
         return self._views[level.index]
 
@@ -92,23 +94,26 @@ class FrameContact:
         """
         view = self.at(self._levels[-1])
         moved: dict[str, object] = {}
-        good = None if view.cloth is None else view.cloth.mend(x)
-        x = x if good is None else good.x
-        if view.bodies is not None:
-            projected, moved["projected"] = view.bodies.project(x)
-            x = projected if view.cloth is None or projected is x else view.cloth.mend(projected, good).x
+        for _ in range(FINISHES):
+            x = x if view.cloth is None else view.cloth.mend(x).x
+            if view.bodies is not None:
+                x, moved["projected"] = view.bodies.project(x)
+            if view.cloth is None or view.bodies is None or not view.cloth.worse(x):
+                break
         return x, moved
 
-    def measure(self, x: Float[Tensor, "vertices 3"]) -> dict[str, object]:
-        """What is in bodies and what crosses, before and after, as plain values.
+    def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
+        """What is in bodies and what crosses, before and after, as plain values, and vertices of cloth that crosses.
 
         Args:
             x: The result [m].
         """
         finest = self._levels[-1]
-        view, said = self.at(finest), {}
+        view, crossing = self.at(finest), torch.zeros_like(finest.free[:, 0])
+        said: dict[str, object] = {}
         if self._bodies is not None:
             said |= self._bodies.measure(finest, finest.base.apply(self._coarse), x)
         if view.cloth is not None:
-            said["cloth"] = view.cloth.measure(x)
-        return said
+            cloth, crossing = view.cloth.measure(x)
+            said |= {"cloth": cloth} if cloth else {}
+        return said, crossing

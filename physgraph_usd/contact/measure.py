@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
@@ -64,7 +64,7 @@ def penetration(
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
     """
     free = level.free[:, 0]
-    depth, held = _depths(surface, x, signed, longest)
+    depth, held = depths(surface, x, signed, longest)
     deep = (depth > DEEP) & ~held
     inside = int((deep & free).sum())
     deepest = float((depth * (free & ~held)).max()) if len(depth) else 0.0
@@ -74,14 +74,21 @@ def penetration(
         deepest_mm=round(1e3 * deepest, 4),
         pinned=int((deep & ~free).sum()),
         pinched=int((held & free).sum()),
-        crossings=crossings(surface, level, x, signed.abs()),
+        crossings=len(pierced(surface, level, x, signed.abs())),
     )
 
 
-def _depths(
-    surface: Surface, x: Tensor, signed: Tensor, longest: float
+def depths(
+    surface: Surface, x: Float[Tensor, "vertices 3"], signed: Float[Tensor, " vertices"], longest: float
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-    """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched."""
+    """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched.
+
+    Args:
+        surface: The surface.
+        x: Positions in its coordinates [m].
+        signed: Signed distances at x, lower bounds where they are positive [m].
+        longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
+    """
     depth, held = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
     within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
     if len(within):
@@ -108,7 +115,7 @@ def _pierce(
     mesh: wp.uint64,
     start: wp.array(dtype=wp.vec3f),
     end: wp.array(dtype=wp.vec3f),
-    hit: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
 ):
     i = first + wp.tid()
     along = end[i] - start[i]
@@ -116,13 +123,30 @@ def _pierce(
     if length > 0.0:
         query = wp.mesh_query_ray(mesh, start[i], along / length, length)
         if query.result:
-            hit[i] = 1
+            face[i] = query.face
 
 
-def crossings(
+@dataclass(frozen=True, eq=False)
+class Pierced:
+    """Cloth and body through one another.
+
+    Attributes:
+        edges: Edges of the cloth that pass through the body.
+        triangles: Triangles of the cloth that edges of the body pass through, one for each such edge.
+    """
+
+    edges: Int[Tensor, " edges"]
+    triangles: Int[Tensor, " triangles"]
+
+    def __len__(self) -> int:
+        """Number of edges of either."""
+        return len(self.edges) + len(self.triangles)
+
+
+def pierced(
     surface: Surface, level: Level, x: Float[Tensor, "vertices 3"], distance: Float[Tensor, " vertices"]
-) -> int:
-    """Number of edges that pass through a face: the cloth's through the body's and the body's through the cloth's.
+) -> Pierced:
+    """Edges that pass through a face: the cloth's through the body's and the body's through the cloth's.
 
     Of a primitive, the cloth's edges with one end inside. Edges and faces that are farther from the surface than they
     are long are not looked at.
@@ -135,23 +159,24 @@ def crossings(
     """
     ends = level.edges.long()
     start, end = x[ends[:, 0]], x[ends[:, 1]]
-    near = distance[ends].sum(dim=1) <= (end - start).norm(dim=1)
-    if not bool(near.any()):
-        return 0
+    near = torch.nonzero(distance[ends].sum(dim=1) <= (end - start).norm(dim=1)).squeeze(1)
+    none = near[:0]
+    if not len(near):
+        return Pierced(none, none)
     if not isinstance(surface, MeshSurface):
         inside = surface.inside(x)[ends[near]]
-        return int((inside[:, 0] != inside[:, 1]).sum())
-    through = _pierced(surface.mesh, start[near], end[near], lanes=level.lanes)
-    return through + _through_cloth(surface, level, x, distance)
+        return Pierced(near[inside[:, 0] != inside[:, 1]], none)
+    faces = _faces_met(surface.mesh, start[near], end[near], lanes=level.lanes)
+    return Pierced(near[faces >= 0], _through_cloth(surface, level, x, distance))
 
 
-def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tensor) -> int:
-    """Number of the body's edges through the cloth's faces."""
+def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tensor) -> Int[Tensor, " triangles"]:
+    """The cloth's triangles that the body's edges pass through."""
     corners = x[level.triangles.long()]
     sides = (corners - corners.roll(1, dims=1)).norm(dim=2)
-    near: Bool[Tensor, " triangles"] = distance[level.triangles.long()].amin(dim=1) <= COVER * sides.amax(dim=1)
-    if not bool(near.any()):
-        return 0
+    near = torch.nonzero(distance[level.triangles.long()].amin(dim=1) <= COVER * sides.amax(dim=1)).squeeze(1)
+    if not len(near):
+        return near
     place, index = np.unique(level.triangles[near].cpu().numpy(), return_inverse=True)
     points = x[torch.as_tensor(place, device=x.device).long()].to(torch.float32).contiguous()
     device = str(x.device)
@@ -165,14 +190,15 @@ def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tens
     start, end = body[edges[:, 0]], body[edges[:, 1]]
     low, high = points.amin(dim=0), points.amax(dim=0)
     meets = ((torch.maximum(start, end) >= low) & (torch.minimum(start, end) <= high)).all(dim=1)
-    return _pierced(cloth, start[meets], end[meets], lanes=level.lanes)
+    faces = _faces_met(cloth, start[meets], end[meets], lanes=level.lanes)
+    return near[faces[faces >= 0].long()]
 
 
-def _pierced(mesh: wp.Mesh, start: Tensor, end: Tensor, *, lanes: int) -> int:
-    """Number of segments that meet a mesh."""
-    if not len(start):
-        return 0
-    hit = torch.zeros(len(start), dtype=torch.int32, device=start.device)
-    points = [wp.from_torch(each.to(torch.float32).contiguous(), dtype=wp.vec3f) for each in (start, end)]
-    Launch(_pierce, len(start), [mesh.id, *points, wp.from_torch(hit)], device=str(start.device), lanes=lanes)({})
-    return int(hit.sum())
+def _faces_met(mesh: wp.Mesh, start: Tensor, end: Tensor, *, lanes: int) -> Int[Tensor, " segments"]:
+    """The first face of a mesh that each segment meets, -1 where there is none."""
+    face = torch.full((len(start),), -1, dtype=torch.int32, device=start.device)
+    if len(start):
+        points = [wp.from_torch(each.to(torch.float32).contiguous(), dtype=wp.vec3f) for each in (start, end)]
+        inputs = [mesh.id, *points, wp.from_torch(face)]
+        Launch(_pierce, len(start), inputs, device=str(start.device), lanes=lanes)({})
+    return face

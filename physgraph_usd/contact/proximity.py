@@ -140,7 +140,7 @@ def faces_near(
 
 
 @wp.kernel
-def edges_near(
+def edges_near(  # noqa: C901 - one query, each candidate refused as early as can be
     first: wp.int32,
     mesh: wp.uint64,
     ask: wp.array(dtype=wp.int32),

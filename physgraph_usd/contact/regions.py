@@ -43,6 +43,9 @@ class Regions:
         self._patch = torch.as_tensor(patch, device=device)
         self._triangles = level.triangles.long()
         self._triangle_patch = self._patch[self._triangles[:, 0]]
+        self._by_patch = torch.argsort(self._triangle_patch, stable=True)
+        counts = torch.bincount(self._triangle_patch, minlength=self._count)
+        self._first = torch.cat([counts.new_zeros(1), torch.cumsum(counts, 0)])
         ring, near = _rings(cage.edges.cpu().numpy(), cage.vertex_count)
         self._ring = sp.coo_matrix(ring)
         self._centre, self._member = (
@@ -102,10 +105,24 @@ class Regions:
         mean = torch.nn.functional.normalize(sums, dim=1, eps=1e-30)
         angle = torch.arccos((mean[self._centre] * axis[self._member]).sum(dim=1).clamp(-1.0, 1.0))
         over = angle + spread[self._member] > TURNED
-        out = torch.zeros(self._count, dtype=torch.bool, device=x.device)
-        turned = torch.zeros_like(out)
+        turned = torch.zeros(self._count, dtype=torch.bool, device=x.device)
         turned[self._centre[over]] = True
-        out[self._member[turned[self._centre]]] = True
+        # The sum of angles is a bound; where it is exceeded, each triangle is held against the ring's mean.
+        return self._marked(turned, unit, mean)
+
+    def _marked(self, turned: Tensor, unit: Tensor, mean: Tensor) -> Bool[Tensor, " patches"]:
+        """All patches of rings in which some triangle turns away from the ring's mean normal."""
+        rings = turned[self._centre]
+        centre, member = self._centre[rings], self._member[rings]
+        first, count = self._first[member], self._first[member + 1] - self._first[member]
+        pair = torch.repeat_interleave(torch.arange(len(member), device=unit.device), count)
+        start = torch.cumsum(count, 0) - count
+        triangle = self._by_patch[torch.arange(len(pair), device=unit.device) - start[pair] + first[pair]]
+        away = (unit[triangle] * mean[centre[pair]]).sum(dim=1) < math.cos(TURNED)
+        over = torch.zeros(self._count, dtype=torch.bool, device=unit.device)
+        over[centre[pair[away]]] = True
+        out = torch.zeros_like(over)
+        out[self._member[over[self._centre]]] = True
         return out
 
 

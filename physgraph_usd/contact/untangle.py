@@ -1,8 +1,8 @@
 """The way out of a crossing: intersection contour minimisation.
 
-Where an edge passes through a face, the two surfaces meet along a contour that runs from there into the faces on both
-sides of the edge. If the edge moves by d relative to the face, its point on the face moves by d - (N.d / N.E) E, and the
-contour grows shorter by G.d with
+Where an edge passes through a face, the two surfaces meet along a contour that runs from there into the faces at the
+edge. If the edge moves by d relative to the face, its point on the face moves by d - (N.d / N.E) E, and the contour
+grows shorter by G.d with
 
     G = sum_F  R_F - (R_F.E / N.E) N
 

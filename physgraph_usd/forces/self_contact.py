@@ -5,7 +5,7 @@
 
 | symbol | here | meaning |
 |---|---|---|
-| sum_i w_gi x_i | ``Gaps`` | from one point to the other: vertex and face (1, -b0, -b1, -b2), two edges (1-s, s, t-1, -t) |
+| sum_i w_gi x_i | ``Gaps`` | way from one point to another: vertex, face (1, -b0, -b1, -b2), edges (1-s, s, t-1, -t) |
 | n_g | ``Gaps.normal`` | the side on which the first point lies, a unit vector |
 | k_g | ``Gaps.stiffness`` | k_c times the pair's area [N/m] |
 | A | sum of a_u + a_v over pairs nearer than R | [m^2]; its jumps are no forces (PAPER A12) |

@@ -88,6 +88,21 @@ def torus(major: float, minor: float, cells: tuple[int, int]) -> Solid:
     return Solid(points, np.full(len(quads), 4), quads.ravel())
 
 
+def ellipsoid(axes: np.ndarray, middle: np.ndarray, cells: tuple[int, int]) -> Solid:
+    """An ellipsoid of quads, with a fan at its top and at its bottom.
+
+    Args:
+        axes: Half axes [m], shape (3,).
+        middle: Its centre [m], shape (3,).
+        cells: Faces around and from top to bottom.
+    """
+    down = np.pi * np.arange(1, cells[1])[:, None] / cells[1]
+    around = 2 * np.pi * np.arange(cells[0]) / cells[0]
+    ring = [np.sin(down) * np.cos(around), np.cos(down), np.sin(down) * np.sin(around)]
+    rings = np.stack(np.broadcast_arrays(*ring), axis=-1)
+    return lathe(middle + axes * rings, middle + axes * np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]))
+
+
 def off_box(points: np.ndarray, half: np.ndarray, gap: float) -> np.ndarray:
     """Move points that are closer to a box about the origin than a gap straight out.
 

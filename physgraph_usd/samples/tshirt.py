@@ -33,7 +33,7 @@ def build() -> PlainStage:
     """
     times = np.arange(1.0, FRAMES + 1)
     shirt = sew(SHIRT)
-    points = _dress(shirt)
+    points = _slope(dress(shirt))
     garment = PlainMesh(
         name="Shirt",
         counts=np.full(len(shirt.quads), 4),
@@ -41,7 +41,7 @@ def build() -> PlainStage:
         points=points,
         look=Look("Body", (0.20, 0.40, 0.33)),
         uv=shirt.uv,
-        subsets=((Look("Trim", (0.78, 0.66, 0.40)), _trim(shirt)),),
+        subsets=((Look("Trim", (0.78, 0.66, 0.40)), trim(shirt)),),
         fabric=PRESETS["jersey"],
         level=3,
         skin=_weights(shirt.points),
@@ -103,8 +103,15 @@ def _above(points: np.ndarray) -> np.ndarray:
     return ease((points[:, 1] - 0.28) / 0.14)
 
 
-def _dress(shirt: Pillow) -> np.ndarray:
-    """Shape the neckline and the shoulders, then lower the sleeves."""
+def dress(shirt: Pillow) -> np.ndarray:
+    """Shape the neckline and the shoulders; the sleeves stay level.
+
+    Args:
+        shirt: The pillow that `SHIRT` gives.
+
+    Returns:
+        Positions [m], shape (V, 3).
+    """
     points = shirt.points.copy()
     x, y = points[:, 0], points[:, 1]
     near = ease((y - 0.30) / (SHIRT.shoulder - 0.30)) * np.sqrt((1.0 - (x / (1.15 * SHIRT.neck)) ** 2).clip(0.0))
@@ -112,11 +119,18 @@ def _dress(shirt: Pillow) -> np.ndarray:
     points[:, 1] -= np.where(front, 0.060, 0.020) * near
     points[:, 1] += 0.030 * ease((y - 0.35) / 0.22) * (1.0 - np.abs(x) / 0.2).clip(0.0)
     points[:, 0] *= 1.0 + 0.05 * ease(1.0 - y / 0.2) - 0.03 * np.exp(-(((y - 0.2) / 0.09) ** 2))
-    return _slope(points)
+    return points
 
 
-def _trim(shirt: Pillow) -> np.ndarray:
-    """Faces of the hem, the cuffs and the collar."""
+def trim(shirt: Pillow) -> np.ndarray:
+    """Faces of the hem, the cuffs and the collar.
+
+    Args:
+        shirt: The pillow that `SHIRT` gives.
+
+    Returns:
+        Face numbers.
+    """
     row, column = shirt.cell.T
     torso, sleeve, below, across = SHIRT.cells
     centre = shirt.points[shirt.quads].mean(axis=1)

@@ -10,16 +10,31 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from ..colliders.orient import FIXED
 from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ..mesh.topology import PolygonMesh
-from .lookup import COLLIDER_OFFSET, find_value
-from .placement import place, timecode
+from .lookup import COLLIDER_OFFSET, COLLIDER_SIDE, find_token, find_value
+from .placement import is_flipped, place, timecode
 from .shapes import UPRIGHT, tessellated
 from .stage import Notice
 
 _EVEN = 1e-4
 """Relative difference under which two scales count as the same."""
+_PLANE_START = ("plane", "start")
 _KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
+
+
+@dataclass(frozen=True, eq=False)
+class _Topology:
+    """Faces as authored, whether their front is clockwise in the world, and triangles turned to it."""
+
+    counts: np.ndarray
+    indices: np.ndarray
+    flip: bool
+    triangles: np.ndarray
+
+    def equals(self, counts: np.ndarray, indices: np.ndarray, flip: bool) -> bool:
+        return self.flip == flip and np.array_equal(self.counts, counts) and np.array_equal(self.indices, indices)
 
 
 @dataclass(eq=False)
@@ -35,7 +50,7 @@ class ColliderReader:
     prim: Usd.Prim
     collider: Collider
     metres: float
-    _topology: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    _topology: _Topology | None = None
 
     def pose(self, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         """Pose the collider at a time code, between its own samples as USD interpolates them.
@@ -63,16 +78,18 @@ class ColliderReader:
         usable = points.ndim == 2 and points.shape[1] == 3 and len(indices) and counts.sum() == len(indices)
         if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
             return None, (self._out(time, "its points and faces do not fit together"),)
-        return MeshPose(place(points.astype(np.float64), matrix), self._triangles(points, counts, indices)), ()
+        flip = self.collider.side in FIXED and is_flipped(self.prim, matrix)
+        triangles = self._triangles(points, counts, indices, flip=flip)
+        return MeshPose(place(points.astype(np.float64), matrix), triangles), ()
 
-    def _triangles(self, points: np.ndarray, counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    def _triangles(self, points: np.ndarray, counts: np.ndarray, indices: np.ndarray, *, flip: bool) -> np.ndarray:
         """Triangles of the faces; the same array as last time while the topology is the same."""
         known = self._topology
-        if known is None or not (np.array_equal(known[0], counts) and np.array_equal(known[1], indices)):
-            split = PolygonMesh(counts, indices, len(points)).triangulate(np.nan_to_num(points))
-            self._topology = (counts, indices, split.triangles)
-            return split.triangles
-        return known[2]
+        if known is None or not known.equals(counts, indices, flip):
+            triangles = PolygonMesh(counts, indices, len(points)).triangulate(np.nan_to_num(points)).triangles
+            known = _Topology(counts, indices, flip, np.ascontiguousarray(triangles[:, ::-1]) if flip else triangles)
+            self._topology = known
+        return known.triangles
 
     def _shape(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         kind, size, axes = _measures(self.prim, time)
@@ -81,13 +98,14 @@ class ColliderReader:
             normal = np.cross(linear[:, 0], linear[:, 1]) * np.sign(np.linalg.det(linear) or 1.0)
             if not np.linalg.norm(normal) > 0:
                 return None, (self._out(time, "its transform flattens it"),)
+            normal = -normal if self.collider.side == "back" else normal
             return ShapePose(kind, _frame_about(normal), matrix[:3, 3], np.zeros(3)), ()
         stretch = np.linalg.norm(linear, axis=0)
         turn = linear / np.maximum(stretch, 1e-300)
         square = np.allclose(turn.T @ turn, np.eye(3), atol=_EVEN)
         even = {"sphere": (0, 1, 2), "capsule": (0, 1, 2), "cylinder": (0, 1), "cube": ()}.get(kind)
         same = even is not None and np.allclose(stretch[list(even)], stretch[0] if even else 1.0, rtol=_EVEN)
-        if square and same:
+        if square and same and self.collider.side != "start":
             return ShapePose(kind, turn, matrix[:3, 3], size * stretch), ()
         points, triangles = tessellated(kind, size)
         return MeshPose(points @ linear.T + matrix[:3, 3], triangles), ()
@@ -107,14 +125,16 @@ def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None,
         Its reader, or None for a kind of prim that cloth cannot touch, and notices.
 
     Raises:
-        SchemaError: When its offset cannot be used.
+        SchemaError: When its offset or its side cannot be used.
     """
     path, kind = str(prim.GetPath()), str(prim.GetTypeName()).removesuffix("_1")
     if not UsdGeom.Mesh(prim) and kind not in _KINDS:
         return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
     kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
     offset = find_value(prim, COLLIDER_OFFSET).at(None) or 0.0
-    return ColliderReader(prim, Collider(path, kind, offset), metres), ()
+    side = find_token(prim, COLLIDER_SIDE)
+    odd = (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
+    return ColliderReader(prim, Collider(path, kind, offset, side), metres), odd
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:

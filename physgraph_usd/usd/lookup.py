@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
-from .schema import AUTO_LEVEL, COLLIDER_API, GARMENT, MATERIAL, Property, find_property
+from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, find_property
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
 _WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0}
@@ -163,6 +163,21 @@ def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
     return Found(row, "fallback", None, None if row.fallback is None else float(row.fallback))
 
 
+def find_token(prim: Usd.Prim, row: Property) -> str:
+    """Value of a token attribute: the prim's, its nearest ancestor's, or the fallback.
+
+    Raises:
+        SchemaError: When it is none of the row's tokens.
+    """
+    attribute = nearest(prim, row.name)
+    if attribute is None:
+        return str(row.fallback)
+    value = attribute.Get()
+    if value not in row.tokens:
+        raise SchemaError(f"{source_name(attribute)} is {value!r}; it must be one of {', '.join(row.tokens)}")
+    return str(value)
+
+
 def source_name(attribute: Usd.Attribute) -> str:
     """How reports write an attribute: ``</prim>.name``."""
     return f"<{attribute.GetPrim().GetPath()}>.{attribute.GetName()}"
@@ -208,7 +223,9 @@ def is_on(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> 
 
 ENABLED = GARMENT["enabled"]
 """Whether a garment is refined."""
-COLLIDER_ENABLED = Property(COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None, "", True)
+COLLIDER_ENABLED = COLLIDER["collider:enabled"]
 """Whether a collider counts."""
-COLLIDER_OFFSET = Property(COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None, "")
+COLLIDER_OFFSET = COLLIDER["collider:offset"]
 """Distance kept from a collider, added to the garment's."""
+COLLIDER_SIDE = COLLIDER["collider:side"]
+"""Where cloth belongs at a collider."""

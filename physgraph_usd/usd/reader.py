@@ -249,7 +249,8 @@ def _read(
 ) -> list[GarmentReader]:
     """Bake the skinning of garments and bodies and read every garment that is not left out."""
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in prims}
-    notices += request.bake.add([*roots, *bodies], request.frames if request.rest_frame is None else None)
+    frames = request.frames if request.rest_frame is None else None
+    notices += request.bake.add([*roots], frames, bodies=bodies)
     readers, every = [], []
     for path, held in roots.items():
         prim = stage.GetPrimAtPath(path)

@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ..mesh.topology import PolygonMesh
+from .heat import HEAT, PREFIX
 from .normals import VertexNormals
 from .overs import EMPTIED
 from .primvars import STALE
@@ -209,6 +210,21 @@ def primvars(fine: Fine) -> Iterator[Problem]:
                 yield fine.problem(name, message, time, severity="warning" if interpolation == "constant" else "error")
 
 
+def heat_maps(fine: Fine) -> Iterator[Problem]:
+    """Heat maps are finite floats per vertex, depths not negative and crossings 0 to 1; `primvars` counts them."""
+    for name in HEAT:
+        spec = fine.layer.GetAttributeAtPath(fine.prim.GetPath().AppendProperty(PREFIX + name))
+        if spec is None:
+            continue
+        if (spec.typeName, spec.GetInfo("interpolation")) != (Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex):
+            yield fine.problem(PREFIX + name, "is not a float[] with interpolation vertex")
+        for time in fine.times:
+            values = fine.entries(PREFIX + name, time)
+            low, high = (float(pick(values, initial=0.0)) for pick in (np.min, np.max))
+            if not (low >= 0.0 and high <= (1.0 if name == "crossing" else np.finfo(np.float32).max)):
+                yield fine.problem(PREFIX + name, f"has values from {low:g} to {high:g}", time)
+
+
 def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) -> str:
     """What is wrong with a primvar at one time, or ""."""
     value = primvar.Get(code_of(time))
@@ -299,6 +315,7 @@ RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
     normals,
     extent,
     primvars,
+    heat_maps,
     subsets,
     leftovers,
     velocities,

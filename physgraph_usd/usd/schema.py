@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..colliders.pose import SIDES
 from ..errors import UsageError
 from ..fabric import PRESETS
 
@@ -40,18 +41,20 @@ class Property:
         doc: What it is, for the schema's documentation.
         uniform: Whether it cannot be animated.
         interpolation: Of a primvar, else "".
+        tokens: Words that a token may be.
     """
 
     schema: str
     name: str
     type: str
-    fallback: float | int | bool | None
+    fallback: float | int | bool | str | None
     unit: str
     minimum: float | None
     maximum: float | None
     doc: str
     uniform: bool = False
     interpolation: str = ""
+    tokens: tuple[str, ...] = ()
 
     @property
     def short(self) -> str:
@@ -126,12 +129,20 @@ PROPERTIES: tuple[Property, ...] = (
         COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None,
         "Distance kept from this collider, added to the garment's." + SI,
     ),
+    Property(
+        COLLIDER_API, "physgraph:collider:side", "token", "auto", "", None, None,
+        "Where cloth belongs: auto, outside closed parts and where the coarse cloth is at open ones; winding, outside "
+        "by the winding number; start, where the coarse cloth is; front or back, that side of the faces of open parts.",
+        True, tokens=SIDES,
+    ),
     *_material(MATERIAL_API, fallbacks=False),
 )  # fmt: skip
 """Every property of the three schemas, in the order in which they are documented."""
 
 GARMENT: dict[str, Property] = {row.short: row for row in PROPERTIES if row.schema == GARMENT_API}
 """Rows of the garment schema by short name."""
+COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.schema == COLLIDER_API}
+"""Rows of the collider schema by short name."""
 
 
 def find_property(text: str) -> Property:

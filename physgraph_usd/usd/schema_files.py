@@ -37,11 +37,16 @@ over "GLOBAL" (
 """
 
 
-def _number(row: Property, value: float) -> str:
+def _number(row: Property, value: float | str) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
     return str(value).lower() if isinstance(value, bool) else str(int(value)) if row.type == "int" else f"{value:g}"
 
 
 def _limits(row: Property) -> str:
+    """The values allowed, in usda."""
+    if row.tokens:
+        return f"        allowedTokens = [{', '.join(_number(row, token) for token in row.tokens)}]\n"
     bounds = {"minimum": row.minimum, "maximum": row.maximum}
     kind = row.type.removesuffix("[]")
     lines = [
@@ -109,9 +114,9 @@ def attribute_table() -> str:
 def _table_row(row: Property) -> str:
     """One property as a line of Markdown."""
     kind = f"uniform {row.type}" if row.uniform else row.type
-    fallback = "" if row.fallback is None else _number(row, row.fallback)
+    fallback = "" if row.fallback is None else _number(row, row.fallback).strip('"')
     low, high = ("" if value is None else _number(row, value) for value in (row.minimum, row.maximum))
-    limits = f"{low} .. {high}".strip() if low or high else ""
+    limits = f"{low} .. {high}".strip() if low or high else ", ".join(row.tokens)
     unit = ", ".join(part for part in (row.unit, limits) if part)
     return f"| `{row.name}` | {kind} | {fallback} | {unit} | {row.doc.removesuffix(SI)} |"
 

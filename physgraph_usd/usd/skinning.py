@@ -6,7 +6,7 @@ like any other, in its own local space.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from ..errors import GarmentError, StageError
 from .find import instance_roots
 from .lookup import with_ancestors
 from .stage import TRAVERSAL, Notice
-from .times import SAME_TIME, merge, transform_times
+from .times import SAME_TIME, garment_times, merge, transform_times
 
 _SHAPE_COUNT = (4, 4)
 
@@ -59,12 +59,15 @@ class Bake:
         self.layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
         stage.GetSessionLayer().subLayerPaths.insert(0, self.layer.identifier)
 
-    def add(self, paths: Sequence[Sdf.Path], frames: tuple[float, float] | None) -> list[Notice]:
-        """Bake those of the prims that are skinned.
+    def add(
+        self, garments: Sequence[Sdf.Path], frames: tuple[float, float] | None, *, bodies: Sequence[Sdf.Path] = ()
+    ) -> list[Notice]:
+        """Bake those of the prims that are skinned, bodies also at the garments' times.
 
         Args:
-            paths: Mesh prims; those inside instances become editable in the anonymous layer.
+            garments: Mesh prims; those inside instances become editable in the anonymous layer.
             frames: First and last time code, or None for all.
+            bodies: Colliders.
 
         Returns:
             What looks skinned and is not.
@@ -72,12 +75,15 @@ class Bake:
         Raises:
             GarmentError: When UsdSkel bakes nothing for a skinned mesh.
         """
+        paths = [*garments, *bodies]
         bound = [path for path in paths if skel_root(self._stage.GetPrimAtPath(path))]
         for path in bound:
             make_editable(self._stage, self.layer, path)
         found = {path: skinned for path in bound if (skinned := find_skinning(self._stage, path))}
         if found:
-            _bake(self._stage, self.layer, list(found.values()), frames=frames)
+            cloth = merge(time for path in garments for time in _times_of(self._stage.GetPrimAtPath(path), found))
+            wanted = {skinned: cloth if path in bodies else () for path, skinned in found.items()}
+            _bake(self._stage, self.layer, wanted, frames=frames)
         for skinned in found.values():
             _check(self._stage, self.layer, skinned, frames=frames)
         self.skinned.update(found)
@@ -134,8 +140,20 @@ def _skeleton_times(skeleton: UsdSkel.SkeletonQuery) -> tuple[float, ...]:
     return merge(times)
 
 
-def _bake(stage: Usd.Stage, layer: Sdf.Layer, wanted: Sequence[Skinned], *, frames: tuple[float, float] | None) -> None:
-    """Bake each skel root once, with all other skinned prims switched off meanwhile."""
+def _times_of(prim: Usd.Prim, found: Mapping[Sdf.Path, Skinned]) -> Sequence[float]:
+    """Time codes of a garment that is yet to be baked."""
+    skinned = found.get(prim.GetPath())
+    return garment_times(prim) if skinned is None else [*skinned.times, *transform_times(prim)]
+
+
+def _bake(
+    stage: Usd.Stage,
+    layer: Sdf.Layer,
+    wanted: Mapping[Skinned, Sequence[float]],
+    *,
+    frames: tuple[float, float] | None,
+) -> None:
+    """Bake each skel root once, with all other skinned prims switched off meanwhile; some at further time codes."""
     rates = {"timeCodesPerSecond": stage.GetTimeCodesPerSecond(), "framesPerSecond": stage.GetFramesPerSecond()}
     for name, rate in rates.items():
         if not rate > 0:  # UsdSkel steps by their ratio and would never come to an end
@@ -152,8 +170,8 @@ def _bake(stage: Usd.Stage, layer: Sdf.Layer, wanted: Sequence[Skinned], *, fram
     session = stage.GetSessionLayer()
     session.subLayerPaths.insert(0, mask.identifier)
     try:
-        for skinned in wanted:
-            _sample_animation(stage, mask, skinned, interval=interval)
+        for skinned, times in wanted.items():
+            _sample_animation(stage, mask, skinned, times, interval=interval)
         with Usd.EditContext(stage, layer):
             for root in roots:
                 UsdSkel.BakeSkinning(UsdSkel.Root.Get(stage, root), interval)
@@ -161,8 +179,10 @@ def _bake(stage: Usd.Stage, layer: Sdf.Layer, wanted: Sequence[Skinned], *, fram
         session.subLayerPaths.remove(mask.identifier)
 
 
-def _sample_animation(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, interval: Gf.Interval) -> None:
-    """Give the animation a sample, in a passing layer, at each time code that only a transform has.
+def _sample_animation(
+    stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, times: Sequence[float], *, interval: Gf.Interval
+) -> None:
+    """Give the animation a sample, in a passing layer, at each time code that only a transform or the cloth has.
 
     UsdSkel bakes where the animation has samples; between them baked points would run along a chord.
     """
@@ -174,7 +194,7 @@ def _sample_animation(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, i
     if attribute is None:
         return
     own = attribute.GetTimeSamples()
-    wanted = merge([*own, *skinned.times, *transform_times(stage.GetPrimAtPath(skinned.path))])
+    wanted = merge([*own, *skinned.times, *transform_times(stage.GetPrimAtPath(skinned.path)), *times])
     if len(wanted) == len(own):
         return
     values = {time: attribute.Get(time) for time in wanted if interval.Contains(time) or time in own}

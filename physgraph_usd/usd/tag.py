@@ -7,12 +7,13 @@ from pathlib import Path
 
 from pxr import Sdf, Usd, UsdGeom
 
+from ..colliders.pose import SIDES
 from ..errors import StageError, UsageError
 from ..fabric import PRESETS, Fabric
 from .atomic import prepare_target
 from .find import find_colliders, find_garments
 from .provenance import export_layer, relative_path, root_over
-from .schema import COLLIDER_API, GARMENT_API
+from .schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, Property
 from .stage import open_stage
 
 
@@ -23,6 +24,8 @@ def tag(
     garments: Sequence[str] = (),
     colliders: Sequence[str] = (),
     preset: str | None = None,
+    layer: int | None = None,
+    side: str | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Apply the schemas to prims of a shot, in a new layer that shows the shot and can be refined.
@@ -33,20 +36,25 @@ def tag(
         garments: Prim paths, names, globs or collections of meshes.
         colliders: The same, of anything with a surface.
         preset: Name of a fabric whose values are authored on the garments, or None.
+        layer: Place of the garments in the order of garments, lower is nearer to the body, or None.
+        side: Where cloth belongs at the colliders, one of `SIDES`, or None.
         overwrite: Whether an existing file may be replaced.
 
     Returns:
         The layer's path.
 
     Raises:
-        UsageError: Nothing was named, the preset is unknown, or the file exists.
+        UsageError: Nothing was named, the preset or the side is unknown or for nothing that was named, or the file
+            exists.
         StageError: A named prim is not there, lies in an instance, or is no surface.
         LayerError: The layer cannot be written.
     """
     if not garments and not colliders:
         raise UsageError("nothing to tag; name a garment or a collider")
-    if preset is not None and preset not in PRESETS:
-        raise UsageError(f"unknown preset {preset!r}; known presets: {', '.join(sorted(PRESETS))}")
+    _check_word("preset", preset, sorted(PRESETS))
+    _check_word("side", side, SIDES)
+    if (layer is not None and not garments) or (side is not None and not colliders):
+        raise UsageError("a layer is for garments and a side for colliders; name one")
     target = Path(out)
     if target.resolve() == Path(shot).resolve():
         raise UsageError(f"{out} is the shot itself; the input is never edited, choose another name")
@@ -54,16 +62,26 @@ def tag(
     stage, _ = open_stage(str(shot))
     cloth = find_garments(stage, garments) if garments else []
     solid = find_colliders(stage, cloth, colliders) if colliders else []
-    layer = root_over(stage.GetRootLayer(), [relative_path(shot, target.parent)])
+    root = root_over(stage.GetRootLayer(), [relative_path(shot, target.parent)])
     for prim in (*cloth, *solid):
         _check_editable(prim)
     for prim in cloth:
-        _apply(layer, prim, GARMENT_API)
+        spec = _applied(root, prim, GARMENT_API)
         if preset is not None:
-            _author_fabric(layer, prim, PRESETS[preset])
+            _author_fabric(spec, PRESETS[preset])
+        if layer is not None:
+            _author(spec, GARMENT["contact:layer"], layer)
     for prim in solid:
-        _apply(layer, prim, COLLIDER_API)
-    return export_layer(layer, target)
+        spec = _applied(root, prim, COLLIDER_API)
+        if side is not None:
+            _author(spec, COLLIDER["collider:side"], side)
+    return export_layer(root, target)
+
+
+def _check_word(what: str, word: str | None, known: Sequence[str]) -> None:
+    """Refuse a word that is none of those known."""
+    if word is not None and word not in known:
+        raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(known)}")
 
 
 def _check_editable(prim: Usd.Prim) -> None:
@@ -77,17 +95,17 @@ def _check_editable(prim: Usd.Prim) -> None:
         raise StageError(f"<{prim.GetPath()}> is a {prim.GetTypeName() or 'prim without a type'}; it has no surface")
 
 
-def _apply(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> None:
-    """Prepend an API schema in the layer's over."""
+def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
+    """The layer's over of a prim, with an API schema prepended."""
     spec = Sdf.CreatePrimInLayer(layer, prim.GetPath())
     schemas = Sdf.TokenListOp()
     schemas.prependedItems = [schema]
     spec.SetInfo("apiSchemas", schemas)
+    return spec
 
 
-def _author_fabric(layer: Sdf.Layer, prim: Usd.Prim, fabric: Fabric) -> None:
+def _author_fabric(spec: Sdf.PrimSpec, fabric: Fabric) -> None:
     """Author a fabric's values on a garment."""
-    spec = layer.GetPrimAtPath(prim.GetPath())
     values = {
         "stretchStiffness": fabric.stretch,
         "shearStiffness": fabric.shear,
@@ -97,5 +115,11 @@ def _author_fabric(layer: Sdf.Layer, prim: Usd.Prim, fabric: Fabric) -> None:
     }
     for name, value in values.items():
         if value is not None:
-            attribute = Sdf.AttributeSpec(spec, f"physgraph:material:{name}", Sdf.ValueTypeNames.Float)
-            attribute.default = value
+            _author(spec, GARMENT[name], value)
+
+
+def _author(spec: Sdf.PrimSpec, row: Property, value: float | str) -> None:
+    """Author one attribute's default."""
+    variability = Sdf.VariabilityUniform if row.uniform else Sdf.VariabilityVarying
+    kind = Sdf.ValueTypeNames.Find(row.type)  # pyright: ignore[reportCallIssue]  the stubs know no argument
+    Sdf.AttributeSpec(spec, row.name, kind, variability).default = value

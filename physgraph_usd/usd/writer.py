@@ -20,6 +20,7 @@ from ..mesh.subdivide import Refinement
 from . import overs, provenance
 from .atomic import termination_raises
 from .carry import FineMap
+from .heat import HeatTrack
 from .hints import ModelHints
 from .material_opinions import author_used_values
 from .normals import VertexNormals
@@ -82,6 +83,7 @@ class LayerWriter:
         self.targets: list[Sdf.Path] = []
         self._tracks: list[PointTrack] = []
         self._hints: list[ModelHints] = []
+        self._heat: list[HeatTrack] = []
         with ExitStack() as stack:
             stack.enter_context(termination_raises())
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
@@ -121,11 +123,17 @@ class LayerWriter:
         normals = VertexNormals(fine.fine, left_handed=left)
         track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=self._rate)
         self._tracks.append(track)
+        self._heat.append(HeatTrack(stream, target, normals.vertex_count, still=not source.times))
         purpose = "render" if self._mode == "sibling" else UsdGeom.Imageable(prim).ComputePurpose()
         self._hints.append(ModelHints(stream, self._shot.stage, source.path, purpose=purpose))
 
     def write(
-        self, time: float | None, points: Sequence[np.ndarray | None], *, changed: Sequence[bool] | None = None
+        self,
+        time: float | None,
+        points: Sequence[np.ndarray | None],
+        *,
+        changed: Sequence[bool] | None = None,
+        heat: Sequence[Mapping[str, np.ndarray] | None] = (),
     ) -> None:
         """Write one time code.
 
@@ -134,11 +142,12 @@ class LayerWriter:
             points: Per garment, fine points [m], world space, shape (V_fine, 3), or None where the garment has no
                 sample at this time.
             changed: Per garment, False where the points are known to equal the last ones.
+            heat: Per garment, its heat maps by name, each of shape (V_fine,), or None; () for no heat maps.
 
         Raises:
             LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
         """
-        self._check_call(time, points)
+        self._check_call(time, points, heat)
         if self._time == -np.inf:
             self._author_values(time)
         for index, track in enumerate(self._tracks):
@@ -148,6 +157,8 @@ class LayerWriter:
             different = True if changed is None else bool(changed[index])
             track.write(time, array, self._shot.to_metres(index, time), changed=different)
             self._hints[index].write(time, track.box)
+            if heat:
+                self._heat[index].write(time, heat[index] or {})
         self._time = np.inf if time is None else time
 
     def _author_values(self, time: float | None) -> None:
@@ -156,7 +167,12 @@ class LayerWriter:
         for source, garment, values in zip(self._shot.sources, self._shot.scene.garments, frame.garments, strict=True):
             author_used_values(self._stream, source, garment, values)
 
-    def _check_call(self, time: float | None, points: Sequence[np.ndarray | None]) -> None:
+    def _check_call(
+        self,
+        time: float | None,
+        points: Sequence[np.ndarray | None],
+        heat: Sequence[Mapping[str, np.ndarray] | None],
+    ) -> None:
         """Refuse calls that would make a wrong layer."""
         if not self._open:
             raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
@@ -167,6 +183,10 @@ class LayerWriter:
         for track, array in zip(self._tracks, points, strict=True):
             if array is not None:
                 track.check(array, time)
+        if heat and len(heat) != len(self._heat):
+            raise LayerError(f"heat maps of {len(heat)} garments for {len(self._heat)} garments")
+        for track, maps in zip(self._heat, heat, strict=False):
+            track.check(maps or {}, time)
 
     def close(self) -> Path:
         """Finish, validate and move the layer to its final name.

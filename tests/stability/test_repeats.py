@@ -80,7 +80,8 @@ def test_s36_ten_passes_over_its_own_output_do_not_drift(temporal: str, steps: i
     frame = GarmentFrame(wave(REST), FABRIC, GUIDE)
     kept, outputs, energies, inputs = None, [], [], []
     for _ in range(11):
-        points, kept, telemetry = group.solve([frame], kept, at=None)
+        solved = group.solve([frame], kept, at=None)
+        points, kept, telemetry = solved.points, solved.carried, solved.telemetry
         outputs.append(points[0])
         energies.append(total(telemetry, "output"))
         inputs.append(total(telemetry, "input"))

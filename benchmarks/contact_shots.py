@@ -1,0 +1,165 @@
+"""What contact leaves in shots: vertices in bodies and crossings, before and after, in our form and in the paper's.
+
+    python -m benchmarks.contact_shots [--frames 5] [--level 2] [--form ours] [--shot NAME] [FOLDER]
+
+Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
+Prints a row a shot: the sums over frames and garments.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from physgraph_usd.contact.settings import ContactSettings
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.samples import write_sample
+from physgraph_usd.shot import prepare_device
+from physgraph_usd.usd.reader import Shot, open_shot
+
+FORMS = {
+    "ours": ContactSettings(),
+    "paper": ContactSettings(form="linear", cloth="spheres"),
+    "elastic": ContactSettings(form="off", cloth="off"),
+}
+SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "crossing": 1, "skirt": 20}
+"""Samples and the number of their first frame here."""
+REAL = {
+    "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], ["/shot/char/body_geo"], 36),
+    "02_makehuman_usdskel_dm.usdc": (["/shot/char/top", "/shot/char/shorts"], ["/shot/char/body"], 20),
+    "06_torus_pull.usda": (["/shot/cloth"], ["/shot/torus"], 36),
+    "08_sphere_spin_xformcollider.usdc": (["/shot/set/cloth"], ["/shot/set/rig/sphere"], 30),
+    "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], ["/shot/CesiumMan"], 30),
+}
+"""Real shots: garments, bodies and the number of the first frame here."""
+LANES = 2
+
+
+@dataclass
+class Sums:
+    """What a run left, summed over frames.
+
+    Attributes:
+        vertices: Free fine vertices.
+        inside: Vertices deeper than 0.1 mm in closed bodies, before and after.
+        deepest: Deepest of them after [mm].
+        pinched: Those between overlapping parts of a body, after.
+        body: Crossings of cloth and bodies, before and after.
+        cloth: Crossings of cloth and cloth, before and after.
+        between: Those of different garments, before and after.
+        worse: Frames with more crossings of cloth than before.
+        strain: Largest 99th percentile of the edges' extension.
+        seconds: Median of the frames' times.
+    """
+
+    vertices: int = 0
+    inside: tuple[int, int] = (0, 0)
+    deepest: float = 0.0
+    pinched: int = 0
+    body: tuple[int, int] = (0, 0)
+    cloth: tuple[int, int] = (0, 0)
+    between: tuple[int, int] = (0, 0)
+    worse: int = 0
+    strain: float = 0.0
+    seconds: float = 0.0
+
+    def add(self, entry: dict[str, Any]) -> None:
+        """Take one group's frame."""
+        contact = entry.get("contact", {})
+        for values in contact.get("bodies", {}).values():
+            before, after = values["before"], values["after"]
+            self.inside = _plus(self.inside, before["inside"], after["inside"])
+            self.body = _plus(self.body, before["crossings"], after["crossings"])
+            self.deepest = max(self.deepest, after["deepest_mm"])
+            self.pinched += after["pinched"]
+        cloth = contact.get("cloth")
+        if cloth:
+            before, after = cloth["before"], cloth["after"]
+            self.cloth = _plus(self.cloth, before["crossings"], after["crossings"])
+            self.between = _plus(self.between, before["between_garments"], after["between_garments"])
+            self.worse += after["crossings"] > before["crossings"]
+        self.strain = max(self.strain, entry["strain"]["p99"])
+
+
+def _plus(pair: tuple[int, int], before: int, after: int) -> tuple[int, int]:
+    return pair[0] + before, pair[1] + after
+
+
+@click.command()
+@click.argument("folder", required=False, type=click.Path(path_type=Path))
+@click.option("--frames", default=5, show_default=True)
+@click.option("--level", default=2, show_default=True)
+@click.option("--form", "forms", multiple=True, type=click.Choice(list(FORMS)), default=["ours", "paper"])
+@click.option("--shot", "shots", multiple=True, help="Only these.")
+def main(folder: Path | None, frames: int, level: int, forms: Sequence[str], shots: Sequence[str]) -> None:
+    """Print the table."""
+    prepare_device("cpu")
+    say(f"{frames} frames in a row, level {level}; a -> b: before and after")
+    say(
+        "| shot | form | vertices | inside | % | deepest mm | pinched | body crossings | cloth crossings | garments "
+        "| frames worse | strain p99 | s/frame |"
+    )
+    say("|---|---|---|---|---|---|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as place:
+        for name in [*SAMPLES, *(REAL if folder else ())]:
+            if shots and not any(each in name for each in shots):
+                continue
+            shot, first = _open(name, Path(place), folder)
+            for form in forms:
+                sums = _run(shot, first, frames, level=level, settings=FORMS[form])
+                say(_row(name, form, sums))
+
+
+def _open(name: str, place: Path, folder: Path | None) -> tuple[Shot, int]:
+    if name in SAMPLES:
+        return open_shot(str(write_sample(name, place))), SAMPLES[name]
+    garments, colliders, first = REAL[name]
+    return open_shot(str(Path(folder or "") / name), garments=garments, colliders=colliders), first
+
+
+def _run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSettings) -> Sums:
+    from physgraph_usd.options import RefineOptions  # noqa: PLC0415
+
+    solve = replace(RefineOptions().solve_settings(), contact=settings)
+    refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), lanes=LANES)
+    sums, spent = Sums(), []
+    for time_code in shot.scene.times[first : first + count]:
+        frame = shot.frame(time_code)
+        began = time.perf_counter()
+        state = refiner.solve(frame)
+        spent.append(time.perf_counter() - began)
+        seen = []
+        for entry in state.telemetry:
+            if not any(entry is each for each in seen):  # Garments solved together share one.
+                seen.append(entry)
+                sums.add(entry)
+        sums.vertices += sum(len(points) for points in state.points if points is not None)
+    sums.seconds = sorted(spent)[len(spent) // 2]
+    return sums
+
+
+def _row(name: str, form: str, sums: Sums) -> str:
+    percent = 100.0 * sums.inside[1] / max(sums.vertices, 1)
+    arrows = [f"{a} -> {b}" for a, b in (sums.inside, sums.body, sums.cloth, sums.between)]
+    return (
+        f"| {Path(name).parts[0].split(chr(46))[0]} | {form} | {sums.vertices} | {arrows[0]} | {percent:.3f} "
+        f"| {sums.deepest:.2f} | {sums.pinched} | {arrows[1]} | {arrows[2]} | {arrows[3]} | {sums.worse} "
+        f"| {sums.strain:.3f} | {sums.seconds:.2f} |"
+    )
+
+
+def say(line: str) -> None:
+    """Write a line to standard output."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""Bodies that a cage passes right through between two frames.
+
+Each frame is solved at its own time, where the cloth is pushed out of closed bodies and kept on its cage's side of open
+ones. A body that is faster than it is thick may be on one side of the cage in a frame and on the other in the next; the
+cloth follows its cage there, and this says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..colliders.orient import pieces_of
+from ..colliders.pose import Collider, MeshPose
+from ..colliders.sweep import passages
+from ..scene import Frame, Garment
+
+
+class Passed:
+    """Remembers the last frame of a shot. Primitives and meshes whose topology changes are not looked at."""
+
+    def __init__(
+        self, garments: Sequence[Garment], colliders: Sequence[Collider], *, device: str = "cpu", lanes: int = 1
+    ) -> None:
+        """Take the scene; nothing is looked at before the second frame."""
+        self._garments, self._colliders = tuple(garments), tuple(colliders)
+        self._place = {"device": device, "lanes": lanes}
+        self._last: Frame | None = None
+        self._parts: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def forget(self) -> None:
+        """Compare the next frame with none."""
+        self._last = None
+
+    def look(self, frame: Frame) -> list[dict[str, int]]:
+        """Compare a frame with the last one.
+
+        Returns:
+            For each garment, the number of its cage's points that came through, by the body's path: out of a closed
+            piece that they were not in before, or to the other side of an open one.
+        """
+        last, self._last = self._last, frame
+        if last is None:
+            return [{} for _ in self._garments]
+        found = []
+        for index, garment in enumerate(self._garments):
+            ways = last.garments[index].points, frame.garments[index].points
+            counts = {self._colliders[body].path: self._count(body, last, frame, ways) for body in garment.colliders}
+            found.append({path: count for path, count in counts.items() if count})
+        return found
+
+    def _count(self, body: int, last: Frame, frame: Frame, ways: tuple[np.ndarray, np.ndarray]) -> int:
+        before, after = last.colliders[body], frame.colliders[body]
+        if not isinstance(before, MeshPose) or not isinstance(after, MeshPose):
+            return 0
+        if before.points.shape != after.points.shape or not np.array_equal(before.triangles, after.triangles):
+            return 0
+        if not _meet(np.stack([before.points, after.points]), np.stack(ways)):
+            return 0
+        closed, opened = self._pieces(body, after)
+        start, end = ways
+        through = [
+            passages(faces, before.points, after.points, start=start, end=end, **self._place)
+            for faces in (closed, opened)
+        ]
+        came_out = (through[0] > 0) & (through[0] % 2 == 0)
+        return int((came_out | (through[1] % 2 == 1)).sum())
+
+    def _pieces(self, body: int, pose: MeshPose) -> tuple[np.ndarray, np.ndarray]:
+        """Closed and open triangles, kept while the topology stays the same."""
+        known = self._parts.get(body)
+        if known is None or not np.array_equal(known[0], pose.triangles):
+            pieces = pieces_of(pose.points, pose.triangles, side=self._colliders[body].side)
+            known = self._parts[body] = pose.triangles, pieces.closed, pieces.open
+        return known[1], known[2]
+
+
+def _meet(body: np.ndarray, cloth: np.ndarray) -> bool:
+    """Whether the boxes of two point sets over both frames, each of shape (2, N, 3), meet."""
+    if not body.size or not cloth.size:
+        return False
+    boxes = [(each.min(axis=(0, 1)), each.max(axis=(0, 1))) for each in (body, cloth)]
+    # Points that are not finite make every comparison false.
+    return bool((boxes[0][0] <= boxes[1][1]).all() and (boxes[1][0] <= boxes[0][1]).all())
+
+
+def told(garment: str, found: Mapping[float | None, Mapping[str, int]]) -> list[str]:
+    """A warning for each body that passed through a garment.
+
+    Args:
+        garment: The garment's path.
+        found: What `Passed.look` gave, by time code.
+    """
+    said = []
+    for body in sorted({body for counts in found.values() for body in counts}):
+        times = [time for time, counts in found.items() if body in counts]
+        most = max(counts.get(body, 0) for counts in found.values())
+        when = f"before time code {times[0]:g}" + (f" and {len(times) - 1} more" if len(times) > 1 else "")
+        said.append(
+            f"<{garment}>: the coarse cloth passes right through <{body}> {when}, at most {most} points at once; the "
+            "refined cloth follows it to the other side"
+        )
+    return said

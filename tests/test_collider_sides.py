@@ -1,0 +1,259 @@
+"""The side on which cloth belongs, where an artist says so: winding, start, front, back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import torch
+from bodies import Soup, around, ball, box, flipped, split, together, tube
+from cloth import sheet
+from pxr import Usd, UsdGeom, Vt
+from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix, vec3
+from touching import frame, measured, mesh_pose, refiner
+
+from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.colliders.pose import SIDES, MeshPose, ShapePose
+from physgraph_usd.colliders.sign import signed_distances
+from physgraph_usd.errors import SchemaError
+from physgraph_usd.shot import inspect_shot
+from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.schema import COLLIDER
+
+MESH, REST = sheet(6, 6, 0.05)
+FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
+"""A small sheet lying level."""
+
+
+def surfaces(soup: Soup, side: str) -> tuple[MeshSurface, ...]:
+    return MeshBody(side=side, device="cpu", lanes=1).pose(MeshPose(*soup))
+
+
+def signed(surface: MeshSurface, x: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
+    pairs = torch.as_tensor(np.zeros((0, 2), np.int32) if edges is None else edges)
+    return signed_distances(surface, torch.as_tensor(x - surface.origin), pairs, reach=10.0).numpy()
+
+
+def floor(size: float = 1.0, cells: int = 4) -> Soup:
+    """An open level square at height zero whose front is up."""
+    ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
+    z, x = np.meshgrid(ticks, ticks)
+    points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    ids = np.arange(x.size).reshape(cells + 1, cells + 1)
+    a, b, c, d = (part.ravel() for part in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
+    return points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+
+
+TUBE = tube(rows=17)
+TUBES = {
+    "tube": TUBE,
+    "inward": flipped(TUBE),
+    "mixed": flipped(TUBE, 0.5),
+    "split": split(TUBE),
+    "two": together(TUBE, (TUBE[0] + np.array([0.5, 0.0, 0.0]), TUBE[1])),
+}
+
+
+class TestWinding:
+    @pytest.mark.parametrize("name", TUBES)
+    def test_open_pieces_have_the_inside_that_libigls_winding_number_gives(self, name: str):
+        soup = TUBES[name]
+        (surface,) = surfaces(soup, "winding")
+        assert (surface.closed, surface.certain) == (True, True)
+        outward = TUBES["two" if name == "two" else "tube"]
+        x = around(soup, 3000)
+        number = np.asarray(igl.winding_number(outward[0], outward[1].astype(np.int64), x))
+        clear = np.abs(number - 0.5) > 0.03
+        assert 200 < (number[clear] > 0.5).sum() < 2500
+        np.testing.assert_array_equal(signed(surface, x)[clear] < 0, number[clear] > 0.5)
+
+    def test_the_sign_does_not_spread_through_an_opening(self):
+        """A chain of points from inside the tube out of its end meets no face, and the side changes all the same."""
+        (surface,) = surfaces(TUBE, "winding")
+        x = np.stack([np.zeros(60), np.zeros(60), np.linspace(0.0, 0.4, 60)], axis=1)
+        chain = np.stack([np.arange(59), np.arange(1, 60)], axis=1).astype(np.int32)
+        found = signed(surface, x, chain) < 0
+        assert found[0]
+        assert not found[-1]
+        assert (np.diff(found.astype(int)) != 0).sum() == 1
+
+    def test_a_closed_body_is_what_it_is_on_auto(self):
+        soup = together(ball(), ball(0.15, at=(0.25, 0.0, 0.0)))
+        x = around(soup, 1000)
+        (auto,), (forced,) = surfaces(soup, "auto"), surfaces(soup, "winding")
+        np.testing.assert_array_equal(signed(auto, x), signed(forced, x))
+
+    @pytest.mark.parametrize("side", ["auto", "winding"])
+    def test_cloth_that_starts_in_an_open_body_comes_out_of_it(self, side: str):
+        """A dome without a floor: on auto what starts under it belongs there."""
+        points, triangles = ball(0.2, level=4)
+        dome = points, triangles[points[triangles][:, :, 1].min(axis=1) > -0.05]
+        state = refiner((MESH, REST), side=side).solve(frame(FLAT + np.array([0.0, 0.19, 0.0]), mesh_pose(dome)))
+        assert measured(state)["inside"] == 0
+        assert measured(state, "before")["inside"] == (0 if side == "auto" else pytest.approx(75, abs=25))
+        found = state.points[0]
+        assert found is not None
+        assert (np.linalg.norm(found, axis=1) > 0.1995).all() == (side == "winding")
+
+
+class TestStart:
+    def test_a_closed_body_is_open_to_it(self):
+        (surface,) = surfaces(ball(), "start")
+        assert (surface.closed, surface.fixed_side) == (False, None)
+        x = torch.zeros((1, 3), dtype=torch.float64)
+        assert not bool(surface.closest(x, torch.full((1,), torch.inf, dtype=torch.float64)).rim.any())
+
+    @pytest.mark.parametrize("side", ["auto", "start"])
+    def test_cloth_inside_a_closed_body_stays_there_only_with_start(self, side: str):
+        soup = ball(0.3, level=4)
+        start = FLAT + np.array([0.0, -0.2, 0.0])
+        state = refiner((MESH, REST), side=side).solve(frame(start, mesh_pose(soup)))
+        points = state.points[0]
+        assert points is not None
+        radius = np.linalg.norm(points, axis=1)
+        assert (radius < 0.3).all() == (side == "start")
+
+    def test_it_holds_the_cloth_off_the_wall_from_inside(self):
+        soup = ball(0.3, level=4)
+        start = FLAT + np.array([0.0, -0.21, 0.0])
+        assert 0.297 < np.linalg.norm(start, axis=1).max() < 0.299
+        free = refiner((MESH, REST), side="start", felt=()).solve(frame(start, mesh_pose(soup))).points[0]
+        held = refiner((MESH, REST), side="start").solve(frame(start, mesh_pose(soup))).points[0]
+        assert free is not None
+        assert held is not None
+        outer = [float(np.linalg.norm(points, axis=1).max()) for points in (free, held)]
+        assert outer[0] > 0.299
+        assert outer[1] < 0.2982
+
+
+class TestFrontAndBack:
+    @pytest.mark.parametrize(("side", "up"), [("front", 1.0), ("back", -1.0), ("start", None)])
+    def test_the_side_of_an_open_surface_is_fixed(self, side: str, up: float | None):
+        (surface,) = surfaces(floor(), side)
+        assert (surface.closed, surface.fixed_side) == (False, up)
+        x = np.array([[0.1, 0.2, 0.1], [0.1, -0.2, 0.1], [2.0, 0.2, 0.1], [2.0, -0.2, 0.1]])
+        signs = np.sign(signed(surface, x))
+        expected = [1.0, 1.0] if up is None else [up, -up]
+        np.testing.assert_array_equal(signs, [*expected, 1.0, 1.0])
+
+    def test_the_authored_winding_counts_and_is_not_made_consistent(self):
+        points, triangles = floor()
+        apart = together((points, triangles), (points + np.array([3.0, 0.0, 0.0]), triangles[:, ::-1]))
+        (surface,) = surfaces(apart, "front")
+        x = np.array([[0.1, 0.2, 0.1], [3.1, 0.2, 0.1]])
+        np.testing.assert_array_equal(np.sign(signed(surface, x)), [1.0, -1.0])
+        (mixed,) = surfaces(flipped(floor(), 0.4), "front")
+        np.testing.assert_array_equal(np.sort(mixed.triangles, axis=1), np.sort(triangles, axis=1))
+        np.testing.assert_array_equal(mixed.triangles, flipped(floor(), 0.4)[1])
+
+    def test_closed_bodies_keep_their_inside(self):
+        for side in ("front", "back"):
+            (surface,) = surfaces(flipped(box()), side)
+            assert (surface.closed, surface.fixed_side) == (True, None)
+            assert signed(surface, np.zeros((1, 3)))[0] < 0
+
+    @pytest.mark.parametrize(("side", "above"), [("front", True), ("back", False), ("auto", False)])
+    def test_cloth_that_starts_under_a_floor(self, side: str, above: bool):
+        start = FLAT + np.array([0.0, -0.004, 0.0])
+        state = refiner((MESH, REST), side=side, gravity=np.zeros(3)).solve(frame(start, mesh_pose(floor())))
+        points = state.points[0]
+        assert points is not None
+        assert (points[:, 1] > 0.0).all() == above
+        assert (points[:, 1] < 0.0).all() != above
+
+    @pytest.mark.parametrize("side", ["front", "back"])
+    def test_cloth_that_starts_on_its_side_is_let_be_where_it_does_not_touch(self, side: str):
+        start = FLAT + np.array([0.0, 0.05 if side == "front" else -0.05, 0.0])
+        free = refiner((MESH, REST), felt=(), gravity=np.zeros(3)).solve(frame(start, mesh_pose(floor()))).points[0]
+        near = refiner((MESH, REST), side=side, gravity=np.zeros(3)).solve(frame(start, mesh_pose(floor()))).points[0]
+        assert free is not None
+        assert near is not None
+        np.testing.assert_array_equal(free, near)
+
+
+BODY = "/World/body"
+
+
+class TestOnStages:
+    @pytest.fixture
+    def stage(self, tmp_path: Path) -> Usd.Stage:
+        made = new_stage(tmp_path / "s.usda")
+        add_sheet(made)
+        points, triangles = floor()
+        mesh = UsdGeom.Mesh.Define(made, BODY)
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))
+        mesh.CreatePointsAttr(vec3(points))
+        mesh.GetPrim().AddAppliedSchema(COLLIDER_API)
+        return made
+
+    def side(self, stage: Usd.Stage) -> str:
+        return open_shot(save(stage)).scene.colliders[0].side
+
+    @pytest.mark.parametrize("side", SIDES)
+    def test_every_word_is_read(self, stage: Usd.Stage, side: str):
+        assert COLLIDER["collider:side"].tokens == SIDES
+        assert self.side(stage) == "auto"
+        author(stage.GetPrimAtPath(BODY), "physgraph:collider:side", side, kind="token")
+        assert self.side(stage) == side
+
+    def test_inspect_tells_it(self, stage: Usd.Stage):
+        author(stage.GetPrimAtPath(BODY), "physgraph:collider:side", "back", kind="token")
+        assert f"with {BODY} (side: back)," in inspect_shot(save(stage))["modelled"]["contact"]
+
+    def test_an_ancestor_gives_it_as_a_string(self, stage: Usd.Stage):
+        author(stage.GetPrimAtPath("/World"), "userProperties:physgraph:collider:side", "start", kind="string")
+        assert self.side(stage) == "start"
+
+    @pytest.mark.parametrize(("kind", "value"), [("token", "left"), ("float", 1.0)])
+    def test_anything_else_is_refused_by_name(self, stage: Usd.Stage, kind: str, value: object):
+        author(stage.GetPrimAtPath("/World"), "physgraph:collider:side", value, kind=kind)
+        with pytest.raises(SchemaError, match=r"</World>\.physgraph:collider:side.*auto, winding, start, front, back"):
+            self.side(stage)
+
+    @pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
+    @pytest.mark.parametrize("scale", [(1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 2)])
+    def test_the_front_is_usds(self, stage: Usd.Stage, orientation: str, scale: tuple[int, int, int]):
+        prim = stage.GetPrimAtPath(BODY)
+        UsdGeom.Mesh(prim).CreateOrientationAttr(orientation)
+        set_matrix(prim, np.diag([*scale, 1.0]).astype(float))
+        author(prim, "physgraph:collider:side", "front", kind="token")
+        pose = open_shot(save(stage)).frame(1.0).colliders[0]
+        assert isinstance(pose, MeshPose)
+        a, b, c = (pose.points[pose.triangles[:, corner]] for corner in range(3))
+        local = np.array([0.0, 1.0 if orientation == "rightHanded" else -1.0, 0.0])
+        image = np.linalg.inv(np.diag(scale)).T @ local
+        assert (np.cross(b - a, c - a) @ image > 0).all()
+
+    def test_a_mirror_that_comes_and_goes_turns_the_faces(self, stage: Usd.Stage):
+        prim = stage.GetPrimAtPath(BODY)
+        operation = UsdGeom.Xformable(prim).AddScaleOp()
+        for time, x in ((1.0, 1.0), (2.0, -1.0), (3.0, 1.0)):
+            operation.Set((x, 1.0, 1.0), time)
+        author(prim, "physgraph:collider:side", "front", kind="token")
+        shot = open_shot(save(stage))
+        for time in (1.0, 2.0, 3.0):
+            pose = shot.frame(time).colliders[0]
+            assert isinstance(pose, MeshPose)
+            a, b, c = (pose.points[pose.triangles[:, corner]] for corner in range(3))
+            assert (np.cross(b - a, c - a)[:, 1] > 0).all()
+
+    def test_a_primitive_becomes_a_mesh_for_the_start_side(self, stage: Usd.Stage):
+        sphere = UsdGeom.Sphere.Define(stage, "/World/ball").GetPrim()
+        sphere.AddAppliedSchema(COLLIDER_API)
+        assert isinstance(open_shot(save(stage)).frame(1.0).colliders[1], ShapePose)
+        author(sphere, "physgraph:collider:side", "start", kind="token")
+        assert isinstance(open_shot(save(stage)).frame(1.0).colliders[1], MeshPose)
+
+    def test_a_plane_can_be_turned_and_has_no_start_side(self, stage: Usd.Stage):
+        plane = UsdGeom.Plane.Define(stage, "/World/plane").GetPrim()
+        plane.AddAppliedSchema(COLLIDER_API)
+        for side, up in (("front", 1.0), ("back", -1.0), ("start", 1.0)):
+            author(plane, "physgraph:collider:side", side, kind="token")
+            shot = open_shot(save(stage))
+            pose = shot.frame(1.0).colliders[1]
+            assert isinstance(pose, ShapePose)
+            assert pose.turn[2, 2] == pytest.approx(up)
+            assert any("no start side" in str(notice) for notice in shot.warnings) == (side == "start")

@@ -1,0 +1,293 @@
+"""Heat maps: what is measured, what is written, and that nothing changes in a layer without them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bodies import ball, distances, tube
+from cloth import sheet
+from layers import COAT, TIMES, errors, fine_points, make_shot, open_over, refine_all
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from shots import CLOTH, cloth_shot, faults, refine
+from stages import COLLIDER_API
+
+from physgraph_usd.chunks import Outcome, _collect, _solve_chunk
+from physgraph_usd.colliders.mesh import MeshBody
+from physgraph_usd.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.colliders.primitives import ShapeSurface
+from physgraph_usd.contact.heat import body_crossings, penetration_map
+from physgraph_usd.errors import LayerError
+from physgraph_usd.mesh.topology import edges_of
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.validate import validate_layer
+from physgraph_usd.usd.writer import LayerWriter
+
+NAMES = ("penetration", "crossing")
+NO_EDGES = np.zeros((0, 2), np.int32)
+
+
+def sphere(radius: float, x: float = 0.0) -> ShapeSurface:
+    return ShapeSurface(ShapePose("sphere", np.eye(3), np.array([x, 0.0, 0.0]), np.full(3, radius)))
+
+
+class TestPenetration:
+    def test_depth_in_a_sphere_is_what_is_left_of_its_radius(self):
+        x = np.random.default_rng(0).uniform(-0.3, 0.3, (500, 3))
+        expected = 1e3 * np.maximum(0.2 - np.linalg.norm(x, axis=1), 0.0)
+        found = penetration_map([sphere(0.2)], x, NO_EDGES)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+        assert (found > 0).sum() > 20
+
+    def test_the_deepest_body_counts(self):
+        x = np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        np.testing.assert_allclose(penetration_map([sphere(0.2), sphere(0.1, 0.25)], x, NO_EDGES), [200, 100, 0])
+
+    def test_in_a_mesh_it_is_libigls_distance(self):
+        soup = ball(level=4)
+        x = np.random.default_rng(1).uniform(-0.25, 0.25, (400, 3))
+        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))
+        inside = np.linalg.norm(x, axis=1) < 0.199
+        clear = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 2e-3
+        found = penetration_map([surface], x, NO_EDGES)
+        np.testing.assert_allclose(found[clear], (1e3 * distances(soup, x) * inside)[clear], atol=5e-3)
+
+    @pytest.mark.parametrize(("side", "depth"), [("auto", 0.0), ("back", 0.0), ("front", 20.0)])
+    def test_an_open_body_has_a_behind_only_where_its_side_is_fixed(self, side: str, depth: float):
+        (surface,) = MeshBody(side=side, device="cpu", lanes=1).pose(MeshPose(*tube(around=256)))
+        found = penetration_map([surface], np.array([[0.08, 0.0, 0.0]]), NO_EDGES)
+        assert found[0] == pytest.approx(depth, abs=0.1)
+
+
+class TestCrossings:
+    def test_a_sheet_through_a_mesh_marks_what_crosses(self):
+        """A level sheet through a ball: its edges between inside and outside, and nothing away from the surface."""
+        x, faces = level_sheet()
+        soup = ball(0.2, level=3)
+        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))
+        edges = edges_of(faces, len(x)).vertices
+        found = body_crossings([surface], x, edges, triangles=faces)
+        radius = np.linalg.norm(x, axis=1)[edges]
+        through = (radius.min(axis=1) < 0.199) & (radius.max(axis=1) > 0.2)
+        assert through.sum() > 20
+        assert found[edges[through].ravel()].all()
+        away = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 0.075
+        assert away.sum() > 80
+        assert not found[away].any()
+
+    def test_a_spike_through_the_middle_of_a_face_marks_its_corners(self):
+        x, faces = level_sheet()
+        at = x[faces[7]].mean(axis=0)
+        normal = np.eye(3)[np.ptp(x, axis=0).argmin()]
+        base = np.array([[1e-3, 1e-3, 1e-3], [-1e-3, 1e-3, -1e-3], [1e-3, -1e-3, -1e-3]])
+        spike = np.concatenate([[0.3 * normal], base - 0.3 * normal]) + at
+        sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [3, 2, 1]])
+        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(spike, sides))
+        found = body_crossings([surface], x, edges_of(faces, len(x)).vertices, triangles=faces)
+        assert np.flatnonzero(found).tolist() == sorted(faces[7].tolist())
+
+    def test_of_a_primitive_edges_with_one_end_inside(self):
+        x, faces = level_sheet()
+        edges = edges_of(faces, len(x)).vertices
+        found = body_crossings([sphere(0.2)], x, edges, triangles=faces)
+        inside = (np.linalg.norm(x, axis=1) < 0.2)[edges]
+        expected = np.zeros(len(x), bool)
+        expected[edges[inside[:, 0] != inside[:, 1]].ravel()] = True
+        np.testing.assert_array_equal(found, expected)
+
+
+def level_sheet() -> tuple[np.ndarray, np.ndarray]:
+    """Points and triangles of a sheet in a plane through the origin."""
+    mesh, rest = sheet(12, 12, 0.05)
+    return rest - rest.mean(axis=0) + 1e-3, np.asarray(mesh.triangulate(None).triangles)
+
+
+def write(shot_file: Path, out: Path, heat: Mapping[Any, dict[str, Any] | None], **options: object) -> Path:
+    """Refine a shot linearly into a layer with given heat maps."""
+    shot = open_shot(str(shot_file), level=1)
+    steps = refine_all(shot)
+    with LayerWriter(shot, steps, out, **options) as writer:  # type: ignore[arg-type]
+        for time in shot.scene.times or (None,):
+            given = [heat[time]] if time in heat else ()
+            writer.write(time, fine_points(shot, steps, time), heat=given)
+    return out
+
+
+def values(composed: Usd.Stage, name: str, time: float | None, *, path: str = COAT) -> np.ndarray | None:
+    primvar = UsdGeom.PrimvarsAPI(composed.GetPrimAtPath(path)).GetPrimvar(f"physgraph:{name}")
+    value = primvar.Get(Usd.TimeCode.Default() if time is None else time)
+    return None if value is None else np.asarray(value)
+
+
+def samples(out: Path, name: str, path: str = COAT) -> list[float]:
+    layer = Sdf.Layer.FindOrOpen(str(out))
+    return list(layer.ListTimeSamplesForPath(f"{path}.primvars:physgraph:{name}"))
+
+
+class TestLayers:
+    @pytest.fixture
+    def shot(self, tmp_path: Path) -> Path:
+        make_shot(tmp_path / "shot.usda")
+        return tmp_path / "shot.usda"
+
+    @pytest.mark.parametrize("mode", ["over", "sibling"])
+    @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
+    def test_values_come_back_per_sample(self, shot: Path, tmp_path: Path, mode: str, suffix: str):
+        rng = np.random.default_rng(0)
+        heat = {t: {n: rng.random(63, np.float32) for n in NAMES} for t in TIMES}
+        out = write(shot, tmp_path / f"out{suffix}", heat, mode=mode)
+        path = COAT if mode == "over" else f"{COAT}_refined"
+        stage = open_over(shot, out)
+        for time in TIMES:
+            for name in NAMES:
+                np.testing.assert_array_equal(values(stage, name, time, path=path), heat[time][name])
+        primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(path)).GetPrimvar("physgraph:penetration")
+        assert (primvar.GetInterpolation(), primvar.GetTypeName()) == ("vertex", Sdf.ValueTypeNames.FloatArray)
+        assert errors(out, shot) == []
+
+    def test_a_still_garment_has_a_default_and_no_samples(self, tmp_path: Path):
+        make_shot(tmp_path / "still.usda", times=())
+        out = write(tmp_path / "still.usda", tmp_path / "out.usdc", {None: {"penetration": np.ones(63)}})
+        assert samples(out, "penetration") == []
+        found = values(open_over(tmp_path / "still.usda", out), "penetration", None)
+        np.testing.assert_array_equal(found, np.ones(63))
+        assert errors(out) == []
+
+    def test_a_run_of_equal_samples_is_written_by_its_ends(self, tmp_path: Path):
+        times = tuple(float(t) for t in range(1, 8))
+        make_shot(tmp_path / "long.usda", times=times)
+        steps = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
+        heat = {t: {"penetration": np.full(63, s)} for t, s in zip(times, steps, strict=True)}
+        out = write(tmp_path / "long.usda", tmp_path / "out.usdc", heat)
+        assert samples(out, "penetration") == [1.0, 3.0, 4.0]
+        stage = open_over(tmp_path / "long.usda", out)
+        for time, step in zip(times, steps, strict=True):
+            np.testing.assert_array_equal(values(stage, "penetration", time), np.full(63, step))
+
+    def test_maps_that_are_not_known_are_left_out(self, shot: Path, tmp_path: Path):
+        out = write(shot, tmp_path / "out.usdc", {TIMES[1]: {"penetration": np.ones(63)}, TIMES[2]: None})
+        assert samples(out, "penetration") == [TIMES[1]]
+        assert not Sdf.Layer.FindOrOpen(str(out)).GetAttributeAtPath(f"{COAT}.primvars:physgraph:crossing")
+        assert errors(out, shot) == []
+
+    @pytest.mark.parametrize(
+        ("heat", "message"),
+        [
+            ({"penetration": np.zeros(3)}, r"penetration> at time code 1: needs 63 finite values, got shape \(3,\)"),
+            ({"crossing": np.full(63, np.nan)}, "crossing> at time code 1: needs 63 finite"),
+            ({"fever": np.zeros(63)}, "no such heat map; known: penetration, crossing"),
+        ],
+    )
+    def test_wrong_maps_leave_nothing(self, shot: Path, tmp_path: Path, heat: dict, message: str):
+        with pytest.raises(LayerError, match=message):
+            write(shot, tmp_path / "out.usdc", {TIMES[0]: heat})
+        assert [file.name for file in tmp_path.iterdir()] == ["shot.usda"]
+
+    @pytest.mark.parametrize(
+        ("name", "value", "message"),
+        [
+            ("penetration", [-1.0] * 63, "has values from -1 to 0"),
+            ("penetration", [float("nan")] * 63, "has values from nan"),
+            ("crossing", [2.0] * 63, "has values from 0 to 2"),
+            ("penetration", [0.0] * 5, "has 5 elements; its interpolation needs 63"),
+        ],
+    )
+    def test_the_validator_sees_broken_maps(
+        self, shot: Path, tmp_path: Path, name: str, value: list[float], message: str
+    ):
+        out = write(shot, tmp_path / "out.usdc", {t: {n: np.zeros(63) for n in NAMES} for t in TIMES})
+        layer = Sdf.Layer.FindOrOpen(str(out))
+        layer.SetTimeSample(f"{COAT}.primvars:physgraph:{name}", TIMES[1], Vt.FloatArray(value))
+        layer.Save()
+        found = [problem for problem in validate_layer(out, shot) if name in problem.path]
+        assert any(message in problem.message and problem.severity == "error" for problem in found)
+        assert TIMES[0] not in {problem.time for problem in found}
+
+
+def body_shot(path: Path, *, frozen: bool = False) -> Path:
+    """The waving sheet with a ball that passes through it."""
+    cloth_shot(path, frozen=frozen)
+    stage = Usd.Stage.Open(str(path))
+    ball_prim = UsdGeom.Sphere.Define(stage, "/World/ball")
+    ball_prim.CreateRadiusAttr(1.5)
+    operation = ball_prim.AddTranslateOp()
+    for time in (1.0, 6.0):
+        operation.Set(Gf.Vec3d(2.0, 2.0, time - 3.0), time)
+    ball_prim.GetPrim().AddAppliedSchema(COLLIDER_API)
+    stage.Save()
+    return path
+
+
+class Heated:
+    """A solver with heat maps of its own."""
+
+    def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
+        for time in times:
+            points = (np.full((2, 3), time), None, np.zeros((1, 3)))
+            heat = ({"penetration": np.full(2, time), "crossing": np.ones(2)}, None, {})
+            yield Outcome(time, points, (False, False, False), {"time": time}, heat)
+
+
+class TestShots:
+    @pytest.mark.parametrize("contact", ["quadratic", "off"])
+    def test_a_layer_tells_how_deep_the_cloth_is(self, tmp_path: Path, contact: str):
+        shot, out = body_shot(tmp_path / "shot.usdc"), tmp_path / "fine.usdc"
+        report = refine(shot, out, heat_map=True, contact=contact)
+        assert report.options["heat_map"] is True
+        assert faults(out, shot) == []
+        stage = open_over(shot, out)
+        deepest = 0.0
+        for time in (1.0, 3.0, 6.0):
+            found = values(stage, "penetration", time, path=CLOTH)
+            assert found is not None
+            points = 0.05 * np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(time))
+            away = np.linalg.norm(points - 0.05 * np.array([2.0, 2.0, time - 3.0]), axis=1)
+            np.testing.assert_allclose(found, 1e3 * np.maximum(0.075 - away, 0.0), atol=1e-3)
+            deepest = max(deepest, float(found.max()))
+            crossing = values(stage, "crossing", time, path=CLOTH)
+            assert crossing is not None
+            assert set(np.unique(crossing)) <= {0.0, 1.0}
+            assert crossing.any() == (contact == "off" and time == 3.0)
+        assert (deepest > 1.0) == (contact == "off")
+
+    def test_a_body_moving_through_cloth_at_rest_shows(self, tmp_path: Path):
+        shot, out = body_shot(tmp_path / "shot.usdc", frozen=True), tmp_path / "fine.usdc"
+        report = refine(shot, out, heat_map=True, contact="off")
+        assert all("reused" in frame["garments"][0]["start"] for frame in report.frames[1:])
+        assert samples(out, "penetration", CLOTH) == [1.0, 2.0, 3.0, 4.0, 5.0]  # at 6 it is past, as at 5
+
+    @pytest.mark.slow
+    def test_workers_hand_it_over_unchanged(self, tmp_path: Path):
+        shot = body_shot(tmp_path / "shot.usdc")
+        layers = []
+        for workers in (1, 2):
+            (tmp_path / str(workers)).mkdir()
+            layers.append(tmp_path / str(workers) / "fine.usdc")
+            refine(shot, layers[-1], heat_map=True, workers=workers, temporal="off")
+        assert layers[0].read_bytes() == layers[1].read_bytes()
+        assert samples(layers[0], "penetration", CLOTH)
+
+    def test_each_garment_keeps_its_own_in_a_frames_file(self, tmp_path: Path):
+        times = [1.0, 2.0, 3.0]
+        _solve_chunk(Heated(), list(times), 1, tmp_path, 5)
+        for index, time in enumerate(times[1:], start=5):
+            outcome = _collect(tmp_path / f"{index}.npz", time, Future())
+            first, second, third = outcome.heat
+            assert (second, third) == (None, {})
+            assert first is not None
+            np.testing.assert_array_equal(first["penetration"], np.full(2, outcome.time))
+            np.testing.assert_array_equal(first["crossing"], np.ones(2))
+
+    def test_without_it_a_layer_has_no_trace_of_it(self, tmp_path: Path):
+        shot, out = body_shot(tmp_path / "shot.usdc"), tmp_path / "fine.usda"
+        refine(shot, out)
+        text = out.read_text()
+        assert "penetration" not in text
+        assert "heat" not in text
+        assert "heat_map" not in RefineOptions().plain()
