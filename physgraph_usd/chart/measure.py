@@ -123,8 +123,7 @@ class _Bench:
         last = [row for row in rows if row["steps"] == steps]
         if len(last) < len(self._frames):
             return True
-        spent = sum(row["ms"] for row in last) / len(last)
-        if growth * spent > self._plan.most_ms:
+        if expected_ms(rows, steps, growth) > self._plan.most_ms:
             return True
         return self._is_flat(rows, steps)
 
@@ -144,3 +143,14 @@ class _Bench:
 
 def _energy(row: dict[str, Any]) -> float:
     return sum(row["energies"].values())
+
+
+def expected_ms(rows: list[dict[str, Any]], steps: int, growth: float) -> float:
+    """Time of the next rung [ms], on the line through the last two: some of a frame's time does not grow with steps."""
+    budgets = sorted({row["steps"] for row in rows if row["steps"] <= steps})[-2:]
+    spent = [[row["ms"] for row in rows if row["steps"] == each] for each in budgets]
+    means = [sum(each) / len(each) for each in spent]
+    if len(means) < 2:
+        return means[-1]
+    slope = max(means[1] - means[0], 0.0) / (budgets[1] - budgets[0])
+    return means[1] + slope * (growth - 1.0) * steps

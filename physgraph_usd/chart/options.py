@@ -39,7 +39,7 @@ class Size:
 
 
 SHORT = Size(SHORT_MINUTES, repeats=3, more=9, growth=2.0, reach=4.0, frames=2)
-LONG = Size(None, repeats=7, more=7, growth=1.5, reach=16.0, frames=3)
+LONG = Size(None, repeats=5, more=5, growth=1.5, reach=8.0, frames=3)
 
 
 @dataclass(frozen=True)

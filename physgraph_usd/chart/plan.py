@@ -13,7 +13,7 @@ FOR_REFERENCE, FOR_CURVES, FOR_TERMS = 0.25, 0.55, 0.15
 """Parts of the time."""
 LATEST = 1.1
 """Part of the time after which nothing more is begun; a rerun goes on."""
-LEAST_REACH = 2.0
+LEAST_REACH = 2.5
 REFERENCE_SECONDS = 300.0
 """Time for a frame's Phi* where there is no limit."""
 TERM_SOLVES = 30
