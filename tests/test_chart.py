@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +18,12 @@ pytest.importorskip("matplotlib", reason="charts are drawn with matplotlib")
 pytest.importorskip("plotly", reason="charts are drawn with plotly")
 
 from browser import hover, opened
+from click.testing import CliRunner
 from PIL import Image
 from pxr import Usd, UsdGeom
 from shots import cloth_shot, refine
 
+from physgraph_usd import cli
 from physgraph_usd.chart.journal import Journal
 from physgraph_usd.chart.measure import expected_ms, rungs
 from physgraph_usd.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
@@ -45,7 +48,7 @@ np.savez(sys.argv[2], x_0_1=x, ms_0_1=ms, x_1_1=x, ms_1_1=ms)
 """A solver outside that does nothing."""
 
 OPTIONS = ChartOptions(
-    level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=1.0
+    level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=5.0
 )
 QUICK = replace(OPTIONS, budget_minutes=0.02)
 
@@ -301,3 +304,37 @@ def test_a_solver_outside_that_fails_is_told(made: tuple[Path, Path, Chart], tmp
 def test_wrong_peers_are_refused(given: str):
     with pytest.raises(UsageError, match="peer"):
         parse_peers([given])
+
+
+LINE = (
+    "--level",
+    "1",
+    "--method",
+    "quasi-newton",
+    "--method",
+    "gd",
+    "--collider",
+    "/World/ball",
+    "--budget-minutes",
+    "0.02",
+)
+
+
+def test_the_command_prints_a_summary_and_tells_progress(made: tuple[Path, Path, Chart], tmp_path: Path):
+    shot, folder, _ = made
+    shutil.copytree(folder, tmp_path / "out")
+    result = CliRunner().invoke(cli.main, ["chart", str(shot), "-o", str(tmp_path / "out"), *LINE])
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("| method | ms to 10% | ms to 3% | ms to 1% | least gap | at ms |")
+    assert "refine's default: " in result.stdout
+    assert "left" in result.stderr
+
+
+@pytest.mark.parametrize("missing", ["matplotlib", "plotly"])
+def test_a_missing_library_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, missing: str):
+    for name in [name for name in sys.modules if name.startswith("physgraph_usd.chart")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    result = CliRunner().invoke(cli.main, ["chart", "shot.usda", "-o", str(tmp_path / "out")])
+    assert result.exit_code == 1
+    assert result.stderr == f"error: {missing} is not installed: pip install 'physgraph-usd[chart]'\n"

@@ -91,7 +91,7 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
         return Problem(scene, levels, device=options.device, lanes=lanes, dtype=dtype, clock=options.clock)
 
     problems = build(opened.scene, levels), build(opened.scene, levels, torch.float64)
-    about = _about(opened, folder, levels, options) | {"vertices": problems[0].vertex_count}
+    about = _about(opened, levels, options) | {"vertices": problems[0].vertex_count}
     journal = Journal(folder, about, overwrite=options.overwrite)
     curves = find_curves(options.methods)
     plan = _plan(journal, problems, _frame(opened, _times(opened, 1)[0]), curves=curves, options=options)
@@ -139,7 +139,7 @@ def _plan(
     return plan
 
 
-def _about(opened: Shot, folder: Path, levels: Sequence[int], options: ChartOptions) -> dict[str, Any]:
+def _about(opened: Shot, levels: Sequence[int], options: ChartOptions) -> dict[str, Any]:
     """What is measured: rows of anything else do not belong to this chart."""
     device = options.device
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.processor()
@@ -154,7 +154,7 @@ def _about(opened: Shot, folder: Path, levels: Sequence[int], options: ChartOpti
         "default": {"integrator": RefineOptions().integrator, "steps": COLD.steps, "tolerance": COLD.tolerance},
         "options": options.plain(),
         "frames": list(options.frames or ()),
-        "inputs": file_hashes(opened.stage, folder.resolve()),
+        "inputs": file_hashes(opened.stage, Path(opened.path).resolve().parent),
     }
 
 
