@@ -170,6 +170,24 @@ class Refiner:
         heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
+    def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
+        """Energy [J] of all garments at given world positions [m], what touches there found anew."""
+        self._bodies.pose(frame.colliders)
+        total = 0.0
+        for part in self._parts.of(frame.garments):
+            frames = [frame.garments[index] for index in part]
+            touching = self._touching(part, frames, self._near(part, frames))
+            total += sum(self.group_of(part).energies(frames, [points[index] for index in part], touching).values())
+        return total
+
+    def _touching(
+        self, part: Sequence[int], frames: Sequence[GarmentFrame], near: Sequence[int]
+    ) -> tuple[Touching, ...]:
+        """Surfaces of bodies, and the distance that each garment keeps from them."""
+        felt = [self._scene.garments[index].colliders for index in part]
+        offsets = [[f.offset if body in own else None for body in near] for own, f in zip(felt, frames, strict=True)]
+        return self._bodies.touching(near, offsets)
+
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
     ) -> tuple[list[_Known | None], list[dict[str, object]]]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..forces.contact import Contact
 from ..forces.self_contact import SelfContact, Spheres
+from ..integrate.metric import Metric
 from ..level import Level
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
@@ -22,7 +23,13 @@ Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
 
 
-@dataclass(frozen=True, eq=False)
+CHANGED = 0.3
+"""Part of the stiffness of what touches that may change before a metric is factorised anew."""
+REFACTORED = 60_000
+"""Vertices up to which a level's metric takes up the stiffness of what touches; above, factorising costs too much."""
+
+
+@dataclass(eq=False)
 class LevelContact:
     """One level's view of what it may touch.
 
@@ -35,6 +42,17 @@ class LevelContact:
     bodies: LevelBodies | None
     cloth: ClothView | None
     rounds: int
+    _held: tuple[Tensor, Metric] | None = None
+
+    def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric:
+        """The metric of a level whose cloth is held by what touches at x [m]; the same one while little changes."""
+        if not terms or len(x) > REFACTORED:
+            return plain
+        # A plane holds in one direction of three; the metric knows none, so it takes the whole stiffness.
+        stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
+        if self._held is None or float((stiff - self._held[0]).abs().sum()) > CHANGED * float(stiff.sum()):
+            self._held = (stiff, plain.plus(stiff))
+        return self._held[1]
 
     @property
     def tangled(self) -> bool:
@@ -86,21 +104,26 @@ class FrameContact:
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds)
         return self._views[level.index]
 
-    def finish(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, object]]:
-        """Push the solved cloth out of bodies and take back what newly crosses.
+    def finish(
+        self, x: Float[Tensor, "vertices 3"]
+    ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"], dict[str, object]]:
+        """Take back what newly crosses and push the solved cloth out of bodies.
 
         Returns:
-            Positions [m], x itself where nothing had to move; and what had to move.
+            Positions [m], x itself where nothing had to move; the same before bodies pushed, where the next frame
+            starts: it is where forces rest, so that equal frames stay equal; and what had to move.
         """
         view = self.at(self._levels[-1])
         moved: dict[str, object] = {}
+        mended = None
         for _ in range(FINISHES):
             x = x if view.cloth is None else view.cloth.mend(x).x
+            mended = x if mended is None else mended
             if view.bodies is not None:
                 x, moved["projected"] = view.bodies.project(x)
             if view.cloth is None or view.bodies is None or not view.cloth.worse(x):
                 break
-        return x, moved
+        return x, x if mended is None else mended, moved
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
         """What is in bodies and what crosses, before and after, as plain values, and vertices of cloth that crosses.

@@ -221,13 +221,21 @@ def wide(v: wp.vec3f):
 
 
 @wp.func
-def passes_through(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d):
-    """Whether the inside of a segment passes through the inside of a triangle; touching is not passing."""
-    zero = wp.float64(0.0)
-    if volume(p, q, r, a) * volume(p, q, r, b) >= zero:
+def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int32):
+    """Whether the line from p to q passes an edge on its left; of two faces at a side just one has it on its left."""
+    low, high = wp.min(p, q), wp.max(p, q)
+    left = volume(wide(x[e[0]]), wide(x[e[1]]), wide(x[low]), wide(x[high])) >= wp.float64(0.0)
+    return left == (p < q)
+
+
+@wp.func
+def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
+    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces."""
+    p, q, r = wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])
+    if volume(p, q, r, wide(x[e[0]])) * volume(p, q, r, wide(x[e[1]])) >= wp.float64(0.0):
         return False
-    u, v, w = volume(a, b, p, q), volume(a, b, q, r), volume(a, b, r, p)
-    return (u > zero and v > zero and w > zero) or (u < zero and v < zero and w < zero)
+    first = turns_left(x, e, t[0], t[1])
+    return turns_left(x, e, t[1], t[2]) == first and turns_left(x, e, t[2], t[0]) == first
 
 
 @wp.kernel
@@ -247,7 +255,6 @@ def pierced(
     """For each edge asked, how many faces it passes through, and the first of them."""
     i = first + wp.tid()
     a, b = edges[ask[i]][0], edges[ask[i]][1]
-    start, end = wide(x[a]), wide(x[b])
     found = wp.vec4i(-1, -1, -1, -1)
     total = wp.int32(0)
     query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]), wp.max(x[a], x[b]))
@@ -258,7 +265,7 @@ def pierced(
             continue
         if meets[garment[a] * garments + garment[t[0]]] == 0:
             continue
-        if passes_through(start, end, wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])):
+        if passes_through(x, edges[ask[i]], t):
             if total < SLOTS:
                 found[total] = f
             total += 1

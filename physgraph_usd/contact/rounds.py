@@ -73,21 +73,21 @@ def solve_rounds(
         SolveError: The energy is not finite.
     """
     reports: list[LevelReport] = []
-    left, resume = budget.steps, None
+    left, last = budget.steps, None
     share = -(-budget.steps // view.rounds)
     kept: list[Carry] = []
     while True:
-        kept.clear()
+        system = make_system(terms, x)
         x, report = solve_level(
-            make_system(terms, x),
+            system,
             integrator,
             x,
             level=level,
             budget=replace(budget, steps=min(left, share) if terms else left),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
-            resume=resume,
+            resume=kept[-1] if last is not None and system.shares_metric(last) else None,
         )
-        resume = kept[-1]
+        last = system
         reports.append(report)
         left -= report.steps
         if report.stopped == "budget" or (left <= 0 and terms):

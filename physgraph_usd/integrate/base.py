@@ -50,6 +50,10 @@ class System:
         self.evaluations = 0
         self.metric_solves = 0
 
+    def shares_metric(self, other: System) -> bool:
+        """Whether what was learned of the curvature under another system holds under this one."""
+        return self._metric is other._metric
+
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N]; the force on vertices that may not move is zero."""
         self.evaluations += 1
