@@ -183,12 +183,10 @@ class Group:
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
     ) -> dict[str, float]:
         """Energy of each term [J] at the garments' world positions [m], what touches there found anew."""
-        world = np.concatenate([frame.points for frame in frames])
-        origin, forces = world.mean(axis=0), self._forces_for(frames)
-        coarse, x = self._tensor(world - origin), self._tensor(np.concatenate(points) - origin)
-        contact = self._contact(touching, coarse, origin, frames)
+        module, contact, origin = self.potential(frames, touching)
+        x = self._tensor(np.concatenate(points) - origin)
         touched = () if contact is None else contact.at(self.levels[-1]).terms(x)
-        return ForceModule((*forces[-1].module(coarse).forces, *touched)).energies(x)
+        return ForceModule((*module.forces, *touched)).energies(x)
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.

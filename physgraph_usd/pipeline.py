@@ -216,16 +216,6 @@ class Refiner:
             self._last[index] = _Known(each, xs, detail, crossing, part, poses)
         return [self._last[index] for index in part], [entry] * len(part)
 
-    def _touching(
-        self, part: Sequence[int], frames: Sequence[GarmentFrame], near: Sequence[int]
-    ) -> tuple[Touching, ...]:
-        """Posed surfaces of bodies, each with the distance that every garment keeps, None where it does not feel it."""
-        offsets = [
-            [each.offset if body in self._scene.garments[index].colliders else None for body in near]
-            for index, each in zip(part, frames, strict=True)
-        ]
-        return self._bodies.touching(near, offsets)
-
     def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
         """Where a garment is inside bodies whose bounds it meets, pushed by them or not, and where cloth crosses."""
         if points is None:
