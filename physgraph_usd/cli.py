@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
 
@@ -255,6 +256,23 @@ def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) 
     from .preview import preview as draw
 
     click.echo(draw(layer, out, times=times or None, **options))
+
+
+@main.command()
+@click.option(
+    "--config", "config_file", required=True, type=click.Path(path_type=Path), metavar="FILE.toml", help="What and how."
+)
+@out_option("DIR", "Folder for the log, the checkpoint, the weights and their card.")
+@click.option("--device", default="cpu", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--minutes", type=float, metavar="M", help="Train so long.  [default: the configuration's]")
+@click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
+def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
+    """Train a learned integrator and print its weights' path."""
+    from .shot import prepare_device
+    from .train.record import run_training
+
+    prepare_device(device)
+    click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))
 
 
 @main.command("schema-path")

@@ -186,13 +186,13 @@ class Group:
         modules, coarse = self.modules(frames)
         parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
         return [
-            System(m, lasting.metric, free=level.free, spacing=level.spacing) for level, lasting, m in parts
+            System(m, lasting.metric, free=level.free, spacing=level.spacing, level=level) for level, lasting, m in parts
         ], coarse
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
-        coarse = self._tensor(np.concatenate([f.points for f in frames]))
-        coarse = coarse - coarse.mean(dim=0)
+        world = np.concatenate([f.points for f in frames])
+        coarse = self._tensor(world - world.mean(axis=0))
         forces = self._forces_for(frames)
         return [lasting.module(coarse) for lasting in forces], coarse
 
@@ -293,7 +293,7 @@ class Group:
 
         def system(touched: Contact | None) -> System:
             module = terms if touched is None else ForceModule((*terms.forces, touched))
-            return System(module, metric, free=level.free, spacing=level.spacing)
+            return System(module, metric, free=level.free, spacing=level.spacing, level=level)
 
         integrator = self._settings.method.build()
         touched = None if view is None else view.term(x)
@@ -306,7 +306,8 @@ class Group:
             system, integrator, x, touched=touched, view=view, level=level.index, budget=budget
         )
         if touched is not None and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
-            apart = System(terms, metric, free=level.free & ~touched.near(level), spacing=level.spacing)
+            free = level.free & ~touched.near(level)
+            apart = System(terms, metric, free=free, spacing=level.spacing, level=level)
             x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
             made.append(report)
         return x, made, touched

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..level import Level
 from .metric import Metric
 
 
@@ -31,6 +33,7 @@ class System:
     Attributes:
         free: False where a vertex may not move, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
+        level: The level's topology and rest shape; None for a system that is no mesh.
         evaluations: Number of force evaluations so far.
         metric_solves: Number of metric solves so far.
     """
@@ -42,10 +45,11 @@ class System:
         *,
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
+        level: Level | None = None,
     ) -> None:
         """Join a force field with its metric and its mask."""
-        self._field, self._metric = field, metric
-        self.free, self.spacing = free, spacing
+        self.field, self.metric = field, metric
+        self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
         self.evaluations = 0
         self.metric_solves = 0
@@ -53,18 +57,23 @@ class System:
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N]; the force on vertices that may not move is zero."""
         self.evaluations += 1
-        energy, force = self._field.energy_and_force(x)
+        energy, force = self.field.energy_and_force(x)
         return float(energy), force if self._all_free else force * self.free
 
     def apply_metric_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with."""
         self.metric_solves += 1
-        move = self._metric.solve(force)
+        move = self.metric.solve(force)
         return move if self._all_free else move * self.free
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each vertex's Hessian block [N/m], positive."""
-        return self._field.diagonal(x).clamp_min(torch.finfo(x.dtype).tiny)
+        return self.field.diagonal(x).clamp_min(torch.finfo(x.dtype).tiny)
+
+    @cached_property
+    def rest_diagonal(self) -> Float[Tensor, " vertices"]:
+        """Diagonal of H0 [N/m], positive; 1 where a vertex may not move."""
+        return self.metric.diagonal.to(self.spacing)
 
     def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
         """RMS of H0^-1 F over the free vertices, in local edge lengths."""
