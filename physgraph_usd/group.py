@@ -186,7 +186,8 @@ class Group:
         modules, coarse = self.modules(frames)
         parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
         return [
-            System(m, lasting.metric, free=level.free, spacing=level.spacing, level=level) for level, lasting, m in parts
+            System(m, lasting.metric, free=level.free, spacing=level.spacing, level=level)
+            for level, lasting, m in parts
         ], coarse
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:

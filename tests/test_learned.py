@@ -16,12 +16,14 @@ from sheets import rotation
 
 from physgraph_usd.errors import WeightsError
 from physgraph_usd.fabric import Fabric
+from physgraph_usd.group import Group
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Carry, Integrator, System
-from physgraph_usd.integrate.learned import LONGEST, integrator_of, limited
+from physgraph_usd.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
 from physgraph_usd.integrate.network import VECTORS, PaperConfig, PhysgraphConfig
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
+from physgraph_usd.level import refine_garments
 from physgraph_usd.scene import GarmentFrame
 
 ALL = PhysgraphConfig(vectors=VECTORS, width=16, rounds=1, strain=True)
@@ -58,6 +60,19 @@ def test_untrained_the_papers_network_stays():
     system, x = problem()
     carry = run(integrator_of(make_network(PAPER).eval().requires_grad_(False)), system, x)
     assert torch.equal(carry.x, x)
+
+
+@pytest.mark.parametrize("vectors", [("metric", "move1", "diagonal"), ("secant", "metric", "metric1", "move1")])
+def test_one_kernel_does_what_torch_does(vectors: tuple[str, ...]):
+    system, x = problem(torch.float32, level=2)
+    network = random_network(PhysgraphConfig(vectors=vectors, width=16, means=False), seed=7, scale=0.3)
+    one, other = LearnedMetric(network), LearnedMetric(network, fuse=False)
+    carry = one.start(system, x)
+    for _ in range(4):
+        carry = one.step(system, carry)
+        move, expected = one.propose(system, carry), other.propose(system, carry)
+        assert float((move - expected).abs().max()) < 1e-5 * float(expected.abs().max())
+        assert not bool(move[~system.free.squeeze(1)].any())
 
 
 @pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])
@@ -155,13 +170,10 @@ def test_s10_without_means_a_patch_moves_as_it_would_in_a_larger_garment():
     integrator = integrator_of(random_network(LOCAL, seed=5, scale=SMALL))
     alone, x = finest_system(group_of(mesh, rest, level=1), wave(rest))
     one = run(integrator, alone, x).x - x
-    from physgraph_usd.group import Group
-    from physgraph_usd.level import refine_garments
-
     group = group_of(mesh, rest, level=1)
     garments = list(group.garments) * 2
     both = Group(garments, refine_garments(garments, [1, 1]), DOWN, group._settings, dtype=torch.float64, device="cpu")
-    frames = [GarmentFrame(wave(rest), FABRIC, GUIDE), GarmentFrame(rest + [0.0, 0.0, 1.0], FABRIC, GUIDE)]
+    frames = [GarmentFrame(wave(rest), FABRIC, GUIDE), GarmentFrame(rest + np.array([0.0, 0.0, 1.0]), FABRIC, GUIDE)]
     systems, coarse = both.systems(frames)
     begin = both.levels[-1].base.apply(coarse)
     two = (run(integrator, systems[-1], begin).x - begin)[: len(one)]
@@ -183,7 +195,7 @@ def spoilt(file: Path, how: str) -> None:
     """Spoil a weights file."""
     with safe_open(str(file), framework="pt") as opened:
         about = dict(opened.metadata())
-        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}
     data = file.read_bytes()
     if how == "missing":
         file.unlink()

@@ -7,11 +7,8 @@ from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from ..level import Level
-from .metric import Metric
 
 
 @runtime_checkable
@@ -27,13 +24,69 @@ class ForceField(Protocol):
         ...
 
 
+@runtime_checkable
+class Preconditioner(Protocol):
+    """A fixed, symmetric positive definite matrix that can be solved with."""
+
+    @property
+    def diagonal(self) -> Float[Tensor, " vertices"]:
+        """Its diagonal [N/m]."""
+        ...
+
+    def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m]."""
+        ...
+
+
+@runtime_checkable
+class Surface(Protocol):
+    """What a level shows of its mesh; the fields are those of `Level`."""
+
+    @property
+    def spans(self) -> tuple[slice, ...]:
+        """Vertex range of each garment."""
+        ...
+
+    @property
+    def rest(self) -> Float[Tensor, "vertices 3"]:
+        """Rest positions [m]."""
+        ...
+
+    @property
+    def triangles(self) -> Int[Tensor, "triangles 3"]:
+        """Corner vertices."""
+        ...
+
+    @property
+    def edges(self) -> Int[Tensor, "edges 2"]:
+        """End vertices."""
+        ...
+
+    @property
+    def rest_length(self) -> Float[Tensor, " edges"]:
+        """Rest length of the edges [m]."""
+        ...
+
+    @property
+    def vertex_garment(self) -> Int[Tensor, " vertices"]:
+        """Garment number of each vertex."""
+        ...
+
+    @property
+    def lanes(self) -> int:
+        """Most threads that a kernel uses on the CPU."""
+        ...
+
+
 class System:
     """One level in one frame, as an integrator sees it.
 
     Attributes:
         free: False where a vertex may not move, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
-        level: The level's topology and rest shape; None for a system that is no mesh.
+        level: The level's mesh; None for a system that has none.
+        field: The forces.
+        metric: H0.
         evaluations: Number of force evaluations so far.
         metric_solves: Number of metric solves so far.
     """
@@ -41,11 +94,11 @@ class System:
     def __init__(
         self,
         field: ForceField,
-        metric: Metric,
+        metric: Preconditioner,
         *,
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
-        level: Level | None = None,
+        level: Surface | None = None,
     ) -> None:
         """Join a force field with its metric and its mask."""
         self.field, self.metric = field, metric

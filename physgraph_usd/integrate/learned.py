@@ -13,20 +13,34 @@ and a hash of the numbers.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, System
+from .base import Carry, Surface, System
+from .fused import can_fuse, fused_physgraph
 from .network import Graph, PaperNetwork, Physgraph
-from .quasi_newton import Pair, secant_pair, two_loop
+
+NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
 
 LONGEST = 5.0
 """Most edge lengths that a vertex moves in a step."""
 SECANTS = 5
 """Secant pairs kept for the L-BFGS direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Secant:
+    """A difference of positions, of negative forces, of their images under H0^-1, and 1 / s.y of each garment or 0."""
+
+    move: Tensor
+    yields: Tensor
+    image: Tensor
+    inverse: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +50,7 @@ class _Memory:
     images: tuple[Tensor, ...]
     forces: tuple[Tensor, ...]
     moves: tuple[Tensor, ...] = ()
-    pairs: tuple[Pair, ...] = ()
+    pairs: tuple[_Secant, ...] = ()
     step: int = 0
     graph: Graph | None = field(default=None, repr=False)
 
@@ -46,12 +60,20 @@ class LearnedMetric:
 
     name = "physgraph"
 
-    def __init__(self, network: Physgraph) -> None:
-        """Keep the network."""
+    def __init__(self, network: Physgraph, *, fuse: bool = True) -> None:
+        """Keep the network.
+
+        Args:
+            network: The network.
+            fuse: Run it as one kernel where there is one for it and no gradient is asked for.
+        """
         self._network = network
+        trained = not any(parameter.requires_grad for parameter in network.parameters())
+        self._fuse = fuse and trained and can_fuse(network.config, torch.float32)
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory."""
+        self._network = placed(self._network, system)
         energy, force = system.energy_and_force(x)
         image = system.apply_metric_inverse(force)
         memory = _Memory((image,), (force,), graph=graph_of(system))
@@ -76,7 +98,13 @@ class LearnedMetric:
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
         memory: _Memory = carry.memory
-        vectors = torch.stack([self._vector(name, system, carry) for name in self._network.config.vectors], dim=1)
+        combined = [self._vector(name, system, carry) for name in self._network.config.vectors]
+        if self._fuse and carry.x.dtype == torch.float32:
+            lanes = 1 if system.level is None else system.level.lanes
+            device = str(system.spacing.device)
+            fused = fused_physgraph(self._network, len(system.spacing), LONGEST, device=device, lanes=lanes)
+            return fused(combined, system.spacing, memory.step) * system.free
+        vectors = torch.stack(combined, dim=1)  # V N 3
         needed = self._network.config.strain or self._network.config.rounds > 0
         strain = edge_strain(system, carry.x).float() if needed else None
         scaled = vectors / system.spacing.reshape(-1, 1, 1)  # V N 3
@@ -90,7 +118,8 @@ class LearnedMetric:
         """One of `network.VECTORS` [m]; zero where the past does not reach so far."""
         memory: _Memory = carry.memory
         if name == "secant":
-            return two_loop(carry.force, memory.images[0], memory.pairs)
+            assert memory.graph is not None
+            return secant_direction(carry.force, memory.images[0], memory.pairs, graph=memory.graph)
         if name == "normal":
             normal = vertex_normals(system, carry.x)
             return (memory.images[0] * normal).sum(dim=1, keepdim=True) * normal
@@ -107,8 +136,9 @@ class LearnedMetric:
         old: _Memory = carry.memory
         pairs = old.pairs
         if "secant" in self._network.config.vectors:
-            pair = secant_pair(move, carry.force - force, old.images[0] - image)
-            pairs = pairs if pair is None else (*pairs, pair)[-SECANTS:]
+            assert old.graph is not None
+            pair = _secant(move, carry.force - force, old.images[0] - image, graph=old.graph)
+            pairs = (*pairs, pair)[-SECANTS:]
         return replace(
             old,
             images=(image, *old.images[:2]),
@@ -130,6 +160,7 @@ class LearnedPaper:
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty history."""
+        self._network = placed(self._network, system)
         energy, force = system.energy_and_force(x)
         # A third of the trace of the Hessian's blocks, at the start: what the force is measured in (A7).
         stiffness = system.diagonal(x).unsqueeze(1)
@@ -167,9 +198,61 @@ class LearnedPaper:
         return limited(out.to(carry.x) * length, system.spacing) * system.free
 
 
+def placed(network: NetworkT, system: System) -> NetworkT:
+    """The network on the system's device: itself, or a copy."""
+    parameter, device = next(network.parameters()), system.spacing.device
+    return network if parameter.device == device else copy.deepcopy(network).to(device)
+
+
 def integrator_of(network: Physgraph | PaperNetwork) -> LearnedMetric | LearnedPaper:
     """The integrator that uses a network."""
     return LearnedMetric(network) if isinstance(network, Physgraph) else LearnedPaper(network)
+
+
+def secant_direction(
+    force: Float[Tensor, "vertices 3"],
+    image: Float[Tensor, "vertices 3"],
+    pairs: tuple[_Secant, ...],
+    *,
+    graph: Graph,
+) -> Float[Tensor, "vertices 3"]:
+    """The L-BFGS direction [m], as in `quasi_newton`, for each garment by itself.
+
+    Args:
+        force: [N].
+        image: H0^-1 F [m].
+        pairs: Secants, oldest first.
+        graph: Which vertex belongs to which garment.
+    """
+    weights = []
+    for pair in reversed(pairs):
+        weight = pair.inverse * _dots(pair.move, force, graph)
+        force = torch.addcmul(force, weight, pair.yields, value=-1.0)
+        image = torch.addcmul(image, weight, pair.image, value=-1.0)
+        weights.append(weight)
+    if pairs:
+        newest = pairs[-1]
+        own = newest.inverse > 0
+        size = _dots(newest.yields, newest.image, graph)
+        image = image * torch.where(own, 1.0 / torch.where(own, newest.inverse * size, 1.0), 1.0)
+    for pair, weight in zip(pairs, reversed(weights), strict=True):
+        image = torch.addcmul(image, weight - pair.inverse * _dots(pair.yields, image, graph), pair.move)
+    return image
+
+
+def _secant(move: Tensor, yields: Tensor, image: Tensor, *, graph: Graph) -> _Secant:
+    """A secant that counts where its curvature is safely positive."""
+    curvature = _dots(move, yields, graph)
+    floor = 1e-8 * (_dots(move, move, graph) * _dots(yields, yields, graph)).sqrt()
+    good = (curvature > floor) & (_dots(yields, image, graph) > 0)
+    return _Secant(move, yields, image, torch.where(good, 1.0 / torch.where(good, curvature, 1.0), 0.0))
+
+
+def _dots(a: Tensor, b: Tensor, graph: Graph) -> Tensor:
+    """Scalar products of each garment, at each of its vertices."""
+    if graph.garments == 1:
+        return torch.dot(a.reshape(-1), b.reshape(-1)).reshape(1, 1)
+    return graph.total((a * b).sum(dim=1, keepdim=True))[graph.owner]
 
 
 def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices"]) -> Float[Tensor, "vertices 3"]:
@@ -206,6 +289,6 @@ def vertex_normals(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tens
     return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
 
 
-def _level(system: System):
+def _level(system: System) -> Surface:
     assert system.level is not None, "this network needs the mesh"
     return system.level

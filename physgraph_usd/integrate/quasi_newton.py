@@ -68,7 +68,7 @@ class QuasiNewton:
     def step(self, system: System, carry: Carry) -> Carry:
         """One secant step with a backtracking line search; the energy never rises."""
         memory: _Memory = carry.memory
-        direction = two_loop(carry.force, memory.image, memory.pairs)
+        direction = _two_loop(carry.force, memory.image, memory.pairs)
         slope = _dot(carry.force, direction)
         if not slope > 0:
             direction, slope = memory.image, _dot(carry.force, memory.image)
@@ -77,7 +77,7 @@ class QuasiNewton:
             return self._forget(system, carry)
         x, energy, force = found
         image = self._image(system, memory.scale, force)
-        pair = secant_pair(x - carry.x, carry.force - force, memory.image - image)
+        pair = _pair(x - carry.x, carry.force - force, memory.image - image)
         pairs = memory.pairs if pair is None else (*memory.pairs, pair)[-self._history :]
         return self._carry(x, energy, force, _Memory(pairs, memory.scale, image))
 
@@ -140,10 +140,8 @@ def backtrack(
     return None
 
 
-def two_loop(
-    force: Float[Tensor, "vertices 3"], preconditioned: Float[Tensor, "vertices 3"], pairs: tuple[Pair, ...]
-) -> Float[Tensor, "vertices 3"]:
-    """The L-BFGS direction [m] for a force [N], from its preconditioned image [m] and the secant pairs."""
+def _two_loop(force: Tensor, preconditioned: Tensor, pairs: tuple[Pair, ...]) -> Tensor:
+    """The L-BFGS direction for a force, from its preconditioned image and the secant pairs."""
     if not pairs:
         return preconditioned
     weights = []
@@ -161,9 +159,7 @@ def two_loop(
     return image
 
 
-def secant_pair(
-    move: Float[Tensor, "vertices 3"], yields: Float[Tensor, "vertices 3"], image: Float[Tensor, "vertices 3"]
-) -> Pair | None:
+def _pair(move: Tensor, yields: Tensor, image: Tensor) -> Pair | None:
     """A secant pair, or None when its curvature is not safely positive."""
     curvature = _dot(move, yields)
     floor = 1e-8 * (_dot(move, move) * _dot(yields, yields)) ** 0.5

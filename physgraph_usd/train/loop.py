@@ -19,10 +19,9 @@ from ..integrate.base import Integrator
 from ..integrate.learned import integrator_of
 from ..integrate.network import PaperConfig, PaperNetwork, Physgraph, PhysgraphConfig
 from ..integrate.quasi_newton import QuasiNewton
-from ..integrate.solve import Budget, solve_level
 from ..integrate.weights import make_network
 from .patches import Patch, PatchConfig, make_patches
-from .unroll import UnrolledSystem
+from .unroll import JointSystem
 
 HARMLESS = 0.02
 """Part of the energy at the start below which the logarithm of the gap stops to reward."""
@@ -46,8 +45,10 @@ class TrainConfig:
         segments: Most unrolls one after another on a patch; later ones start where the last one ended.
         through_forces: Gradients flow through forces too, by differences; else through displacements only (A19).
         loss: "ratio" or "log" of the gap, averaged over the steps (A18).
-        raw: Part of the starts that are the upsampled cage; the others come from a solved level below.
+        raw: Part of the starts that are the upsampled cage.
+        middle: Part of the starts where an earlier unroll ended; the others come from a solved level below.
         own: Part of those that the network itself has solved; quasi-Newton the others.
+        turn: Turn each start at random (A8); only where neither gravity nor guide has a direction.
         rate: Adam's first rate; it falls to a hundredth along a cosine.
         clip: Largest norm of the gradient.
         average: Decay of the weights' running mean, which is what is kept.
@@ -66,7 +67,9 @@ class TrainConfig:
     through_forces: bool = False
     loss: str = "log"
     raw: float = 0.4
+    middle: float = 0.15
     own: float = 0.5
+    turn: bool = False
     rate: float = 3e-3
     clip: float = 1.0
     average: float = 0.99
@@ -141,57 +144,72 @@ class Trainer:
         steps = max(2, round(config.unroll * min(1.0, 0.3 + 2.8 * done)))
         self._optimiser.zero_grad()
         self.network.train()
-        losses = [
-            self._descend(self.patches[int(i)], steps) for i in self._rng.integers(len(self.patches), size=config.batch)
-        ]
+        loss = self._descend(steps)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
         if all(bool(p.grad.isfinite().all()) for p in self.network.parameters() if p.grad is not None):
             self._optimiser.step()
             self._mean.update_parameters(self.network)
         self.iteration += 1
-        return float(np.mean(losses))
+        return loss
 
-    def _descend(self, patch: Patch, steps: int) -> float:
-        """Unroll one patch at one level, segment after segment; gradients add up."""
+    def _descend(self, steps: int) -> float:
+        """Unroll a batch, segment after segment; gradients add up. Returns the mean loss."""
         config = self.config
-        index = int(self._rng.integers(len(patch.systems)))
-        x = self._begin(patch, index)
-        system = UnrolledSystem(patch.systems[index], through_forces=config.through_forces)
+        items = [self._draw() for _ in range(config.batch)]
+        system = JointSystem([p.systems[i] for p, i in items], through_forces=config.through_forces)
+        starts = [self._begin(patch, index) for patch, index in items]
+        x = torch.cat([self._turned(start) for start in starts] if config.turn else starts)
         integrator = integrator_of(self.network)
-        carry, total = None, 0.0
         segments = int(self._rng.integers(1, config.segments + 1))
+        carry, total = integrator.start(system, x), 0.0
         for _ in range(segments):
-            carry = integrator.start(system, x) if carry is None else detached(carry)
-            before = carry.energy
+            before = system.energies[-1].detach()
             system.energies.clear()
+            carry = detached(carry)
             for _ in range(steps):
                 carry = integrator.step(system, carry)
-            reached = [float(energy.detach()) for energy in system.energies]
-            patch.least[index] = min(patch.least[index], *(energy for energy in reached if math.isfinite(energy)))
-            loss = loss_of(system.energies, before, patch.least[index], kind=config.loss)
-            if not bool(loss.isfinite()) or not carry.energy < 4.0 * before + abs(before):
+            reached = torch.stack(system.energies)  # K B
+            for (patch, index), column in zip(items, reached.detach().T.tolist(), strict=True):
+                patch.least[index] = min(patch.least[index], *filter(math.isfinite, column))
+            least = before.new_tensor([patch.least[index] for patch, index in items])
+            loss = loss_of(reached, before, least, kind=config.loss)
+            if not bool(loss.isfinite()):
                 break
-            if loss.requires_grad:
-                (loss / (config.batch * segments)).backward()
+            (loss / segments).backward()
             total += float(loss.detach()) / segments
+        self._keep(items, system, carry.x.detach(), before)
         return total
 
+    def _turned(self, x: Tensor) -> Tensor:
+        """The positions after a random rotation."""
+        turn = np.linalg.qr(self._rng.normal(size=(3, 3)))[0]
+        return x @ torch.as_tensor(turn * np.linalg.det(turn), dtype=x.dtype, device=x.device)
+
+    def _draw(self) -> tuple[Patch, int]:
+        patch = self.patches[int(self._rng.integers(len(self.patches)))]
+        return patch, int(self._rng.integers(len(patch.systems)))
+
     def _begin(self, patch: Patch, index: int) -> Tensor:
-        """A start at a level: the upsampled cage, or the end of a solve of the level below."""
-        if index == 0 or self._rng.random() < self.config.raw:
+        """A start at a level: the upsampled cage, or the end of a solve of the level below or of this level."""
+        dice = self._rng.random()
+        if dice < self.config.raw or (index == 0 and 0 not in patch.kept):
             return patch.begin(index)
-        own = self._rng.random() < self.config.own
-        integrator: Integrator = integrator_of(self.network) if own else QuasiNewton()
-        budget = Budget(int(self._rng.choice([5, 10, 20, 40])))
-        below = patch.begin(index - 1)
-        with torch.no_grad():
-            try:
-                below, _ = solve_level(patch.systems[index - 1], integrator, below, level=index - 1, budget=budget)
-            except ArithmeticError:
-                return patch.begin(index)
+        if dice > 1.0 - self.config.middle and index in patch.kept:
+            return patch.kept[index]
+        if index == 0:
+            return patch.begin(index)
         prolong = patch.group.levels[index].from_below
         assert prolong is not None
-        return prolong.apply(below)
+        own = self._rng.random() < self.config.own
+        return prolong.apply(patch.kept[index - 1] if own and index - 1 in patch.kept else patch.solved[index - 1])
+
+    def _keep(self, items: Sequence[tuple[Patch, int]], system: JointSystem, x: Tensor, before: Tensor) -> None:
+        """Keep where the network came to, as a start for later; what went uphill is forgotten."""
+        for (patch, index), span, old, new in zip(
+            items, system.spans, before.tolist(), system.energies[-1].tolist(), strict=True
+        ):
+            if new <= old:
+                patch.kept[index] = x[span].clone()
 
     def averaged(self) -> Physgraph | PaperNetwork:
         """The running mean of the weights, ready for use."""
@@ -225,6 +243,7 @@ class Trainer:
             "iteration": self.iteration,
             "seconds": self.seconds,
             "curve": self.curve,
+            "patches": [(patch.kept, patch.least) for patch in self.patches],
         }
         part = file.with_suffix(".part")
         torch.save(state, part)
@@ -239,19 +258,28 @@ class Trainer:
         self._rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch"].cpu())
         self.iteration, self.seconds, self.curve = state["iteration"], state["seconds"], state["curve"]
+        for patch, (kept, least) in zip(self.patches, state["patches"], strict=True):
+            patch.kept, patch.least = kept, least
 
 
-def loss_of(energies: Sequence[Float[Tensor, ""]], before: float, least: float, *, kind: str) -> Float[Tensor, ""]:
-    """Mean over the steps of the gap, or of its logarithm, relative to the start.
+def loss_of(
+    energies: Float[Tensor, "steps patches"],
+    before: Float[Tensor, " patches"],
+    least: Float[Tensor, " patches"],
+    *,
+    kind: str,
+) -> Float[Tensor, ""]:
+    """Mean over steps and patches of the gap, or of its logarithm, relative to the start.
 
     Args:
         energies: Energies of the steps [J].
-        before: Energy at the start [J].
-        least: Least energy known [J].
+        before: Energies at the start [J].
+        least: Least energies known [J].
         kind: "ratio" or "log".
     """
-    scale = max(before - least, 1e-6 * abs(before), 1e-30)
-    gap = (torch.stack(list(energies)) - least) / scale
+    scale = torch.maximum(before - least, 1e-6 * before.abs()).clamp_min(1e-30)
+    gap = (energies - least) / scale
+    # Beyond the start's own gap only the logarithm counts: one patch that blows up must not outweigh the rest.
     if kind == "ratio":
         return torch.where(gap < 1.0, gap, 1.0 + gap.clamp_min(1.0).log()).mean()
     return (gap.clamp_min(0.0) + HARMLESS).log().mean()

@@ -1,6 +1,6 @@
 """Patches of cloth to train on, made from numbers alone: shapes, meshes, fabrics, borders and poses at random.
 
-A patch is a sheet, a tube or a dome of 8 to 16 cage edges (A21), irregular or in quads whose diagonals alternate. It is
+A patch is a sheet, a tube or a dome of 6 to 12 cage edges (A21), irregular or in quads whose diagonals alternate. It is
 posed by a smooth random deformation, and some patches are draped first: our own solver lets the cage hang from what is
 fixed. No asset is read.
 """
@@ -46,10 +46,10 @@ class PatchConfig:
 
     count: int = 64
     levels: tuple[int, int] = (1, 3)
-    edges: tuple[int, int] = (8, 16)
+    edges: tuple[int, int] = (6, 12)
     decades: float = 3.0
     elastic: bool = False
-    most_vertices: int = 3000
+    most_vertices: int = 4000
     reference_steps: int = 150
 
 
@@ -65,6 +65,8 @@ class Patch:
         start: Energy of the linearly upsampled cage at each level [J].
         least: Least energy known at each level [J].
         words: What it is.
+        solved: Positions after some steps of nested quasi-Newton at each level [m].
+        kept: Positions where the network in training last came to, by level [m].
     """
 
     group: Group
@@ -74,6 +76,8 @@ class Patch:
     words: str
     start: list[float] = field(default_factory=list)
     least: list[float] = field(default_factory=list)
+    solved: list[Tensor] = field(default_factory=list)
+    kept: dict[int, Tensor] = field(default_factory=dict)
 
     def begin(self, index: int) -> Tensor:
         """The upsampled cage at a level [m], off the saddle where it is flat."""
@@ -93,23 +97,30 @@ def make_patches(config: PatchConfig, *, seed: int, device: str) -> list[Patch]:
     rng = np.random.default_rng(seed)
     while len(patches) < config.count:
         patch = _patch(config, rng, device)
-        measure(patch, config.reference_steps)
+        measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
         drop = [a - b for a, b in zip(patch.start, patch.least, strict=True)]
         if all(np.isfinite(drop)) and min(drop) > 1e-3 * abs(patch.start[-1]) + 1e-12:
             patches.append(patch)
     return patches
 
 
-def measure(patch: Patch, steps: int) -> None:
-    """Find the energies between which a patch's levels move: nested and flat quasi-Newton, the lower of both."""
-    patch.start, patch.least = [], []
-    x = patch.begin(0)
+def measure(patch: Patch, steps: int, *, presolve: int) -> None:
+    """Find the energies between which a patch's levels move, by nested quasi-Newton.
+
+    Args:
+        patch: The patch.
+        steps: Steps a level behind the least energy known.
+        presolve: Steps a level of a second, shorter solve whose positions are kept.
+    """
+    patch.start, patch.least, patch.solved = [], [], []
+    x = short = patch.begin(0)
     for index, (level, system) in enumerate(zip(patch.group.levels, patch.systems, strict=True)):
-        x = x if level.from_below is None else level.from_below.apply(x)
+        x, short = (x, short) if level.from_below is None else map(level.from_below.apply, (x, short))
         x, report = solve_level(system, QuasiNewton(), x, level=index, budget=Budget(steps))
-        flat = solve_level(system, QuasiNewton(), patch.begin(index), level=index, budget=Budget(steps))[1]
+        short, _ = solve_level(system, QuasiNewton(), short, level=index, budget=Budget(presolve))
         patch.start.append(system.energy_and_force(level.base.apply(patch.coarse))[0])
-        patch.least.append(min(report.energy_after, flat.energy_after))
+        patch.least.append(report.energy_after)
+        patch.solved.append(short)
 
 
 def _patch(config: PatchConfig, rng: np.random.Generator, device: str) -> Patch:
@@ -227,7 +238,9 @@ def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:
 def _material(config: PatchConfig, rng: np.random.Generator, *, free: bool) -> tuple[Fabric, float, np.ndarray]:
     """Fabric, guide stiffness [N/m^3] and gravity [m/s^2]."""
     half = 0.5 * config.decades
-    stretch, bend = (middle * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for middle in (100.0, 5e-6))
+    stretch, bend = (
+        middle * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for middle in (100.0, 5e-6)
+    )
     direction = rng.normal(size=3)
     down = 9.81 * direction / np.linalg.norm(direction) * (0.0 if config.elastic else float(rng.random() < 0.7))
     guide = 2000.0 * 10 ** rng.uniform(-0.7, 0.7) if free or rng.random() < 0.8 else 0.0
