@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from physgraph_usd.fabric import PRESETS
@@ -22,7 +23,7 @@ from physgraph_usd.integrate.saddle import leave_saddle
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.level import refine_garments
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import GarmentFrame
+from physgraph_usd.scene import Garment, GarmentFrame
 from physgraph_usd.usd.reader import open_shot
 
 SHOTS: dict[str, tuple[str, float | None]] = {
@@ -88,9 +89,10 @@ def cases(
     """
     known: dict[str, float] = json.loads(cache.read_text()) if cache and cache.exists() else {}
     for name in shots:
-        garment, gravity, points = _opened(name)
-        if garment is None:
+        opened = _opened(name)
+        if opened is None:
             continue
+        garment, gravity, points = opened
         for fabric in fabrics:
             frame = replace(points, fabric=PRESETS[fabric])
             label = f"{name.partition('/')[0].partition('.')[0]}, {fabric}"
@@ -169,14 +171,14 @@ def history(system: System, integrator: Integrator, x: torch.Tensor, steps: int)
     return energies
 
 
-def _opened(name: str):
-    """Garment, gravity and frame of a shot; Nones where it is not there."""
+def _opened(name: str) -> tuple[Garment, np.ndarray, GarmentFrame] | None:
+    """Garment, gravity and frame of a shot, or None where it is not there."""
     prim, time_code = SHOTS[name]
     with tempfile.TemporaryDirectory() as folder:
         if prim:
             data = Path(os.environ.get("PHYSGRAPH_DATA", "../shared/data")) / "shots" / name
             if not data.exists():
-                return None, None, None
+                return None
             shot = open_shot(str(data), garments=[prim])
         else:
             shot = open_shot(str(write_sample(name, Path(folder))))
@@ -185,7 +187,7 @@ def _opened(name: str):
         return replace(garment, colliders=()), shot.scene.gravity, frame.garments[0]
 
 
-def _group(garment, gravity, dtype: torch.dtype, *, level: int, device: str) -> Group:
+def _group(garment: Garment, gravity: np.ndarray, dtype: torch.dtype, *, level: int, device: str) -> Group:
     settings = SolveSettings(method_named("quasi-newton"))
     chains = refine_garments([garment], [level])
     return Group([garment], chains, gravity, settings, dtype=dtype, device=device, lanes=LANES)

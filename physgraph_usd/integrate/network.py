@@ -79,6 +79,8 @@ class Physgraph(nn.Module):
         self.config = config
         count, width = len(config.vectors), config.width
         first, second = torch.triu_indices(count, count, 1)
+        self._first: Tensor
+        self._second: Tensor
         self.register_buffer("_first", first, persistent=False)
         self.register_buffer("_second", second, persistent=False)
         numbers = count + len(first)
@@ -197,9 +199,8 @@ class PaperNetwork(nn.Module):
         self.update_vertex = nn.ModuleList(_perceptron(2 * latent, latent, latent) for _ in range(rounds))
         self.decode = _perceptron(latent, latent, 3, norm=False)
         self.step_length = nn.Parameter(torch.tensor(1.0))
-        last = self.decode[-1]
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        for parameter in self.decode[-1].parameters():
+            nn.init.zeros_(parameter)
 
     def forward(
         self,
@@ -241,7 +242,11 @@ class Normaliser(nn.Module):
         """
         super().__init__()
         self._most = most
-        for name, shape in (("count", ()), ("calls", ()), ("sum", (width,)), ("square", (width,))):
+        self.count: Tensor
+        self.calls: Tensor
+        self.total: Tensor
+        self.square: Tensor
+        for name, shape in (("count", ()), ("calls", ()), ("total", (width,)), ("square", (width,))):
             self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
 
     def forward(self, features: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
@@ -250,10 +255,10 @@ class Normaliser(nn.Module):
             shown = features.detach().double()
             self.calls += 1
             self.count += len(shown)
-            self.sum += shown.sum(dim=0)
+            self.total += shown.sum(dim=0)
             self.square += shown.square().sum(dim=0)
         count = self.count.clamp_min(1.0)
-        mean = self.sum / count
+        mean = self.total / count
         deviation = (self.square / count - mean.square()).clamp_min(1e-16).sqrt()
         known = self.count > 0
         mean, deviation = torch.where(known, mean, 0.0), torch.where(known, deviation, 1.0)

@@ -11,7 +11,7 @@ import json
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -34,6 +34,10 @@ def kind_of(network: Network) -> str:
     return "physgraph" if isinstance(network, Physgraph) else "physgraph-paper"
 
 
+@overload
+def make_network(config: PhysgraphConfig) -> Physgraph: ...
+@overload
+def make_network(config: PaperConfig) -> PaperNetwork: ...
 def make_network(config: PhysgraphConfig | PaperConfig) -> Network:
     """An untrained network."""
     return Physgraph(config) if isinstance(config, PhysgraphConfig) else PaperNetwork(config)
@@ -125,7 +129,8 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def _config(kind: str, values: dict[str, Any]) -> PhysgraphConfig | PaperConfig:
     if kind == "physgraph-paper":
         return PaperConfig(**values)
-    config = PhysgraphConfig(**(values | {"vectors": tuple(values["vectors"])}))
+    own: dict[str, Any] = values | {"vectors": tuple(values["vectors"])}
+    config = PhysgraphConfig(**own)
     unknown = [name for name in config.vectors if name not in VECTORS]
     if unknown:
         raise ValueError(f"unknown vectors {unknown}")

@@ -162,6 +162,7 @@ class Trainer:
         integrator = integrator_of(self.network)
         segments = int(self._rng.integers(1, config.segments + 1))
         carry, total = integrator.start(system, x), 0.0
+        before = system.energies[-1].detach()
         for _ in range(segments):
             before = system.energies[-1].detach()
             system.energies.clear()
@@ -170,7 +171,7 @@ class Trainer:
                 carry = integrator.step(system, carry)
             reached = torch.stack(system.energies)  # K B
             for (patch, index), column in zip(items, reached.detach().T.tolist(), strict=True):
-                patch.least[index] = min(patch.least[index], *filter(math.isfinite, column))
+                patch.least[index] = min([patch.least[index], *filter(math.isfinite, column)])
             least = before.new_tensor([patch.least[index] for patch, index in items])
             loss = loss_of(reached, before, least, kind=config.loss)
             if not bool(loss.isfinite()):
@@ -220,7 +221,7 @@ class Trainer:
     def held_out_ratios(self) -> dict[str, float]:
         """Gap over that of quasi-Newton at the same steps, geometric mean over held-out patches."""
         if self._held_out is None:
-            config = PatchConfig(**(vars(self.config.patches) | {"count": self.config.held_out}))
+            config = replace(self.config.patches, count=self.config.held_out)
             self._held_out = make_patches(config, seed=10_000 + self.config.seed, device=self.device)
         ours = integrator_of(self.averaged())
         table = {}
