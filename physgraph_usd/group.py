@@ -192,8 +192,8 @@ class Group:
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
-        world = np.concatenate([f.points for f in frames])
-        coarse = self._tensor(world - world.mean(axis=0))
+        world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
+        coarse = self._tensor((world - world.mean(dim=0)).numpy())
         forces = self._forces_for(frames)
         return [lasting.module(coarse) for lasting in forces], coarse
 

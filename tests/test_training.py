@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +71,7 @@ def test_patches_differ_in_shape_mesh_border_and_fabric():
 
 
 def test_elastic_patches_feel_stretch_and_bending_only():
-    for patch in make_patches(PatchConfig(**(vars(FEW) | {"elastic": True})), seed=6, device="cpu"):
+    for patch in make_patches(replace(FEW, elastic=True), seed=6, device="cpu"):
         module, _ = patch.group.modules([patch.frame])
         energies = module[-1].energies(patch.begin(len(patch.systems) - 1))
         assert energies["gravity"] == 0.0

@@ -94,11 +94,51 @@ def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device
     return FusedPhysgraph(network, vertices, longest, device=device, lanes=lanes)
 
 
+def _encoder(count: int) -> wp.Function:
+    """Adds the features' part to the first layer: lengths as logarithms, then cosines of all pairs."""
+    directions = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
+    floor, log_scale = FLOOR**2, 0.5 * LOG_SCALE
+
+    @wp.func
+    def encoded(v: wp.array(dtype=wp.vec3f), i: wp.int32, vertices: wp.int32, scale: wp.float32, w: Any, start: Any):
+        unit = directions()
+        h = start
+        for a in range(wp.static(count)):
+            s = v[a * vertices + i] * scale
+            square = wp.dot(s, s) + wp.float32(wp.static(floor))
+            h = h + w[a] * (wp.static(log_scale) * wp.log(square) + wp.float32(1.5))
+            inverse = wp.float32(1.0) / wp.sqrt(square)
+            unit[a, 0] = s[0] * inverse
+            unit[a, 1] = s[1] * inverse
+            unit[a, 2] = s[2] * inverse
+        row = wp.int32(wp.static(count))
+        for a in range(wp.static(count)):
+            for b in range(a + 1, wp.static(count)):
+                cosine = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
+                h = h + w[row] * cosine
+                row = row + 1
+        return h
+
+    return encoded
+
+
+def _layer(width: int) -> wp.Function:
+    """A layer after a rectifier."""
+
+    @wp.func
+    def layer(h: Any, w: Any, start: Any):
+        out = start
+        for k in range(wp.static(width)):
+            out = out + w[k] * wp.max(h[k], wp.float32(0.0))
+        return out
+
+    return layer
+
+
 @functools.cache
 def fused_kernel(count: int, width: int) -> wp.Kernel:
     """The kernel for so many vectors and so wide a network; vectors are stored one after another."""
-    directions = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
-    floor, log_scale = FLOOR**2, 0.5 * LOG_SCALE
+    encoded, layer = _encoder(count), _layer(width)
 
     @wp.kernel(module="unique")
     def fused(
@@ -116,34 +156,12 @@ def fused_kernel(count: int, width: int) -> wp.Kernel:
         out: wp.array(dtype=Any),
     ):
         i = first + wp.tid()
-        scale = wp.float32(1.0) / spacing[i]
-        unit = directions()
-        h = b1[0]
-        for a in range(wp.static(count)):
-            s = v[a * vertices + i] * scale
-            square = wp.dot(s, s) + wp.float32(wp.static(floor))
-            h = h + w1[a] * (wp.static(log_scale) * wp.log(square) + wp.float32(1.5))
-            inverse = wp.float32(1.0) / wp.sqrt(square)
-            unit[a, 0] = s[0] * inverse
-            unit[a, 1] = s[1] * inverse
-            unit[a, 2] = s[2] * inverse
-        row = wp.int32(wp.static(count))
-        for a in range(wp.static(count)):
-            for b in range(a + 1, wp.static(count)):
-                cosine = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
-                h = h + w1[row] * cosine
-                row = row + 1
-        g = b2[0]
-        for k in range(wp.static(width)):
-            g = g + w2[k] * wp.max(h[k], wp.float32(0.0))
-        c = b3[0]
-        for k in range(wp.static(width)):
-            c = c + w3[k] * wp.max(g[k], wp.float32(0.0))
+        h = encoded(v, i, vertices, wp.float32(1.0) / spacing[i], w1, b1[0])
+        c = layer(layer(h, w2, b2[0]), w3, b3[0])
         move = v[i] * c[0]
         for a in range(1, wp.static(count)):
             move = move + v[a * vertices + i] * c[a]
-        far = wp.length(move)
-        most = longest * spacing[i]
+        far, most = wp.length(move), longest * spacing[i]
         if far > most:
             move = move * (most / far)
         out[i] = move
