@@ -4,7 +4,8 @@
 
 Two tables. The first has every shot and fabric: the gaps at two schedules. The second has one row a candidate: its gap
 over quasi-Newton's at the same number of force evaluations, the time of the same descents over quasi-Newton's, and the
-time to a gap of 3% over quasi-Newton's, as medians over shots and fabrics. Everything is guarded. Cards stand beside
+time to a gap of 3% over quasi-Newton's, as medians over shots and fabrics; on the CPU time is that of all threads
+together. Everything is guarded. Cards stand beside
 the weights (`physgraph-usd train` writes them). Samples are always there; real shots where PHYSGRAPH_DATA names their
 folder. No body pushes.
 """
@@ -33,7 +34,7 @@ SCHEDULES = ((5, 5, 5), (10, 10, 5))
 FRONT = ((5, 5, 5), (10, 10, 5), (20, 10, 5), (20, 20, 5), (40, 20, 6), (40, 40, 8), (80, 80, 12))
 """Schedules among which the quickest to a gap of 3% is looked for."""
 ENOUGH = 0.03
-REPEATS = 3
+REPEATS = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -4,8 +4,8 @@
 
 A waved square sheet of triangles. Untrained networks of the sizes that ship: time does not depend on the weights.
 Medians; on CUDA the device is waited for after each step. The paper reports 7.1, 9.7, 37.7 and 343 ms for its network
-at 1e3, 1e4, 1e5 and 1e6 springs on an RTX A6000, another GPU than yours. The last two columns are the least time that the layers'
-operations or bytes need at the peak rates of --tflops and --gbytes; forces and metric are not in it.
+at 1e3, 1e4, 1e5 and 1e6 springs on an RTX A6000, another GPU than yours. The last two columns are the least time that
+the layers' operations or bytes need at the peak rates of --tflops and --gbytes; forces and metric are not in it.
 """
 
 from __future__ import annotations

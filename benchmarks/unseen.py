@@ -121,7 +121,8 @@ class Descent:
 
     Attributes:
         energy: [J].
-        milliseconds: Wall time of the steps.
+        milliseconds: Time of the steps: wall time on CUDA; on the CPU that of all its threads together, which other work
+            on the machine does not lengthen.
         evaluations: Force evaluations.
         movers: Steps by who made them.
         x: Positions [m].
@@ -144,17 +145,18 @@ def descend(
     x = group.levels[-len(steps)].base.apply(coarse)
     energy, spent, evaluations = math.inf, 0.0, 0
     movers: dict[str, int] = {}
+    clock = time.perf_counter if x.is_cuda else time.process_time
     for level, system, count in zip(group.levels[-len(steps) :], systems[-len(steps) :], steps, strict=True):
         x = x if level.from_below is None or x.shape[0] == level.vertex_count else level.from_below.apply(x)
         x = leave_saddle(system, level, x, outward=torch.ones(1, device=x.device))
-        before, began = system.evaluations, time.perf_counter()
+        before, began = system.evaluations, clock()
         carry = integrator.start(system, x)
         while system.evaluations - before <= count and carry.mover != "stayed":
             carry = integrator.step(system, carry)
             movers[carry.mover] = movers.get(carry.mover, 0) + 1
         if x.is_cuda:
             torch.cuda.synchronize()
-        spent += time.perf_counter() - began
+        spent += clock() - began
         evaluations += system.evaluations - before
         x, energy = carry.x, carry.energy
     return Descent(energy, 1e3 * spent, evaluations, movers, x)
