@@ -121,8 +121,8 @@ class Descent:
 
     Attributes:
         energy: [J].
-        milliseconds: Time of the steps: wall time on CUDA; on the CPU that of all its threads together, which other work
-            on the machine does not lengthen.
+        milliseconds: Time of the steps: wall time on CUDA; on the CPU that of all threads together, which other work on
+            the machine does not lengthen.
         evaluations: Force evaluations.
         movers: Steps by who made them.
         x: Positions [m].
