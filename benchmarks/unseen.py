@@ -41,7 +41,7 @@ SHOTS: dict[str, tuple[str, float | None]] = {
 FABRICS = ("jersey", "denim", "silk")
 LEVEL = 2
 REFERENCE = ((150, 150, 200), (40, 80, 200))
-"""Nested quasi-Newton in float64 behind the least energy known; a network that finds less lowers it further."""
+"""Nested quasi-Newton in float64 behind the least energy known."""
 LANES = os.cpu_count() or 1
 
 
