@@ -69,15 +69,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--out", type=Path, default=None, help="folder for weights and cards")
     given = parser.parse_args(arguments)
     prepare_device(given.device)
-    base = replace(record.read_config(CONFIG), iterations=given.iterations, minutes=1e6)
+    base = replace(record.read_config(CONFIG), iterations=given.iterations, minutes=1e6, average=0.95)
     wanted = [name.strip() for name in given.only.split(",") if name.strip()]
     say(
         "| candidate | loss | gap ratio (5, 5, 5) | gap ratio (10, 10, 5) | minutes | hash |\n|---|---|---|---|---|---|"
     )
+    trainer: Trainer | None = None
     for name, config in candidates(base).items():
         if wanted and name not in wanted:
             continue
-        trainer = Trainer(config, device=given.device)
+        trainer = Trainer(config, device=given.device, like=trainer)
         trainer.train(every=1e9)
         last = trainer.curve[-1]
         ratios = " | ".join(f"{ratio:.3f}" for ratio in last["held_out"].values())

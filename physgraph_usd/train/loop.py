@@ -87,8 +87,14 @@ class Trainer:
         curve: What was measured on the way.
     """
 
-    def __init__(self, config: TrainConfig, *, device: str = "cpu") -> None:
-        """Make patches and an untrained network."""
+    def __init__(self, config: TrainConfig, *, device: str = "cpu", like: Trainer | None = None) -> None:
+        """Make patches and an untrained network.
+
+        Args:
+            config: The run.
+            device: "cpu" or a CUDA device.
+            like: A finished run on the same patches, which are taken over, or None.
+        """
         self.config, self.device = config, device
         torch.manual_seed(config.seed)
         self.network = make_network(config.network).to(device)
@@ -96,8 +102,13 @@ class Trainer:
             self.network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
         )
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
-        self.patches = make_patches(config.patches, seed=config.seed, device=device)
-        self._held_out: list[Patch] | None = None
+        shared = like is not None and (like.config.patches, like.config.seed) == (config.patches, config.seed)
+        self.patches = (
+            like.patches if like and shared else make_patches(config.patches, seed=config.seed, device=device)
+        )
+        self._held_out = like._held_out if like and shared else None
+        for patch in self.patches:
+            patch.kept.clear()
         self._rng = np.random.default_rng(config.seed + 1)
         self.iteration, self.seconds = 0, 0.0
         self.curve: list[dict[str, Any]] = []
