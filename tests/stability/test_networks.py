@@ -25,7 +25,11 @@ RANDOM = {
     "physgraph-paper": PaperConfig(latent=16, rounds=3),
     "raw features": PaperConfig(latent=16, rounds=2, features="paper"),
 }
-SHIPPED = [name for name in ("physgraph", "physgraph-paper") if (FOLDER / f"{name}.safetensors").exists()]
+SHIPPED = [
+    pytest.param(name, marks=pytest.mark.slow) if name == "physgraph-paper" else name
+    for name in ("physgraph", "physgraph-paper")
+    if (FOLDER / f"{name}.safetensors").exists()
+]
 
 
 def problem(
