@@ -1,6 +1,6 @@
 """The paper's convergence figure: energy against steps on a patch, for every integrator.
 
-    python -m benchmarks.convergence [--weights FILE] [--out docs/pictures/convergence.png]
+    python -m benchmarks.convergence [--weights FILE] [--out docs/pictures/convergence.png] [--shots swatch,flag]
 
 Patches of another seed than those trained on, stretch and bending only, their border fixed, subdivided twice (x16).
 Rates of Adam and gradient descent are the paper's, in units that make them comparable (an Adam rate is in edge lengths,
@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -27,6 +27,8 @@ from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.train.patches import Patch, PatchConfig, make_patches
+
+from .unseen import cases
 
 STEPS = 30
 PAPER_STEPS = 5
@@ -45,14 +47,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--physgraph", type=Path, default=FOLDER / "physgraph.safetensors")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=None)
+    parser.add_argument("--shots", default="", help="garments of benchmarks.unseen in place of patches")
+    parser.add_argument("--cache", type=Path, default=None, help="file that keeps the garments' least energies")
     given = parser.parse_args(arguments)
     prepare_device(given.device)
-    for number, patch in enumerate(make_patches(CONFIG, seed=SEED, device=given.device)):
+    named = [name for name in given.shots.split(",") if name]
+    patches = garments(named, given) if named else make_patches(CONFIG, seed=SEED, device=given.device)
+    for number, patch in enumerate(patches):
         say(f"\npatch {number}: {patch.words}, {patch.group.levels[-1].vertex_count} vertices")
         lines = curves(patch, given.weights, given.physgraph, device=given.device)
         table(lines)
         if given.out and number == 0:
             draw(lines, given.out)
+
+
+def garments(names: Sequence[str], given: argparse.Namespace) -> Iterator[Patch]:
+    """Whole garments with gravity and guide, in jersey, as patches."""
+    for case in cases(shots=names, fabrics=["jersey"], device=given.device, cache=given.cache):
+        energies = [math.nan] * (len(case.systems) - 1)
+        start, least = [*energies, case.start], [*energies, case.least]
+        yield Patch(case.group, case.frame, case.systems, case.coarse, case.name, start=start, least=least)
 
 
 def curves(patch: Patch, paper: Path, own: Path, *, device: str) -> dict[str, list[float]]:

@@ -52,6 +52,7 @@ class Case:
     Attributes:
         name: Shot and fabric.
         group: Its levels, float32.
+        frame: Its pose and fabric.
         systems: One a level.
         coarse: Recentred cage [m].
         start: Energy of the upsampled cage [J].
@@ -60,6 +61,7 @@ class Case:
 
     name: str
     group: Group
+    frame: GarmentFrame
     systems: list[System]
     coarse: torch.Tensor
     start: float
@@ -106,7 +108,7 @@ def cases(
                     cache.write_text(json.dumps(known, indent=1))
             systems, coarse = single.systems([frame])
             start = systems[-1].energy_and_force(single.levels[-1].base.apply(coarse))[0]
-            yield Case(label, single, systems, coarse, start, known[key])
+            yield Case(label, single, frame, systems, coarse, start, known[key])
 
 
 def least_of(group: Group, frame: GarmentFrame) -> float:
