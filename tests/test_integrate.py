@@ -219,7 +219,7 @@ class TestQuasiNewton:
         assert all(after <= before for before, after in pairwise(seen))
         assert seen[-1] < seen[0]
 
-    @pytest.mark.parametrize("name", METHODS)
+    @pytest.mark.parametrize("name", [name for name in METHODS if name != "physgraph-paper"])  # that one needs a mesh
     def test_fixed_vertices_never_move(self, name: str):
         system = system_of(spd(12, 9.0), metric=np.eye(12), fixed=(0, 5))
         x = start(12)
@@ -351,7 +351,7 @@ def test_a_part_of_the_cloth_is_solved_while_the_rest_is_held():
     whole, x = finest_system(group_of(mesh, rest, level=1), wave(rest))
     moving = torch.zeros_like(whole.free)
     moving[: len(x) // 2] = True
-    part = System(whole.field, whole.metric, free=whole.free & moving, spacing=whole.spacing)
+    part = System(whole.field, whole.metric, free=whole.free & moving, spacing=whole.spacing, level=whole.level)
     held = ~part.free[:, 0]
     force = part.energy_and_force(x)[1]
     assert not force[held].any()

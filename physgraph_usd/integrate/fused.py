@@ -94,7 +94,7 @@ def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device
     return FusedPhysgraph(network, vertices, longest, device=device, lanes=lanes)
 
 
-def _encoder(count: int) -> wp.Function:
+def _encoder(count: int) -> Any:
     """Adds the features' part to the first layer: lengths as logarithms, then cosines of all pairs."""
     directions = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
     floor, log_scale = FLOOR**2, 0.5 * LOG_SCALE
@@ -122,7 +122,7 @@ def _encoder(count: int) -> wp.Function:
     return encoded
 
 
-def _layer(width: int) -> wp.Function:
+def _layer(width: int) -> Any:
     """A layer after a rectifier."""
 
     @wp.func

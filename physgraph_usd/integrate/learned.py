@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..errors import SolveError
 from .base import Carry, Surface, System
 from .fused import can_fuse, fused_physgraph
 from .network import Graph, PaperNetwork, Physgraph
@@ -290,5 +291,6 @@ def vertex_normals(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tens
 
 
 def _level(system: System) -> Surface:
-    assert system.level is not None, "this network needs the mesh"
+    if system.level is None:
+        raise SolveError("this network needs a mesh, and the system has none")
     return system.level
