@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
 
@@ -242,6 +243,23 @@ def chart(shot: str, out: Path, **options: Any) -> None:
     given = {name: value for name, value in options.items() if value not in (None, ())}
     done = chart_shot(shot, out, ChartOptions(**given, progress=_tell))
     click.echo("\n".join(done.lines()))
+
+
+@main.command()
+@click.option(
+    "--config", "config_file", required=True, type=click.Path(path_type=Path), metavar="FILE.toml", help="What and how."
+)
+@out_option("DIR", "Folder for the log, the checkpoint, the weights and their card.")
+@click.option("--device", default="cpu", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--minutes", type=float, metavar="M", help="Train so long.  [default: the configuration's]")
+@click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
+def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
+    """Train a learned integrator and print its weights' path."""
+    from .shot import prepare_device
+    from .train.record import run_training
+
+    prepare_device(device)
+    click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))
 
 
 @main.command("schema-path")

@@ -201,7 +201,8 @@ class Group:
         modules, coarse = self.modules(frames)
         parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
         return [
-            System(m, lasting.metric, free=level.free, spacing=level.spacing) for level, lasting, m in parts
+            System(m, lasting.metric, free=level.free, spacing=level.spacing, level=level)
+            for level, lasting, m in parts
         ], coarse
 
     def use(self, settings: SolveSettings) -> None:
@@ -221,8 +222,8 @@ class Group:
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
-        coarse = self._tensor(np.concatenate([f.points for f in frames]))
-        coarse = coarse - coarse.mean(dim=0)
+        world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
+        coarse = self._tensor((world - world.mean(dim=0)).numpy())
         forces = self._forces_for(frames)
         return [lasting.module(coarse) for lasting in forces], coarse
 
@@ -338,7 +339,9 @@ class Group:
 
         def system(touched: Sequence[Touch], at: Tensor) -> System:
             held = metric if view is None else view.metric(metric, touched, at)
-            return System(ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing)
+            return System(
+                ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing, level=level
+            )
 
         integrator = self._settings.method.build()
         if view is None:
@@ -357,7 +360,7 @@ class Group:
         made = freed + made
         if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
             held = torch.stack([term.near(level) for term in touched]).any(dim=0)
-            apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing)
+            apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing, level=level)
             x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
             made.append(report)
         return x, made, touched
