@@ -120,7 +120,8 @@ def view_of(
     """The finest level's cloth in a frame whose upsampled cage is at given positions."""
     lasting = ClothContact(levels, garments)
     each = torch.full((len(garments),), thickness, dtype=base.dtype)
-    return ClothView(lasting, levels[-1], base, thickness=each, stiffness=stiffness)
+    settings = ContactSettings(cloth_stiffness=stiffness)
+    return ClothView(lasting, levels[-1], base, thickness=each, settings=settings)
 
 
 def refiner_with(
