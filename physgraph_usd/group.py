@@ -16,8 +16,9 @@ from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
 from .contact.rounds import solve_rounds, untangle
+from .contact.seams import Seams
 from .contact.settings import ContactSettings
-from .detail import Carried, MovingFrames, Reset
+from .detail import Carried, MovingFrames, Reset, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
@@ -71,23 +72,6 @@ class SolveSettings:
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """One frame of a group.
-
-    Attributes:
-        points: World positions of each garment [m].
-        carried: What the next frame needs.
-        telemetry: Plain values.
-        crossing: For each garment, which vertices belong to cloth that crosses cloth, shape (V,), bool.
-    """
-
-    points: list[np.ndarray]
-    carried: Carried
-    telemetry: dict[str, object]
-    crossing: list[np.ndarray]
 
 
 class Group:
@@ -200,12 +184,10 @@ class Group:
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
     ) -> dict[str, float]:
         """Energy of each term [J] at the garments' world positions [m], what touches there found anew."""
-        world = np.concatenate([frame.points for frame in frames])
-        origin, forces = world.mean(axis=0), self._forces_for(frames)
-        coarse, x = self._tensor(world - origin), self._tensor(np.concatenate(points) - origin)
-        contact = self._contact(touching, coarse, origin, frames)
+        module, contact, origin = self.potential(frames, touching)
+        x = self._tensor(np.concatenate(points) - origin)
         touched = () if contact is None else contact.at(self.levels[-1]).terms(x)
-        return ForceModule((*forces[-1].module(coarse).forces, *touched)).energies(x)
+        return ForceModule((*module.forces, *touched)).energies(x)
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
@@ -221,6 +203,21 @@ class Group:
         return [
             System(m, lasting.metric, free=level.free, spacing=level.spacing) for level, lasting, m in parts
         ], coarse
+
+    def use(self, settings: SolveSettings) -> None:
+        """Solve the frames that follow in another way; levels and metrics are kept."""
+        if settings.potential != self._settings.potential:
+            self._material = ()
+        self._settings = settings
+
+    def potential(
+        self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()
+    ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
+        """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
+        world = np.concatenate([frame.points for frame in frames])
+        origin = world.mean(axis=0)
+        module, coarse = self._forces_for(frames)[-1], self._tensor(world - origin)
+        return module.module(coarse), self._contact(touching, coarse, origin, frames), origin
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
@@ -279,7 +276,10 @@ class Group:
         """What a frame's cloth may touch, or None when there is nothing."""
         settings = self._settings.contact
         cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
-        if not len(self.levels[0].triangles) or (cloth is None and not touching):
+        if not len(self.levels[0].triangles):
+            return None
+        seams = Seams.find(self.levels[0], coarse, self._stretch) if settings.cloth != "off" else None
+        if cloth is None and not touching and seams is None:
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
         settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
@@ -287,7 +287,9 @@ class Group:
         if touching:
             bodies = FrameBodies.begin(self.levels, touching, coarse, origin=origin, settings=settings)
         thickness = [frame.fabric.thickness for frame in frames]
-        return FrameContact(self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings)
+        return FrameContact(
+            self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings, seams=seams
+        )
 
     def _descend(
         self,
