@@ -40,6 +40,15 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
     return report
 
 
+def leave_out_what_never_was(report: RefineReport) -> None:
+    """Move contact of cloth with cloth from what is modelled to what is left out where no frame needed it."""
+    entries = [entry for frame in report.frames for entry in frame.get("garments", ())]
+    if any("cloth" in entry.get("contact", {}) for entry in entries):
+        return
+    if report.modelled.pop("self contact", None):
+        report.left_out["self contact"] = "no two parts of the cloth came near one another in any frame"
+
+
 def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
     report = begin_report(opened, choices, options)

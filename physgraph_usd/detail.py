@@ -118,6 +118,16 @@ class MovingFrames:
         turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
         return self._level.smooth_base.apply(coarse) + moved, motion, turn
 
+    def scaled(
+        self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"], gain: np.ndarray
+    ) -> Float[Tensor, "vertices 3"]:
+        """Scale the detail of free vertices by a gain at each cage vertex, shape (C,); 1 everywhere changes nothing."""
+        if np.all(gain == 1.0):
+            return fine
+        more = torch.as_tensor(self._level.from_coarse @ gain).to(fine).unsqueeze(1)
+        smooth = self._level.smooth_base.apply(coarse)
+        return torch.where(self._level.free, smooth + more * (fine - smooth), fine)
+
     def _spread(self, frames: Float[Tensor, "coarse 3 3"]) -> Float[Tensor, "vertices 3 3"]:
         """Interpolate cage frames to the fine vertices."""
         base = self._level.base

@@ -168,12 +168,13 @@ class Group:
             x, reports, module = self._descend(forces, coarse, predicted, clock, contact=contact)
         except SolveError as error:
             raise SolveError(self._blame(forces[-1], coarse, error, at)) from error
-        result = self._finish(x, coarse, frames)
+        gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
+        result = self._frames.scaled(coarse, x, gain)
         moved: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
-            result, moved = contact.finish(result)
-            x = x if scaled else result
+            result, start_next, moved = contact.finish(result)
+            x = x if scaled else start_next
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
         elastic = forces[-1].elastic_energy(x)
@@ -194,6 +195,17 @@ class Group:
         points[self._fixed] = self._place_fixed @ world
         spans, crosses = self.levels[-1].spans, crossing.cpu().numpy()
         return Solved([points[span] for span in spans], carried, telemetry, [crosses[span] for span in spans])
+
+    def energies(
+        self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
+    ) -> dict[str, float]:
+        """Energy of each term [J] at the garments' world positions [m], what touches there found anew."""
+        world = np.concatenate([frame.points for frame in frames])
+        origin, forces = world.mean(axis=0), self._forces_for(frames)
+        coarse, x = self._tensor(world - origin), self._tensor(np.concatenate(points) - origin)
+        contact = self._contact(touching, coarse, origin, frames)
+        touched = () if contact is None else contact.at(self.levels[-1]).terms(x)
+        return ForceModule((*forces[-1].module(coarse).forces, *touched)).energies(x)
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
@@ -267,7 +279,7 @@ class Group:
         """What a frame's cloth may touch, or None when there is nothing."""
         settings = self._settings.contact
         cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
-        if not len(coarse) or (cloth is None and not touching):
+        if not len(self.levels[0].triangles) or (cloth is None and not touching):
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
         settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
@@ -358,16 +370,6 @@ class Group:
         if not below:
             return Budget(settings.steps, settings.tolerance, deadline)
         return Budget(COARSE_STEPS * settings.steps, COARSE_TOLERANCE * settings.tolerance, deadline)
-
-    def _finish(self, x: Tensor, coarse: Tensor, frames: Sequence[GarmentFrame]) -> Tensor:
-        """Scale the detail where an artist asked for more or less of it."""
-        finest = self.levels[-1]
-        gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
-        if np.all(gain == 1.0):
-            return x
-        fine_gain = self._tensor(finest.from_coarse @ gain).unsqueeze(1)
-        smooth = finest.smooth_base.apply(coarse)
-        return torch.where(finest.free, smooth + fine_gain * (x - smooth), x)
 
     def _telemetry(
         self, module: ForceModule, x: Tensor, coarse: Tensor, reports: list[LevelReport]

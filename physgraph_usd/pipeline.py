@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from .colliders.pose import Pose
+from .contact.bodies import Touching
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
@@ -151,6 +152,24 @@ class Refiner:
         heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
+    def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
+        """Energy [J] of all garments at given world positions [m], what touches there found anew."""
+        self._bodies.pose(frame.colliders)
+        total = 0.0
+        for part in self._parts.of(frame.garments):
+            frames = [frame.garments[index] for index in part]
+            touching = self._touching(part, frames, self._near(part, frames))
+            total += sum(self.group_of(part).energies(frames, [points[index] for index in part], touching).values())
+        return total
+
+    def _touching(
+        self, part: Sequence[int], frames: Sequence[GarmentFrame], near: Sequence[int]
+    ) -> tuple[Touching, ...]:
+        """Surfaces of bodies, and the distance that each garment keeps from them."""
+        felt = [self._scene.garments[index].colliders for index in part]
+        offsets = [[f.offset if body in own else None for body in near] for own, f in zip(felt, frames, strict=True)]
+        return self._bodies.touching(near, offsets)
+
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
     ) -> tuple[list[_Known | None], list[dict[str, object]]]:
@@ -160,11 +179,7 @@ class Refiner:
         kept = None if gap or any(each is None for each in last) else join([each.carried for each in last if each])
         group, near = self.group_of(part), self._near(part, frames)
         while True:
-            offsets = [
-                [each.offset if body in self._scene.garments[index].colliders else None for body in near]
-                for index, each in zip(part, frames, strict=True)
-            ]
-            touching = self._bodies.touching(near, offsets)
+            touching = self._touching(part, frames, near)
             solved = group.solve(frames, kept, at=frame.time, touching=touching)
             more = self._reached(part, frames, solved.points)
             if more <= set(near):

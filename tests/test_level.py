@@ -199,3 +199,22 @@ def test_level_of_nothing():
     assert level.vertex_count == 0
     assert level.dtype == torch.float32
     assert level.device == "cpu"
+
+
+@pytest.mark.parametrize("bent", [True, False])
+def test_cloth_rests_at_its_own_angles_or_flat(bent: bool):
+    points, triangles = equilateral(0.4, 0.3, 0.1)
+    rolled = np.stack([0.2 * np.sin(5 * points[:, 0]), points[:, 1], 0.2 * np.cos(5 * points[:, 0])], axis=1)
+    level = level_of(rolled, triangles, bent=bent)
+    angle = hinge_geometry(rolled, level.hinges.numpy())[0]
+    assert np.abs(angle).max() > 0.1
+    np.testing.assert_allclose(level.rest_angle.numpy(), angle if bent else 0 * angle, atol=1e-12)
+
+
+def test_triangles_without_area_and_those_that_repeat_are_no_cloth():
+    points, triangles = equilateral(0.4, 0.3, 0.1)
+    more = np.vstack([points, points[:2].mean(axis=0)])
+    extra = np.array([[0, len(points), 1], triangles[3], triangles[5][::-1]])
+    level = level_of(more, np.vstack([triangles, extra]))
+    assert len(level.triangles) == len(triangles)
+    assert not bool(level.free[len(points)])

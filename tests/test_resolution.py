@@ -58,6 +58,10 @@ def test_a_fifth_of_a_wave_decides(squeeze: float, bend: float):
     assert choice.level == 0 or 2 * choice.edge > wave / EDGES_PER_WAVE
 
 
+def test_a_wave_has_at_least_five_edges():
+    assert EDGES_PER_WAVE == 5.0
+
+
 def test_stiffer_and_finer_cages_need_fewer_levels():
     levels = [choose(0.1, fabric=replace(FABRIC, bend=bend))[0].level for bend in (1e-2, 4e-4, 1e-4, 2.5e-5)]
     assert levels == [0, levels[1], levels[1] + 1, levels[1] + 2]

@@ -93,7 +93,7 @@ class MeshSurface:
             pose: Any pose.
             triangles: The pieces' triangles, shape (T, 3).
             rim: Rim edges and rim corners of open pieces, or None for closed ones.
-            side: One of `pose.SIDES`.
+            side: One of `sides.SIDES`.
             device: "cpu" or a CUDA device.
             lanes: Most threads that a query uses on the CPU.
         """
@@ -234,7 +234,7 @@ class MeshBody:
     """One mesh collider over the shot: its surfaces, kept while the topology stays the same."""
 
     def __init__(self, *, side: str = "auto", device: str, lanes: int) -> None:
-        """Remember where and how to build; ``side`` is one of `pose.SIDES`."""
+        """Remember where and how to build; ``side`` is one of `sides.SIDES`."""
         self._side, self._device, self._lanes = side, device, lanes
         self._triangles: np.ndarray | None = None
         self._count = 0

@@ -45,7 +45,7 @@ def pieces_of(points: np.ndarray, triangles: np.ndarray, *, side: str = "auto") 
     Args:
         points: Positions [m], shape (V, 3); those that are not finite take their faces with them.
         triangles: Corners, shape (T, 3).
-        side: One of `pose.SIDES`: "winding" counts every piece as closed, "start" none; open pieces are left as they
+        side: One of `sides.SIDES`: "winding" counts every piece as closed, "start" none; open pieces are left as they
             are wound for "front" and "back".
 
     Returns:

@@ -20,7 +20,8 @@ from ..colliders.base import Nearest, Surface
 from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
-from .measure import penetration, pierced, pinched
+from .measure import DEEP, penetration, pierced, pinched
+from .room import room_above
 from .settings import ContactSettings
 
 PINCHED = 0.5
@@ -142,7 +143,8 @@ class LevelBodies:
             vertex, normal, signed = track.refresh(x, track.offset + self._reach)
             near = signed < track.offset[vertex] + self._reach
             vertex, normal, signed = vertex[near], normal[near], signed[near]
-            height = (normal * x[vertex]).sum(dim=1) - signed + track.offset[vertex]
+            offset = self._kept(track, x[vertex], normal, signed, track.offset[vertex])
+            height = (normal * x[vertex]).sum(dim=1) - signed + offset
             planes.append(Planes(vertex.to(torch.int32), normal.contiguous(), height))
         if not any(len(each.vertex) for each in planes):
             return None
@@ -161,31 +163,63 @@ class LevelBodies:
             through = self._through(out)
             if not bool(through.any()):
                 break
-            extra = torch.where(through, extra + LIFT * self._reach, extra)
-            out, more = self._out(out, extra)
+            lifted, more = self._out(out, torch.where(through, extra + LIFT * self._reach, extra))
+            # What another body is in the way of stays where it is.
+            stuck = self._depth(lifted) > self._depth(out).clamp_min(DEEP)
+            extra = torch.where(through & ~stuck, extra + LIFT * self._reach, extra)
+            out = torch.where(stuck.unsqueeze(1), out, lifted)
             passes += more
         shifts = (out - x).norm(dim=1)
         far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
         return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
 
     def _out(self, x: Tensor, extra: Tensor) -> tuple[Tensor, int]:
-        """Push out to the least clearance and more, body by body; returns positions and the passes made."""
+        """Push out to the least clearance and more, body by body; returns positions and the passes made.
+
+        What bodies push to and fro until the passes end is moved by halves, and so to the middle between them.
+        """
         out, passes = x, 0
-        for _ in range(self._settings.projections):
-            moved = False
+        for attempt in range(2 * self._settings.projections):
+            together = attempt >= self._settings.projections
+            moved, total = False, torch.zeros_like(x)
             for track in self._tracks:
-                least = self._settings.clearance * track.offset + extra
-                vertex, normal, signed = track.refresh(out, least)
-                lack = least[vertex] - signed
-                push = (lack > 1e-7) & self._level.free[vertex, 0]
-                if bool(push.any()):
-                    out = out.clone() if not moved else out
-                    out[vertex[push]] += lack[push].unsqueeze(1) * normal[push]
-                    moved = True
-            if not moved:
+                vertex, push = self._pushes(track, out, extra)
+                if not len(vertex):
+                    continue
+                moved = True
+                if together:
+                    total[vertex] += 0.5 * push
+                else:
+                    out = out.clone() if out is x else out
+                    out[vertex] += push
+            out = out + total if together and moved else out
+            if not moved or (together and float(total.abs().max()) < 1e-7):
                 break
             passes += 1
         return out, passes
+
+    def _pushes(self, track: _Track, x: Tensor, extra: Tensor) -> tuple[Tensor, Tensor]:
+        """Vertices that are under their least clearance to a surface, and the ways to it."""
+        least = self._settings.clearance * track.offset + extra
+        vertex, normal, signed = track.refresh(x, least)
+        lack = self._kept(track, x[vertex], normal, signed, least[vertex]) - signed
+        push = (lack > 1e-7) & self._level.free[vertex, 0]
+        return vertex[push], lack[push].unsqueeze(1) * normal[push]
+
+    def _kept(self, track: _Track, x: Tensor, normal: Tensor, signed: Tensor, wanted: Tensor) -> Tensor:
+        """The distance to keep from a surface: half the room that it leaves, where that is less than what is wanted."""
+        foot = x - signed.unsqueeze(1) * normal + track.shift
+        reach = 2.0 * wanted.clamp_min(0.0)
+        room = room_above(track.surface, foot, normal, reach=reach, lanes=self._level.lanes)
+        return torch.minimum(wanted, 0.5 * room)
+
+    def _depth(self, x: Tensor) -> Tensor:
+        """How deep each vertex is in the deepest body [m]."""
+        out = torch.zeros_like(x[:, 0])
+        for track in self._tracks:
+            vertex, _, signed = track.refresh(x, torch.zeros_like(out))
+            out[vertex] = torch.maximum(out[vertex], -signed)
+        return out
 
     def _through(self, x: Tensor) -> Bool[Tensor, " vertices"]:
         """Vertices whose edges or faces bodies pass through, though they are outside themselves."""
@@ -193,8 +227,10 @@ class LevelBodies:
         for track in self._tracks:
             moved = (x - track.at).norm(dim=1)
             found = pierced(track.surface, self._level, x + track.shift, (track.known.abs() - moved).clamp_min(0.0))
-            out[self._level.edges.long()[found.edges].reshape(-1)] = True
-            out[self._level.triangles.long()[found.triangles].reshape(-1)] = True
+            held = ~self._level.free[:, 0] & (track.known < 0)
+            for corners in (self._level.edges.long()[found.edges], self._level.triangles.long()[found.triangles]):
+                # What a pin holds inside comes out at no height.
+                out[corners[~held[corners].any(dim=1)].reshape(-1)] = True
         return out
 
 

@@ -104,21 +104,26 @@ class FrameContact:
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds)
         return self._views[level.index]
 
-    def finish(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, object]]:
-        """Push the solved cloth out of bodies and take back what newly crosses.
+    def finish(
+        self, x: Float[Tensor, "vertices 3"]
+    ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"], dict[str, object]]:
+        """Take back what newly crosses and push the solved cloth out of bodies.
 
         Returns:
-            Positions [m], x itself where nothing had to move; and what had to move.
+            Positions [m], x itself where nothing had to move; the same before bodies pushed, where the next frame
+            starts: it is where forces rest, so that equal frames stay equal; and what had to move.
         """
         view = self.at(self._levels[-1])
         moved: dict[str, object] = {}
+        mended = None
         for _ in range(FINISHES):
             x = x if view.cloth is None else view.cloth.mend(x).x
+            mended = x if mended is None else mended
             if view.bodies is not None:
                 x, moved["projected"] = view.bodies.project(x)
             if view.cloth is None or view.bodies is None or not view.cloth.worse(x):
                 break
-        return x, moved
+        return x, x if mended is None else mended, moved
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
         """What is in bodies and what crosses, before and after, as plain values, and vertices of cloth that crosses.

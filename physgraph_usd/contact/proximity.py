@@ -75,6 +75,12 @@ def is_inside(s: float, t: float):
 
 
 @wp.func
+def between(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, g: wp.vec2i, s: float, t: float):
+    """From the place t on edge g to the place s on edge e."""
+    return (1.0 - s) * x[e[0]] + s * x[e[1]] - (1.0 - t) * x[g[0]] - t * x[g[1]]
+
+
+@wp.func
 def belongs(distance: float, rest_distance: float, cosine: float):
     """Whether a part of the same garment is a neighbour in the plane, where it belongs."""
     return wp.abs(cosine) < IN_PLANE and distance > CLOSED_IN * rest_distance
@@ -167,8 +173,7 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
     e = ask[i]
     a, b = edges[e][0], edges[e][1]
     far = 0.5 * (reach[a] + reach[b])
-    n = normal[a] + normal[b]
-    n = n / wp.max(wp.length(n), 1.0e-20)
+    n = wp.normalize(normal[a] + normal[b])
     best_up = wp.float32(far)
     best_down = wp.float32(far)
     up = wp.int32(-1)
@@ -190,11 +195,9 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
                 continue
             if are_beside(edges[e], edges[g], starts, ring):
                 continue
-            way = (1.0 - s) * x[a] + s * x[b] - (1.0 - t) * x[c] - t * x[d]
-            cosine = wp.dot(way, n) / distance
+            cosine = wp.dot(between(x, edges[e], edges[g], s, t), n) / distance
             if garment[a] == garment[c]:
-                at_rest = (1.0 - s) * rest[a] + s * rest[b] - (1.0 - t) * rest[c] - t * rest[d]
-                if belongs(distance, wp.length(at_rest), cosine):
+                if belongs(distance, wp.length(between(rest, edges[e], edges[g], s, t)), cosine):
                     continue
             if cosine > 0.0:
                 if distance < best_up:
@@ -221,13 +224,21 @@ def wide(v: wp.vec3f):
 
 
 @wp.func
-def passes_through(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d):
-    """Whether the inside of a segment passes through the inside of a triangle; touching is not passing."""
-    zero = wp.float64(0.0)
-    if volume(p, q, r, a) * volume(p, q, r, b) >= zero:
+def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int32):
+    """Whether the line from p to q passes an edge on its left; of two faces at a side just one has it on its left."""
+    low, high = wp.min(p, q), wp.max(p, q)
+    left = volume(wide(x[e[0]]), wide(x[e[1]]), wide(x[low]), wide(x[high])) >= wp.float64(0.0)
+    return left == (p < q)
+
+
+@wp.func
+def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
+    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces."""
+    p, q, r = wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])
+    if volume(p, q, r, wide(x[e[0]])) * volume(p, q, r, wide(x[e[1]])) >= wp.float64(0.0):
         return False
-    u, v, w = volume(a, b, p, q), volume(a, b, q, r), volume(a, b, r, p)
-    return (u > zero and v > zero and w > zero) or (u < zero and v < zero and w < zero)
+    first = turns_left(x, e, t[0], t[1])
+    return turns_left(x, e, t[1], t[2]) == first and turns_left(x, e, t[2], t[0]) == first
 
 
 @wp.kernel
@@ -247,7 +258,6 @@ def pierced(
     """For each edge asked, how many faces it passes through, and the first of them."""
     i = first + wp.tid()
     a, b = edges[ask[i]][0], edges[ask[i]][1]
-    start, end = wide(x[a]), wide(x[b])
     found = wp.vec4i(-1, -1, -1, -1)
     total = wp.int32(0)
     query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]), wp.max(x[a], x[b]))
@@ -258,7 +268,7 @@ def pierced(
             continue
         if meets[garment[a] * garments + garment[t[0]]] == 0:
             continue
-        if passes_through(start, end, wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])):
+        if passes_through(x, edges[ask[i]], t):
             if total < SLOTS:
                 found[total] = f
             total += 1

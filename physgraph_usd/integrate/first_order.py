@@ -23,7 +23,8 @@ class GradientDescent:
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x and measure the stiffest vertex."""
         energy, force = system.energy_and_force(x)
-        return Carry(x, energy, force, mover=self.name, memory=self._rate / float(system.diagonal(x).max()))
+        stiffest = float(system.diagonal(x).max()) if len(x) else 1.0
+        return Carry(x, energy, force, mover=self.name, memory=self._rate / stiffest)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step of fixed length."""

@@ -93,6 +93,8 @@ class ColliderReader:
 
     def _shape(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         kind, size, axes = _measures(self.prim, time)
+        if axes is None or not (np.isfinite(size).all() and (size >= 0).all()):
+            return None, (self._out(time, "its sizes or its axis are none that a shape can have"),)
         linear = matrix[:3, :3] @ axes
         if kind == "plane":
             normal = np.cross(linear[:, 0], linear[:, 1]) * np.sign(np.linalg.det(linear) or 1.0)
@@ -145,13 +147,18 @@ def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
     return np.zeros(0, np.int32) if value is None else np.asarray(value)
 
 
-def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.ndarray]:
-    """Kind, half sizes in stage units, and the matrix whose columns are the shape's axes in the prim's space."""
+def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.ndarray | None]:
+    """Kind, half sizes in stage units, and the matrix whose columns are the shape's axes in the prim's space.
+
+    A size that is no number is NaN, and an axis that USD does not know has no matrix.
+    """
 
     def number(name: str, fallback: float) -> float:
         attribute = prim.GetAttribute(name)
         value = attribute.Get(timecode(time)) if attribute else None
-        return fallback if value is None else float(value)
+        if value is None:
+            return fallback
+        return float(value) if isinstance(value, int | float) else np.nan
 
     kind = str(prim.GetTypeName()).removesuffix("_1").lower()
     half_height = 0.5 * number("height", 1.0 if kind == "capsule" else 2.0)
@@ -160,7 +167,7 @@ def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.n
     half = 0.5 * number("size", 2.0)
     size = {"sphere": [radius] * 3, "cube": [half] * 3}.get(kind, [radius, radius, half_height])
     axis = prim.GetAttribute("axis").Get() if prim.GetAttribute("axis") else "Z"
-    return kind, np.array(size, dtype=np.float64), UPRIGHT[str(axis or "Z")]
+    return kind, np.array(size, dtype=np.float64), UPRIGHT.get(str(axis or "Z"))
 
 
 def _frame_about(normal: np.ndarray) -> np.ndarray:

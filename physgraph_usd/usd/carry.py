@@ -71,15 +71,18 @@ class FineMap:
         """Number of authored elements of an interpolation.
 
         Raises:
-            KeyError: The interpolation depends on no topology.
+            ValueError: The interpolation depends on no topology.
         """
         vertices = self.cage.vertex_count
-        return {
+        counts = {
             "vertex": vertices,
             "varying": vertices,
             "uniform": self._face_count,
             "faceVarying": int(self._starts[-1]),
-        }[interpolation]
+        }
+        if interpolation not in counts:
+            raise ValueError(f"has interpolation {interpolation!r}; known: constant, {', '.join(counts)}")
+        return counts[interpolation]
 
     def primvar(
         self, interpolation: str, values: np.ndarray, *, indices: np.ndarray | None = None, smooth: bool = True
@@ -147,7 +150,12 @@ class FineMap:
         Raises:
             ValueError: The element type is unknown or an index is out of range.
         """
-        indices = np.asarray(indices, np.int64).reshape(-1)
+        indices = np.asarray(indices)
+        if indices.dtype.kind not in "iu" and indices.size:
+            raise ValueError(f"has indices that are no whole numbers but {indices.dtype}")
+        indices = indices.astype(np.int64).reshape(-1)
+        if element == "edge" and len(indices) % 2:
+            raise ValueError(f"has {len(indices)} indices for edges, which need pairs")
         limit = self._face_count if element == "face" else self.cage.vertex_count
         if len(indices) and not 0 <= indices.min() <= indices.max() < limit:
             raise ValueError(f"has {element} indices from {indices.min()} to {indices.max()}; the mesh has {limit}")
@@ -168,7 +176,12 @@ def to_numpy(value: Any) -> tuple[np.ndarray, bool]:
     Returns:
         The array, shape (N, ...), and whether values between two are meaningful. Quaternions are not interpolated:
         q and -q are the same rotation.
+
+    Raises:
+        ValueError: The value is no array.
     """
+    if not hasattr(type(value), "__len__") or not type(value).__name__.endswith("Array"):
+        raise ValueError(f"is a {type(value).__name__}, no array")
     if not hasattr(type(value), "FromNumpy"):
         return _objects(value), False
     array = np.asarray(value)

@@ -10,6 +10,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from .stream import LayerStream
 
 ATTRIBUTE = "extentsHint"
+_FIRST = Usd.TimeCode.EarliestTime()
 _PURPOSES = ("default", "render", "proxy", "guide")
 
 
@@ -32,7 +33,7 @@ class ModelHints:
         prim = self._prim
         while prim and not prim.IsPseudoRoot():
             attribute = prim.GetAttribute(ATTRIBUTE)
-            if attribute and attribute.HasAuthoredValue():
+            if attribute and attribute.HasAuthoredValue() and isinstance(attribute.Get(_FIRST), Vt.Vec3fArray):
                 self._models.append(prim)
             prim = prim.GetParent()
 
@@ -50,8 +51,10 @@ class ModelHints:
         corners = np.array([[box[i][0], box[j][1], box[k][2], 1.0] for i, j, k in product((0, 1), repeat=3)])
         local = np.array(cache.GetLocalToWorldTransform(self._prim))
         for model in self._models:
-            matrix = local @ np.linalg.inv(np.array(cache.GetLocalToWorldTransform(model)))
-            self._grow(model, time, (corners @ matrix)[:, :3])
+            inverse = np.linalg.pinv(np.array(cache.GetLocalToWorldTransform(model)))
+            grown = (corners @ local @ inverse)[:, :3]
+            if np.isfinite(grown).all():
+                self._grow(model, time, grown)
 
     def _grow(self, model: Usd.Prim, time: float | None, corners: np.ndarray) -> None:
         """Author the union of a hint and eight corners, at a time where the hint is animated, else as default."""

@@ -15,6 +15,7 @@ from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
 from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, find_property
+from .stage import in_brief
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
 _WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0}
@@ -196,7 +197,7 @@ def read_number(attribute: Usd.Attribute, time: float | None) -> float:
     value = attribute.Get(code)
     if not isinstance(value, bool | int | float):
         kind = attribute.GetTypeName()
-        raise SchemaError(f"{source_name(attribute)} is {value!r} of type {kind}; a single number is needed")
+        raise SchemaError(f"{source_name(attribute)} is {in_brief(value)} of type {kind}; a single number is needed")
     return float(value)
 
 

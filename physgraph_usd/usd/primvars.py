@@ -50,8 +50,9 @@ def carry_primvars(
 def _hide(stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar) -> None:
     """Block a primvar's values and indices."""
     stream.block(target.AppendProperty(primvar.GetAttr().GetName()), primvar.GetTypeName())
-    if primvar.IsIndexed():
-        stream.block(target.AppendProperty(primvar.GetIndicesAttr().GetName()), Sdf.ValueTypeNames.IntArray)
+    indices = primvar.GetIndicesAttr()
+    if primvar.IsIndexed() and indices.GetTypeName():
+        stream.block(target.AppendProperty(indices.GetName()), indices.GetTypeName())
 
 
 def _carry(

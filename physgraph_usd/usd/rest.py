@@ -116,7 +116,7 @@ def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
             continue
         source = UsdGeom.Primvar(attribute).ComputeFlattened if name.startswith("primvars:") else attribute.Get
         value = source(Usd.TimeCode.EarliestTime())
-        if value is None or len(value) == 0:
+        if value is None or np.size(value) == 0:
             continue
         points = as_points(value, str(prim.GetPath()), name)
         if len(points) != count:

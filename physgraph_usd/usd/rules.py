@@ -230,7 +230,7 @@ def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) 
     value = primvar.Get(code_of(time))
     if value is None:
         return ""
-    groups = len(value) / primvar.GetElementSize()
+    groups = len(value) / max(primvar.GetElementSize(), 1)
     if not primvar.IsIndexed():
         return "" if groups == expected else f"has {groups:g} elements; its interpolation needs {expected}"
     indices = np.asarray(primvar.GetIndices(code_of(time)))
@@ -248,11 +248,14 @@ def subsets(fine: Fine) -> Iterator[Problem]:
     families: dict[tuple[str, str], list[np.ndarray]] = {}
     for subset in UsdGeom.Subset.GetAllGeomSubsets(imageable):
         element = subset.GetElementTypeAttr().Get()
-        value = subset.GetIndicesAttr().Get()
-        indices = np.asarray(value if value is not None else [], np.int64)
-        path = str(subset.GetIndicesAttr().GetPath())
+        path, value = str(subset.GetIndicesAttr().GetPath()), subset.GetIndicesAttr().Get()
+        array = np.asarray(value if value is not None else [])
         if element not in sizes:
             continue
+        if array.size and array.dtype.kind not in "iu":
+            yield Problem("error", path, None, f"is a {type(value).__name__}, not an array of integers", "")
+            continue
+        indices = array.astype(np.int64).reshape(-1)
         if len(indices) and not 0 <= indices.min() <= indices.max() < sizes[element]:
             yield Problem("error", path, None, f"names {element} {indices.max()} of {sizes[element]}", "")
         elif len(np.unique(indices)) != len(indices):

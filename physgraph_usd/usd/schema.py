@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..colliders.pose import SIDES
 from ..errors import UsageError
 from ..fabric import PRESETS
+from ..sides import SIDES
 
 GARMENT_API = "PhysGraphGarmentAPI"
 COLLIDER_API = "PhysGraphColliderAPI"

@@ -14,8 +14,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from ..errors import StageError
+from ..errors import PhysGraphError, StageError
 
+_PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
+"""The name of a rule of USD's own parser, which tells a user nothing."""
+MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 STANDARD_GRAVITY = 9.81
 """Magnitude of gravity when no physics scene gives one [m/s^2]."""
@@ -73,28 +76,39 @@ class GarmentSource:
 
 
 @contextlib.contextmanager
-def pxr_errors(what: str) -> Iterator[None]:
-    """Turn an error that USD raises into a StageError.
+def pxr_errors(what: str, kind: type[PhysGraphError] = StageError) -> Iterator[None]:
+    """Turn an error that USD raises into one of ours.
 
     Args:
         what: What was being done, as the message's beginning.
+        kind: Our error.
 
     Raises:
-        StageError: When pxr raised; its text is the first reason USD gave.
+        PhysGraphError: Of that kind, when pxr raised; its text is the first reasons USD gave.
     """
     try:
         yield
     except Tf.ErrorException as error:
-        raise StageError(f"{what}: {reason_of(error)}") from error
+        raise kind(f"{what}: {reason_of(error)}") from error
     except UnicodeDecodeError as error:  # a damaged crate hands out names that are no text
-        raise StageError(f"{what}: a name in the file is no text; the file is damaged") from error
+        raise kind(f"{what}: a name in the file is no text; the file is damaged") from error
 
 
 def reason_of(error: Tf.ErrorException) -> str:
-    """Give the reasons inside a USD error, without its C++ places."""
-    reasons = [part.split(" : ", 1)[-1].strip().strip("'").strip() for part in str(error).split("\n\tError in ")]
-    kept = dict.fromkeys(" ".join(reason.split()) for reason in reasons if reason)
-    return "; ".join(kept) or "USD gave no reason"
+    """Give the first reasons inside a USD error, without its C++ places."""
+    try:
+        text = str(error)
+    except UnicodeDecodeError:
+        return "the file has bytes that are no text; it is damaged"
+    reasons = [part.split(" : ", 1)[-1].strip().strip("'").strip() for part in text.split("\n\tError in ")]
+    kept = list(dict.fromkeys(in_brief(reason) for reason in reasons if reason))
+    return "; ".join(kept[:MOST_REASONS]) + _others(max(len(kept) - MOST_REASONS, 0)) or "USD gave no reason"
+
+
+def in_brief(said: object) -> str:
+    """What USD or a value says of itself, on one line of bounded length, without the names of USD's parser."""
+    text = _PARSER_RULE.sub("parse error", " ".join(str(said).split()))
+    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} ..."
 
 
 def root_metadata(stage: Usd.Stage, key: str) -> object | None:
@@ -145,7 +159,8 @@ def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
     if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
         notices.append(Notice("", None, f"timeCodesPerSecond is {rate!r}; time codes are kept, speeds mean nothing"))
     up, odd = up_vector(stage)
-    return Units(metres, kilograms, up, gravity(stage, up, metres)), notices + odd
+    pull, odd_pull = gravity(stage, up, metres)
+    return Units(metres, kilograms, up, pull), notices + odd + odd_pull
 
 
 def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
@@ -156,21 +171,27 @@ def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
     return np.array([0.0, 1.0, 0.0]), [Notice("", None, f"upAxis is {authored!r}; USD knows Y and Z; Y assumed")]
 
 
-def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> np.ndarray:
-    """Gravity of the first physics scene, or 9.81 m/s^2 against the up axis [m/s^2], shape (3,).
+def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray, list[Notice]]:
+    """Gravity of the first physics scene, or 9.81 m/s^2 against the up axis [m/s^2], shape (3,), and what is odd.
 
     UsdPhysics: a zero direction means down, a negative infinite magnitude means earth's; units are stage lengths.
     """
-    direction, magnitude = -up, STANDARD_GRAVITY
+    direction, magnitude, notices = -up, STANDARD_GRAVITY, []
     scenes = (UsdPhysics.Scene(prim) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL))
     physics = next((scene for scene in scenes if scene), None)
     if physics is not None:
-        authored = np.array(physics.GetGravityDirectionAttr().Get() or Gf.Vec3f(0.0), dtype=np.float64)
-        length = float(np.linalg.norm(authored))
-        direction = authored / length if math.isfinite(length) and length > 0 else direction
-        strength = physics.GetGravityMagnitudeAttr().Get()
-        magnitude = strength * metres if strength is not None and strength >= 0 else magnitude
-    return direction * magnitude
+        towards, strength = physics.GetGravityDirectionAttr().Get(), physics.GetGravityMagnitudeAttr().Get()
+        length = float(np.linalg.norm(np.array(towards, float))) if isinstance(towards, Gf.Vec3f) else math.nan
+        number = strength if isinstance(strength, int | float) else math.nan
+        direction = np.array(towards, dtype=np.float64) / length if 0 < length < math.inf else direction
+        magnitude = number * metres if 0 <= number < math.inf else magnitude
+        odd = {"Direction": (towards, length < math.inf), "Magnitude": (strength, number < math.inf)}
+        notices = [
+            Notice(str(physics.GetPath()), None, f"physics:gravity{name} is {in_brief(value)}; the earth's is assumed")
+            for name, (value, usable) in odd.items()
+            if not usable and value is not None
+        ]
+    return direction * magnitude, notices
 
 
 def list_meshes(stage: Usd.Stage) -> tuple[str, ...]:
@@ -245,7 +266,7 @@ def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[Comp
         asset = re.search(r"(?:load sublayer|open asset) @([^@]+)@", message)
         exists = asset is not None and bool(Ar.GetResolver().Resolve(asset.group(1)))
         found[message] = CompositionProblem(
-            "" if path == "/" else path or "", message, not (exists or "ycle" in message)
+            "" if path == "/" else path or "", in_brief(message), not (exists or "ycle" in message)
         )
     return list(found.values())
 

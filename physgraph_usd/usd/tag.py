@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pxr import Sdf, Usd, UsdGeom
 
-from ..colliders.pose import SIDES
 from ..errors import StageError, UsageError
 from ..fabric import PRESETS, Fabric
+from ..sides import SIDES
 from .atomic import prepare_target
 from .find import find_colliders, find_garments
 from .provenance import export_layer, relative_path, root_over

@@ -12,10 +12,12 @@ from pxr import Sdf, Tf, Usd
 from ..errors import LayerError
 from . import layer_rules
 from .provenance import read_record, root_over
-from .rules import RULES, Fine, Problem
-from .stage import reason_of
+from .rules import RULES, Fine, Problem, subsets
+from .stage import pxr_errors, reason_of
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
+_COUNTS = "InvalidSubsetFamily"
+"""USD's rule whose message lists indices: the same fault reads otherwise on the fine mesh."""
 
 
 def validate_layer(path: str | Path, shot: str | Path | None = None) -> list[Problem]:
@@ -29,17 +31,18 @@ def validate_layer(path: str | Path, shot: str | Path | None = None) -> list[Pro
         Problems, errors first; each names its path and time.
 
     Raises:
-        LayerError: The layer or the shot cannot be opened.
+        LayerError: The layer or the shot cannot be opened or read.
     """
     layer = _open(Path(path))
     below = shot if shot is not None else _recorded_shot(layer)
     root = None if below is None else _open(Path(below))
-    problems = check_layer(layer, root)
-    if root is None:
-        said = "the shot is not where the record says; only the layer itself was checked"
-        problems.append(Problem("warning", "/", None, said, "record"))
-    elif not any(problem.rule == "composition" for problem in problems):
-        problems += _own_validators(layer, root)
+    with pxr_errors(f"cannot read {path} over {below}", LayerError):
+        problems = check_layer(layer, root)
+        if root is None:
+            said = "the shot is not where the record says; only the layer itself was checked"
+            problems.append(Problem("warning", "/", None, said, "record"))
+        elif not any(problem.rule == "composition" for problem in problems):
+            problems += _own_validators(layer, root)
     return sorted(problems, key=lambda problem: problem.severity != "error")
 
 
@@ -72,21 +75,28 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
         if fault:
             problems.append(Problem("error", path, None, fault, "composition"))
             continue
-        problems += _check_garment(composed.GetPrimAtPath(path), layer, samples)
         coarse = alone.GetPrimAtPath(_coarse_path(layer, path))
+        problems += _check_garment(composed.GetPrimAtPath(path), layer, samples, coarse=coarse)
         if coarse:
             problems += _named("against_shot", layer_rules.against_shot(layer, coarse, Sdf.Path(path)))
     return problems
 
 
-def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None) -> Iterator[Problem]:
-    """Run the rules for one garment."""
+def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coarse: Usd.Prim) -> Iterator[Problem]:
+    """Run the rules for one garment; subsets that break a rule in the shot already are its own, and only told."""
     written = list(layer.ListTimeSamplesForPath(prim.GetPath().AppendProperty("points")))
     if samples is not None and len(written) > samples:
         written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
     fine = Fine(prim, layer, (None, *written))
+    of_the_shot = bool(coarse) and any(subsets(Fine(coarse, layer, (None,))))
     for rule in RULES:
-        yield from _named(rule.__name__, rule(fine))
+        for problem in _named(rule.__name__, rule(fine)):
+            told = rule is subsets and of_the_shot
+            yield (
+                replace(problem, severity="warning", message=f"{problem.message}; so it is in the shot")
+                if told
+                else problem
+            )
 
 
 def _named(rule: str, problems: Iterable[Problem]) -> Iterator[Problem]:
@@ -145,7 +155,13 @@ def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
     composed = Usd.Stage.Open(root_over(shot, [layer.identifier, shot.identifier]))
     after = _findings(UsdValidation, validators, composed)
     fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
-    new = [problem for key, problem in after.items() if _on_coarse(key, fine) not in before]
+    sites = {key[:2] for key in before}
+    new = [
+        problem
+        for key, problem in after.items()
+        if _on_coarse(key, fine) not in before
+        and not (problem.rule.endswith(_COUNTS) and _on_coarse(key, fine)[:2] in sites)
+    ]
     return [problem for problem in new if not _is_meant(problem, fine)]
 
 
@@ -157,8 +173,12 @@ def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]
 
 
 def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
-    """Whether a finding is what we did on purpose: skinning is taken off, its coarse properties stay below."""
-    return problem.path in fine and problem.rule.endswith("MissingSkelBindingAPI")
+    """Whether a finding is what we did on purpose.
+
+    Skinning is taken off, its coarse properties stay below; a family whose faces were all left out has none.
+    """
+    emptied = problem.rule.endswith(_COUNTS) and "No indices in family" in problem.message
+    return problem.path in fine and (emptied or problem.rule.endswith("MissingSkelBindingAPI"))
 
 
 def _findings(module: object, validators: list, stage: Usd.Stage) -> dict[tuple[str, str, str], Problem]:

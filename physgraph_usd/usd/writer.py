@@ -26,7 +26,7 @@ from .material_opinions import author_used_values
 from .normals import VertexNormals
 from .primvars import carry_primvars, carry_subsets
 from .reader import Shot
-from .stage import Notice
+from .stage import Notice, pxr_errors
 from .stream import LayerStream
 from .track import PointTrack
 from .validate import check_layer
@@ -95,8 +95,9 @@ class LayerWriter:
         times = self._shot.scene.times
         span = (times[0], times[-1]) if times else None
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
-        for index, steps in enumerate(refinements):
-            self._author_garment(index, steps, span)
+        with pxr_errors(f"cannot read {self._shot.path}"):
+            for index, steps in enumerate(refinements):
+                self._author_garment(index, steps, span)
         shot_path = provenance.relative_path(self._shot.path, self._stream.target.parent)
         garments = [str(path) for path in self.targets]
         record = {"shot": shot_path, "mode": self._mode, **self._record, "garments": garments}
@@ -210,7 +211,8 @@ class LayerWriter:
 
     def _check_written(self) -> None:
         """Validate the first, middle and last sample of what was written."""
-        problems = check_layer(self._stream.layer, self._shot.stage.GetRootLayer(), samples=3)
+        with pxr_errors(f"cannot read {self._shot.path} under the layer written", LayerError):
+            problems = check_layer(self._stream.layer, self._shot.stage.GetRootLayer(), samples=3)
         errors = [problem for problem in problems if problem.severity == "error"]
         if errors:
             raise LayerError(f"the layer written is invalid ({len(errors)} problems); first: {errors[0]}")

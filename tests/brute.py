@@ -1,0 +1,124 @@
+"""Proximity and crossings of small meshes, pair by pair in numpy: independent of the package's own queries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from physgraph_usd.level import Level
+
+
+@dataclass(frozen=True, eq=False)
+class Soup:
+    """A level's elements as arrays of numpy.
+
+    Attributes:
+        x: Positions, rounded as the package's hierarchy rounds them, shape (V, 3).
+        edges: Shape (E, 2).
+        faces: Shape (F, 3).
+        garment: Of each vertex, shape (V,).
+    """
+
+    x: np.ndarray
+    edges: np.ndarray
+    faces: np.ndarray
+    garment: np.ndarray
+
+    @staticmethod
+    def of(level: Level, x: object) -> Soup:
+        """The elements of a level at positions."""
+        rounded = np.asarray(x).astype(np.float32).astype(np.float64)
+        arrays = (np.asarray(each).astype(np.int64) for each in (level.edges, level.triangles, level.vertex_garment))
+        return Soup(rounded, *arrays)
+
+
+def crossing_points(x: np.ndarray, edges: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges that pass through faces with which they share no vertex: numbers of both, and where, shape (N, 3)."""
+    found: list[tuple[np.ndarray, ...]] = []
+    p, q, r = (x[faces[:, i]] for i in range(3))
+    for number, (a, b) in enumerate(edges):
+        along = x[b] - x[a]
+        matrix = np.stack([q - p, r - p, np.broadcast_to(-along, p.shape)], axis=2)
+        det = np.linalg.det(matrix)
+        safe = np.abs(det) > 1e-18
+        u, v, t = np.full((3, len(faces)), -1.0)
+        u[safe], v[safe], t[safe] = np.linalg.solve(matrix[safe], (x[a] - p[safe])[:, :, None])[:, :, 0].T
+        through = (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
+        which = np.flatnonzero(through & ~((faces == a) | (faces == b)).any(axis=1))
+        found.append((np.full(len(which), number), which, x[a] + t[which, None] * along))
+    edge, face, point = (np.concatenate(part) for part in zip(*found, strict=True))
+    return edge, face, point
+
+
+def crossings(soup: Soup, meets: np.ndarray | None = None) -> set[tuple[int, int]]:
+    """Pairs of an edge and a face that it passes through, of garments that feel one another."""
+    edge, face, _ = crossing_points(soup.x, soup.edges, soup.faces)
+    if meets is not None:
+        felt = meets[soup.garment[soup.edges[edge, 0]], soup.garment[soup.faces[face, 0]]]
+        edge, face = edge[felt], face[felt]
+    return set(zip(edge.tolist(), face.tolist(), strict=True))
+
+
+def between(x: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> int:
+    """Number of edges of each garment that pass through faces of any other."""
+    total = 0
+    for a in range(len(x)):
+        edges = np.unique(np.sort(faces[a][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        for b in range(len(x)):
+            if a != b:
+                both = np.concatenate([x[a], x[b]])
+                total += len(crossing_points(both, edges, faces[b] + len(x[a]))[0])
+    return total
+
+
+def contour_length(soup: Soup) -> float:
+    """Length of the lines along which faces that share no vertex pass through one another."""
+    edge, face, point = crossing_points(soup.x, soup.edges, soup.faces)
+    ends: dict[tuple[int, int], list[np.ndarray]] = {}
+    for e, f, where in zip(edge, face, point, strict=True):
+        owners = np.flatnonzero((np.isin(soup.faces, soup.edges[e])).sum(axis=1) == 2)
+        for owner in owners:
+            if not np.isin(soup.faces[owner], soup.faces[f]).any():
+                ends.setdefault((min(owner, f), max(owner, f)), []).append(where)
+    return float(sum(np.linalg.norm(pair[0] - pair[1]) for pair in ends.values() if len(pair) == 2))
+
+
+def on_segments(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Place along segments that is closest to points, 0 to 1."""
+    along = b - a
+    return (((p - a) * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-300)).clip(0.0, 1.0)
+
+
+def on_triangles(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Closest points of triangles to points: inside where the foot is, else on the best side."""
+    normal = np.cross(b - a, c - a)
+    size = (normal**2).sum(axis=-1)
+    foot = p - ((p - a) * normal).sum(axis=-1, keepdims=True) / size[..., None] * normal
+    inside = np.ones(size.shape, bool)
+    best, least = foot, np.full(size.shape, np.inf)
+    for u, v in ((a, b), (b, c), (c, a)):
+        inside &= (np.cross(v - u, foot - u) * normal).sum(axis=-1) >= 0
+        there = u + on_segments(u, v, p)[..., None] * (v - u)
+        distance = np.linalg.norm(there - p, axis=-1)
+        nearer = distance < least
+        best, least = np.where(nearer[..., None], there, best), np.where(nearer, distance, least)
+    return np.where(inside[..., None], foot, best)
+
+
+def between_edges(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places along two lines where they are closest, unclamped, by least squares; nan for parallel ones."""
+    u, v, w = b - a, d - c, a - c
+    uu, uv, vv = ((i * j).sum(axis=-1) for i, j in ((u, u), (u, v), (v, v)))
+    wu, wv = (w * u).sum(axis=-1), (w * v).sum(axis=-1)
+    det = uu * vv - uv * uv
+    det = np.where(det > 1e-10 * uu * vv, det, np.nan)
+    return (uv * wv - vv * wu) / det, (uu * wv - uv * wu) / det
+
+
+def beside(soup: Soup) -> np.ndarray:
+    """Which vertices are the same or joined by an edge, shape (V, V)."""
+    out = np.eye(len(soup.x), dtype=bool)
+    out[soup.edges[:, 0], soup.edges[:, 1]] = out[soup.edges[:, 1], soup.edges[:, 0]] = True
+    return out

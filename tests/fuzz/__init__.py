@@ -1,0 +1,1 @@
+"""Mutates stages and sees that every mutant ends in a valid layer or an error of our tree: ``python -m tests.fuzz``."""

@@ -1,0 +1,168 @@
+"""The sound shots that mutants are made from: small, and between them they use all that a shot may have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+from stages import (
+    COLLIDER_API,
+    add_sheet,
+    add_skeleton,
+    author,
+    bind_skin,
+    clip_shot,
+    instanced_shot,
+    new_stage,
+    save,
+    sheet_points,
+    vec3,
+)
+
+SIZE = (3, 2)
+TIMES = (1.0, 2.0)
+METRES = 0.05
+CLOTH = "/World/cloth"
+
+
+def _plain(folder: Path) -> None:
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    add_sheet(stage, CLOTH, times=TIMES, size=SIZE)
+    save(stage)
+
+
+def _still(folder: Path) -> None:
+    stage = new_stage(folder / "shot.usda", metres=METRES, up="Z")
+    add_sheet(stage, CLOTH, times=(), size=SIZE, kind="mixed")
+    save(stage)
+
+
+def _dressed(folder: Path) -> None:
+    """Primvars of every interpolation, subsets, a material, painted values, animated parents and stale opinions."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    rig = UsdGeom.Xform.Define(stage, "/World/rig")
+    for time in TIMES:
+        UsdGeom.XformCommonAPI(rig).SetTranslate((time, 0.0, 0.0), time)
+    mesh = add_sheet(stage, "/World/rig/cloth", times=TIMES, size=SIZE)
+    prim, count, faces = mesh.GetPrim(), len(sheet_points(None, SIZE)), SIZE[0] * SIZE[1]
+    make, types = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar, Sdf.ValueTypeNames
+    uv = make("st", types.TexCoord2fArray, "faceVarying")
+    uv.Set(Vt.Vec2fArray.FromNumpy(np.random.default_rng(0).random((4 * faces, 2), dtype=np.float32)))
+    uv.SetIndices(Vt.IntArray.FromNumpy(np.arange(4 * faces, dtype=np.int32)))
+    make("heat", types.FloatArray, "vertex").Set(Vt.FloatArray([0.5] * count))
+    make("label", types.StringArray, "uniform").Set([f"f{face}" for face in range(faces)])
+    make("rest", types.Point3fArray, "vertex").Set(vec3(sheet_points(None, SIZE)))
+    for name in ("pin", "bendScale", "guideScale"):
+        make(f"physgraph:{name}", types.FloatArray, "vertex").Set(Vt.FloatArray([0.25] * count))
+    author(prim, "physgraph:material:bendStiffness", 1e-5)
+    author(prim, "physgraph:guide:stiffness", 1500.0, time=1.0)
+    author(prim, "physgraph:guide:stiffness", 2500.0, time=2.0)
+    material = UsdShade.Material.Define(stage, "/World/Looks/red")
+    author(material.GetPrim(), "physgraph:material:density", 0.2)
+    binding = UsdShade.MaterialBindingAPI.Apply(prim)
+    binding.Bind(material)
+    for name, members in (("front", range(faces // 2)), ("back", range(faces // 2, faces))):
+        binding.CreateMaterialBindSubset(name, list(members))
+    mesh.CreateNormalsAttr([(0, 0, 1)] * count)
+    mesh.CreateHoleIndicesAttr([1])
+    mesh.CreateCreaseIndicesAttr([0, 1])
+    mesh.CreateCreaseLengthsAttr([2])
+    mesh.CreateCreaseSharpnessesAttr([2.0])
+    author(prim.GetParent(), "extentsHint", Vt.Vec3fArray([(0, 0, 0), (1, 1, 1)]), kind="float3[]")
+    save(stage)
+
+
+def _bodies(folder: Path) -> None:
+    """A sheet over one collider of each kind, one of them by UsdPhysics, and a physics scene."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    cloth = add_sheet(stage, CLOTH, times=TIMES, size=SIZE)
+    scene = UsdPhysics.Scene.Define(stage, "/World/physics")
+    scene.CreateGravityMagnitudeAttr(9.81 / METRES)
+    scene.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
+    body = add_sheet(stage, "/World/floor", times=TIMES, size=SIZE, tagged=False, kind="triangles")
+    UsdGeom.XformCommonAPI(body).SetTranslate((0.1, 0.1, -0.2))
+    body.GetPrim().AddAppliedSchema(COLLIDER_API)
+    for index, kind in enumerate(("Sphere", "Capsule", "Cube", "Plane", "Cylinder", "Cone")):
+        prim = stage.DefinePrim(f"/World/{kind.lower()}", kind)
+        UsdGeom.XformCommonAPI(prim).SetTranslate((0.7 * index, 1.0, -0.9))
+        prim.AddAppliedSchema(COLLIDER_API)
+        author(prim, "physgraph:collider:offset", 0.001)
+    UsdPhysics.CollisionAPI.Apply(stage.GetPrimAtPath("/World/cube"))
+    cloth.GetPrim().CreateRelationship("physgraph:colliders").SetTargets(
+        [Sdf.Path(f"/World/{name}") for name in ("floor", "sphere", "capsule", "cube", "plane", "cylinder", "cone")]
+    )
+    save(stage)
+
+
+def _skinned(folder: Path) -> None:
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    add_skeleton(stage, "/World/rig", TIMES, blend=True)
+    mesh = add_sheet(stage, "/World/rig/cloth", times=(), size=SIZE)
+    points = sheet_points(None, SIZE)
+    bind_skin(mesh, "/World/rig", joints=[int(x > 1) for x in points[:, 0]], blend=np.full_like(points, 0.01))
+    save(stage)
+
+
+def _layered(folder: Path) -> None:
+    """Geometry behind a payload, animation in a sublayer that an offset shifts."""
+    asset = new_stage(folder / "asset.usda", metres=METRES)
+    add_sheet(asset, CLOTH, times=(), size=SIZE)
+    save(asset)
+    animation = Sdf.Layer.CreateNew(str(folder / "animation.usda"))
+    points = Sdf.AttributeSpec(
+        Sdf.CreatePrimInLayer(animation, CLOTH), "points", Sdf.ValueTypeNames.Point3fArray, Sdf.VariabilityVarying
+    )
+    for time in TIMES:
+        animation.SetTimeSample(points.path, time, vec3(sheet_points(time, SIZE)))
+    animation.Save()
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    stage.GetPrimAtPath("/World").GetPayloads().AddPayload("./asset.usda")
+    stage.GetRootLayer().subLayerPaths.append("./animation.usda")
+    stage.GetRootLayer().subLayerOffsets[0] = Sdf.LayerOffset(100.0, 1.0)
+    save(stage)
+
+
+def _several(folder: Path) -> None:
+    """Two garments whose samples lie at different times, one with a triangle membrane."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    add_sheet(stage, CLOTH, times=(1.0, 2.5), size=SIZE, kind="triangles")
+    other = add_sheet(stage, "/World/other", times=(2.0,), size=SIZE, kind="ngons")
+    UsdGeom.XformCommonAPI(other).SetTranslate((10.0, 0.0, 0.0))
+    author(other.GetPrim(), "physgraph:material:shearStiffness", 9.0)
+    save(stage)
+
+
+def _instanced(folder: Path) -> None:
+    instanced_shot(folder)
+
+
+def _clips(folder: Path) -> None:
+    clip_shot(folder, TIMES)
+
+
+BASES: dict[str, Callable[[Path], None]] = {
+    "plain": _plain,
+    "still": _still,
+    "dressed": _dressed,
+    "bodies": _bodies,
+    "skinned": _skinned,
+    "layered": _layered,
+    "several": _several,
+    "instanced": _instanced,
+    "clips": _clips,
+}
+"""What writes each sound shot, ``shot.usda``, into a folder."""
+
+
+def write_bases(folder: Path) -> None:
+    """Write every sound shot into a folder of its own name."""
+    for name, write in BASES.items():
+        (folder / name).mkdir(parents=True)
+        write(folder / name)
+
+
+def garments_of(stage: Usd.Stage) -> list[Usd.Prim]:
+    """The meshes of a sound shot that have the garment schema, where it can be edited."""
+    return [prim for prim in stage.Traverse() if "PhysGraphGarmentAPI" in prim.GetPrimTypeInfo().GetAppliedAPISchemas()]

@@ -1,0 +1,7 @@
+"""Every kind of mutation; a mutant's number picks one in turn."""
+
+from __future__ import annotations
+
+from . import files, meshes, values, wholes
+
+KINDS = (*files.KINDS, *meshes.KINDS, *values.KINDS, *wholes.KINDS)

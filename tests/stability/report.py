@@ -1,0 +1,168 @@
+"""``python -m tests.stability.report``: the cases S1 to S40 by method, as a table; writes docs/stability.md.
+
+A cell says whether the case passed and what was measured. Cases that no integrator decides have one figure for all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import click
+import report_solver as solver
+import report_stages as stages
+import warp as wp
+from report_solver import Result
+
+from physgraph_usd.errors import PhysGraphError
+from physgraph_usd.integrate import METHODS
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "stability.md"
+LATER = "not yet measured: "
+BODIES = LATER + "needs contact with bodies by method"
+SELF = LATER + "needs self contact"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case.
+
+    Attributes:
+        number: 1 to 40.
+        title: What it is.
+        bound: What passes.
+        by_method: Measures one method, or None.
+        once: Measures what no method decides, or None.
+        left_out: Why it is not measured, or "".
+    """
+
+    number: int
+    title: str
+    bound: str
+    by_method: Callable[[str], Result] | None = None
+    once: Callable[[], Result] | None = None
+    left_out: str = ""
+
+
+CASES = (
+    Case(
+        1, "one triangle, one edge, no face, isolated points", "finite; isolated points stay", solver.s1_almost_nothing
+    ),
+    Case(2, "faces without area, repeated or doubled", "others move under 1 % of the displacement", solver.s2_faults),
+    Case(3, "needles of aspect 1e4", "no step over an edge", solver.s3_needles),
+    Case(4, "a fin, a bow-tie, a face wound the other way", "finite, energy falls", solver.s4_fins),
+    Case(5, "NaN in one point of one frame", "other frames to the bit", stages.s5_broken_point),
+    Case(6, "mirrored cloth", "mirrored answer to 1e-5 edges", solver.s6_mirror),
+    Case(7, "a hundredth of the size", "same shape to 1e-4 edges", solver.s7_units),
+    Case(8, "stiffness x 1e-3 to 1e3", "gap under 10 % in 200 steps", solver.s8_stiffness),
+    Case(9, "levels 0 to 3", "gap under 10 % in 200 steps", solver.s9_resolution),
+    Case(10, "a patch alone, and beside 100 times its area", "difference under 1 %", solver.s10_patch),
+    Case(11, "turned, and 3e5 m away, float32", "2e-2 edges", solver.s11_far_and_turned),
+    Case(12, "no force; weight x 1e6", "no move (1e-5 edges); finite", solver.s12_forces),
+    Case(13, "flat sheet squeezed by a tenth", "wrinkles take up half the energy", solver.s13_saddle),
+    Case(14, "a hinge at and past half a turn", "gradient to 1e-4", once=stages.s14_folds),
+    Case(15, "crumpled ball, noise of three edges", "energy / 10 in 200 steps", solver.s15_crumpled),
+    Case(16, "rest edges without length, rest points not finite", "refused by name", once=stages.s16_rest_shapes),
+    Case(17, "one pin, all pinned", "to the bit", solver.s17_pins),
+    Case(18, "open and flipped colliders", "", left_out=BODIES),
+    Case(19, "thin collider between two layers", "", left_out=BODIES),
+    Case(20, "deep start", "", left_out=BODIES),
+    Case(21, "cloth pinched between body parts", "", left_out=BODIES),
+    Case(22, "collider that swallows the cloth", "", left_out=BODIES),
+    Case(23, "vertex on the surface, or where its gradient vanishes", "", left_out=BODIES),
+    Case(24, "two sheets crossing", "", left_out=SELF),
+    Case(25, "closed contours of crossings", "", left_out=SELF),
+    Case(26, "ten stacked layers", "", left_out=SELF),
+    Case(27, "torus, funnel, spinning sphere, needles", "", left_out=SELF),
+    Case(28, "two garments with a shared seam", "", left_out=SELF),
+    Case(29, "the cage jumps 2 m or turns by half", "cold start of that frame to 1e-6 edges", solver.s29_teleport),
+    Case(30, "collider that moves five edges a frame", "", left_out=BODIES),
+    Case(31, "gaps and odd sample times", "samples at the authored times", stages.s31_times),
+    Case(32, "topology that changes", "named, other frames written", once=stages.s32_topology),
+    Case(33, "single against double precision", "1e-4 edges; CUDA in tests/test_cuda.py", solver.s33_precision),
+    Case(34, "five runs, one to four threads", "the same bytes", solver.s34_repeats),
+    Case(35, "a hundred equal frames", "the same bytes", solver.s35_frozen),
+    Case(36, "ten passes over its own output", "energy falls, changes decay", solver.s36_drift),
+    Case(37, "guarded; and adversaries under the guard", "energy never rises", solver.s37_guard, stages.s37_adversary),
+    Case(38, "constants, cantilever on three kinds of mesh", "5 %", once=stages.s38_analytic),
+    Case(39, "waves of 0.5, 1, 2, 3 and 8 edges", "warned under four edges", once=stages.s39_locking),
+    Case(40, "every force against differences of its energy", "1e-6", once=stages.s40_gradients),
+)
+
+
+def cell(measure: Callable[[], Result]) -> tuple[bool, str]:
+    """Whether a measurement passed, and its cell."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            result = measure()
+    except (PhysGraphError, RuntimeError, ValueError, ArithmeticError, LookupError) as error:
+        return False, f"**fail** {type(error).__name__}"
+    return bool(result.held), f"pass {result.figure}" if result.held else f"**fail** {result.figure}"
+
+
+def row(case: Case, names: list[str]) -> tuple[list[bool], str]:
+    """Which cells of a case passed, and its row."""
+    head = f"| S{case.number} | {case.title} | {case.bound} |"
+    if case.left_out:
+        return [], f"{head} {case.left_out} |" + " |" * len(names)
+    found = [cell(case.once)] if case.once else []
+    once = found[0][1] if found else "n/a"
+    cells = [cell(lambda name=name: case.by_method(name)) for name in names] if case.by_method else []  # type: ignore[misc]
+    shown = [text for _, text in cells] or ["n/a"] * len(names)
+    return [held for held, _ in found + cells], f"{head} {once} | {' | '.join(shown)} |"
+
+
+TEXT = """# Stability
+
+Where methods fail, case by case. Written by `python -m tests.stability.report` in {minutes:.1f} minutes ({machine};
+float64 unless a case says otherwise). The measurements are in `report_solver.py` and `report_stages.py` beside it; the
+tests in that folder hold our default, `quasi-newton`, to bounds.
+
+A cell says whether the case passed and what was measured. "all" is for what no method decides; n/a means that the case
+does not concern the column. `gd` and `adam` are guarded; `quasi-newton` and `newton` are nested, the others start at
+the finest level. {passed} of {measured} measured cells pass; {later} of 40 cases are not yet measured.
+
+{table}
+"""
+
+
+@click.command()
+@click.option("--case", "chosen", type=int, multiple=True, help="Only this case; prints, writes no page.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), default=PAGE, help="Page to write.")
+def main(chosen: tuple[int, ...], out: Path) -> None:
+    """Measure the cases S1 to S40 by method and write the table."""
+    wp.config.log_level = wp.LOG_WARNING
+    names, began = list(METHODS), time.monotonic()
+    lines = [f"| case | what | passes | all | {' | '.join(names)} |", "|---" * (4 + len(names)) + "|"]
+    every: list[bool] = []
+    for case in CASES:
+        if chosen and case.number not in chosen:
+            continue
+        start = time.monotonic()
+        with contextlib.redirect_stdout(sys.stderr):
+            held, line = row(case, names)
+        every += held
+        lines.append(line)
+        click.echo(f"{line}  {time.monotonic() - start:.1f} s", err=True)
+    table = "\n".join(lines)
+    if chosen:
+        click.echo(table)
+        return
+    figures = {"passed": sum(every), "measured": len(every), "later": sum(bool(case.left_out) for case in CASES)}
+    minutes, machine = (time.monotonic() - began) / 60.0, f"{platform.machine()}, CPU"
+    out.write_text(TEXT.format(table=table, minutes=minutes, machine=machine, **figures), encoding="utf-8")
+    click.echo(out)
+
+
+if __name__ == "__main__":
+    main()

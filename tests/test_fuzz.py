@@ -1,0 +1,117 @@
+"""A hundred and fifty mutants in this process, and the fuzzer's machinery: `python -m tests.fuzz` runs thousands."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fuzz import trial
+from fuzz.bases import BASES, write_bases
+from fuzz.files import sizes
+from fuzz.kinds import KINDS
+from fuzz.mutant import Kind, make
+from fuzz.trial import GOOD, Outcome, attempt
+from shots import faults, refine
+
+from physgraph_usd.errors import GarmentError, LayerError, SolveError
+
+ROOT = Path(__file__).resolve().parents[1]
+SAFE = [number for number in range(4 * len(KINDS)) if KINDS[number % len(KINDS)].in_process]
+PARTS = 6
+"""Mutants are tried in a few groups, so that they spread over processes and a failure names its group."""
+
+
+@pytest.fixture(scope="module")
+def bases(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bases")
+    write_bases(folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_the_shots_that_mutants_are_made_from_are_sound(bases: Path, tmp_path: Path, name: str):
+    report = refine(bases / name / "shot.usda", tmp_path / "fine.usdc")
+    assert report.exit_code == 0
+    assert faults(tmp_path / "fine.usdc", bases / name / "shot.usda") == []
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("part", range(PARTS))
+def test_mutants_end_in_a_layer_or_a_named_error(bases: Path, tmp_path: Path, part: int):
+    outcomes = [attempt(number, KINDS, bases, tmp_path / str(number)) for number in SAFE[part::PARTS]]
+    bad = [f"{each.number} {each.kind}: {each.result}\n{each.detail}" for each in outcomes if each.result not in GOOD]
+    assert not bad, "\n".join(bad)
+    assert len({each.result for each in outcomes}) > 1
+
+
+def test_a_number_is_always_the_same_mutant(bases: Path, tmp_path: Path):
+    for number in (0, 16, 21, 40):
+        one, two = (make(number, KINDS, bases, tmp_path / f"{number}{copy}")[1] for copy in "ab")
+        assert sizes(one.folder) == sizes(two.folder)
+        assert one.said == two.said
+        assert {k: v for k, v in one.options.items() if k != "root"} == {
+            k: v for k, v in two.options.items() if k != "root"
+        }
+
+
+class TestWhatItSees:
+    """The fuzzer tells each kind of bad end; without this it could not fail."""
+
+    @pytest.fixture
+    def outcome(self, bases: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        def run(end) -> Outcome:
+            monkeypatch.setattr(trial, "refine_shot", end)
+            return attempt(0, (Kind("none", lambda draft: None, ("plain",)),), bases, tmp_path / "0")
+
+        return run
+
+    def test_tracebacks(self, outcome):
+        def end(*_):
+            raise KeyError("x")
+
+        assert outcome(end).result == "traceback"
+
+    def test_files_that_are_left_after_an_error(self, outcome):
+        def end(shot: Path, out: Path, _):
+            out.write_bytes(b"half")
+            raise SolveError("no")
+
+        assert outcome(end).result == "files left"
+
+    def test_inputs_that_are_changed(self, outcome):
+        def end(shot: Path, out: Path, _):
+            shot.write_bytes(b"")
+            raise SolveError("no")
+
+        assert outcome(end).result == "input changed"
+
+    @pytest.mark.parametrize(
+        "error", [SolveError(""), LayerError("a\nb"), GarmentError("/A", "broken"), SolveError("in 'pxrInternal::X'")]
+    )
+    def test_messages_that_say_too_little(self, outcome, error: Exception):
+        def end(*_):
+            raise error
+
+        assert outcome(end).result == "poor message"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="its children are limited in memory by a Unix call")
+def test_the_command_runs_crates_in_processes_of_their_own(tmp_path: Path):
+    line = [
+        sys.executable,
+        "-m",
+        "tests.fuzz",
+        "--mutants",
+        "60",
+        "--kind",
+        "crate",
+        "--failures",
+        str(tmp_path / "bad"),
+    ]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "crate: flip bits" in done.stdout
