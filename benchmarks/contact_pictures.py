@@ -1,4 +1,4 @@
-"""The pictures of docs/contact.md: each sample about contact as its coarse input, and refined with more and more forces.
+"""The pictures of docs/contact.md: samples about contact, coarse and refined with more and more forces.
 
     python -m benchmarks.contact_pictures docs/pictures [NAME...]
 
@@ -13,8 +13,8 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,23 +29,31 @@ from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.level import build_levels, refine_garments
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.preview import label, surface_of
-from physgraph_usd.raycast import View, draw, fit_view
+from physgraph_usd.raycast import BACKGROUND, View, draw, encode_color, fit_view
 from physgraph_usd.samples import write_sample
 from physgraph_usd.scene import recentred
 from physgraph_usd.shot import prepare_device, refine_shot
 from physgraph_usd.usd.meshes import DrawnMesh, DrawnStage, refined_in
 from physgraph_usd.usd.reader import open_shot
 
-LEVEL, RUN_UP, PANEL = 2, 6, (560, 480)
-"""Subdivisions, frames solved before the one drawn, and a panel's size [pixels]."""
+LEVEL, RUN_UP = 2, 6
+"""Subdivisions, and frames solved before the one drawn."""
+PANEL, BAND, COLORS = (540, 420), 50, 144
+"""A panel's size, the height of its label [pixels], and colours in a picture."""
 FORMS = {
     "Elastic forces only": {"contact": "off", "self_contact": "off"},
     "With the body": {"self_contact": "off"},
     "With the body and itself": {},
 }
 """Titles and options of the refined panels."""
-NO_BODY = {"Elastic forces only": FORMS["Elastic forces only"], "With the other sheet and itself": {}}
-MARKS = ((0.0, (0.62, 0.62, 0.60)), (0.5, (0.90, 0.62, 0.10)), (1.0, (0.75, 0.04, 0.03)))
+NO_BODY = {
+    "Elastic forces only": FORMS["Elastic forces only"],
+    "With the spheres of the paper": {"self_contact": "paper"},
+    "With the other sheet and itself": {},
+}
+FINER = 3
+"""Samples per pixel along each axis of a section."""
+MARKS = ((0.0, (0.40, 0.40, 0.39)), (0.5, (0.80, 0.50, 0.04)), (1.0, (0.75, 0.02, 0.02)))
 """Linear colours of the heat map by value."""
 DEEPEST = 8.0
 """Depth that the heat map shows in its last colour [mm]."""
@@ -61,7 +69,8 @@ class Shown:
         size: Its extent along each axis [m].
         camera: Azimuth and elevation [degrees].
         forms: The refined panels.
-        heat: Title of the panel that is drawn once more, as a heat map; none when empty.
+        heat: Numbers of the panels that a second picture shows as heat maps.
+        section: Draw the section at the middle's z instead of the view.
     """
 
     time: float
@@ -69,16 +78,17 @@ class Shown:
     size: tuple[float, float, float]
     camera: tuple[float, float]
     forms: dict[str, dict[str, str]]
-    heat: str = ""
+    heat: tuple[int, ...] = ()
+    section: bool = False
 
 
 SHOWN = {
-    "block": Shown(12.0, (0.02, 0.24, 0.0), (0.44, 0.30, 0.4), (40.0, 22.0), FORMS),
-    "torus": Shown(20.0, (0.0, -0.05, 0.0), (0.34, 0.24, 0.34), (25.0, 30.0), FORMS),
-    "armpit": Shown(15.0, (0.22, 0.33, 0.02), (0.24, 0.26, 0.2), (20.0, 0.0), FORMS),
+    "block": Shown(12.0, (0.02, 0.25, 0.0), (0.36, 0.22, 0.3), (40.0, 22.0), FORMS),
+    "torus": Shown(20.0, (0.0, -0.05, 0.0), (0.30, 0.18, 0.28), (25.0, 30.0), FORMS),
+    "armpit": Shown(15.0, (0.205, 0.27, 0.0), (0.06, 0.30, 0.0), (0.0, 0.0), FORMS, section=True),
     "layers": Shown(8.0, (0.02, 0.97, 0.05), (0.30, 0.26, 0.2), (30.0, 8.0), FORMS),
-    "hood": Shown(12.0, (0.0, 0.15, -0.03), (0.30, 0.32, 0.3), (130.0, 12.0), FORMS),
-    "crossing": Shown(6.0, (0.0, 0.86, 0.0), (0.4, 0.4, 0.3), (70.0, 5.0), NO_BODY, "With the other sheet and itself"),
+    "hood": Shown(12.0, (0.0, 0.11, -0.06), (0.24, 0.22, 0.2), (150.0, 8.0), FORMS),
+    "crossing": Shown(6.0, (0.0, 0.84, 0.0), (0.3, 0.28, 0.2), (78.0, 2.0), NO_BODY, heat=(2, 3)),
 }
 """The pictures by sample."""
 
@@ -115,15 +125,22 @@ def picture(name: str, shown: Shown, folder: Path, out: Path) -> Path:
     meshes += [DrawnStage(shot, layer).meshes(shown.time) for layer in layers]
     titles = ["Coarse input", *shown.forms]
     notes = [_said(each) for each in measured(shot, shown.time, meshes[1:])]
-    if shown.heat:
-        which = titles.index(shown.heat)
-        titles.append("What --heat-map writes for it")
-        meshes.append(_heated(layers[which - 1], meshes[which], shown.time))
-        notes.append(notes[which])
     for title, note in zip(titles, notes, strict=True):
         say(f"{name} {shown.time:g}, {title}: {', '.join(note)}")
-    drawn = [_panel(each, garments, shown, lined=not place) for place, each in enumerate(meshes)]
+    drawn = _draw(meshes, shown, lined=garments)
+    if shown.section:
+        wider = PANEL[0] / PANEL[1] * shown.size[1] / shown.size[0]
+        titles = [f"{each}: section, {wider:.1f} times as wide" for each in titles]
     _save(out, drawn, titles, notes=notes)
+    if shown.heat:
+        heated = [meshes[0], *(_heated(layers[place - 1], meshes[place], shown.time) for place in shown.heat)]
+        drawn = _draw(heated, shown, lined=())[1:]
+        _save(
+            out.with_name("contact_heat.png"),
+            drawn,
+            [f"{titles[each]}: the heat map" for each in shown.heat],
+            notes=[notes[each] for each in shown.heat],
+        )
     return out
 
 
@@ -166,10 +183,9 @@ def measured(shot: Path, time: float, refined: Sequence[Sequence[DrawnMesh]]) ->
     return found
 
 
-def _sums(said: dict[str, object], when: str) -> dict[str, int]:
+def _sums(said: dict[str, Any], when: str) -> dict[str, int]:
     """The figures of a panel, summed over bodies; those of bodies are left out where there are none."""
     bodies, cloth = said.get("bodies"), said.get("cloth")
-    assert isinstance(bodies, dict | None) and isinstance(cloth, dict | None)
     sums = {} if bodies is None else dict.fromkeys(("inside", "pinched", "body"), 0)
     for values in (bodies or {}).values():
         for name, key in (("inside", "inside"), ("pinched", "pinched"), ("body", "crossings")):
@@ -194,9 +210,10 @@ def _heated(layer: Path, meshes: Sequence[DrawnMesh], time: float) -> list[Drawn
     stage = Usd.Stage.Open(str(layer))
     out = []
     for mesh in meshes:
-        known = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(mesh.path))
-        maps = [known.GetPrimvar(f"physgraph:{name}").Get(time) for name in ("penetration", "crossing")]
-        if any(each is not None for each in maps):
+        prim = stage.GetPrimAtPath(mesh.path)
+        if prim:
+            known = UsdGeom.PrimvarsAPI(prim)
+            maps = [known.GetPrimvar(f"physgraph:{name}").Get(time) for name in ("penetration", "crossing")]
             depth, crossing = (np.zeros(len(mesh.points)) if each is None else np.asarray(each) for each in maps)
             value = np.maximum(depth / DEEPEST, crossing)[mesh.triangles].max(axis=1).clip(0.0, 1.0)
             at, colors = zip(*MARKS, strict=True)
@@ -206,31 +223,62 @@ def _heated(layer: Path, meshes: Sequence[DrawnMesh], time: float) -> list[Drawn
     return out
 
 
-def _panel(meshes: Sequence[DrawnMesh], garments: Sequence[str], shown: Shown, *, lined: bool) -> np.ndarray:
-    """One panel's pixels."""
+def _draw(panels: Sequence[Sequence[DrawnMesh]], shown: Shown, *, lined: Sequence[str]) -> list[np.ndarray]:
+    """The pixels of each panel; edges of some meshes show in the first."""
+    if shown.section:
+        return [_section(meshes, shown) for meshes in panels]  # A slit of millimetres: across is drawn larger than up.
+    view, floor = _view(shown), min(float(mesh.points[:, 1].min()) for mesh in panels[0]) - 0.02
+    drawn = []
+    for meshes in panels:
+        surfaces = [surface_of(mesh, lined=meshes is panels[0] and mesh.path in lined) for mesh in meshes]
+        drawn.append(draw(surfaces, view, size=PANEL, floor=floor))
+    return drawn
+
+
+def _section(meshes: Sequence[DrawnMesh], shown: Shown) -> np.ndarray:
+    """Lines in which meshes meet the plane through the middle, across and up each filling the panel."""
+    size = np.array(PANEL) * FINER
+    sheet = Image.new("RGB", tuple(size.tolist()), encode_color(tuple(BACKGROUND)))
+    pen = ImageDraw.Draw(sheet)
+    low, extent = np.array(shown.middle) - 0.5 * np.array(shown.size), np.array(shown.size)
+    for mesh in meshes:
+        corners = mesh.points[mesh.triangles] - (low[0], low[1], shown.middle[2])
+        above = corners[:, :, 2] > 0.0
+        for color, triangle, side in zip(mesh.colors, corners, above, strict=True):
+            if side.any() and not side.all():
+                ends = _ends(triangle, side) / extent[:2] * size
+                place = [(float(x), float(size[1] - y)) for x, y in ends]
+                pen.line(place, fill=encode_color(tuple(0.6 * color)), width=2 * FINER)
+    return np.asarray(sheet.resize(PANEL, Image.Resampling.BOX))
+
+
+def _ends(triangle: np.ndarray, above: np.ndarray) -> np.ndarray:
+    """Where two sides of a triangle pass through z = 0, shape (2, 2)."""
+    alone = int(np.flatnonzero(above == (above.sum() == 1))[0])
+    ends = []
+    for other in {0, 1, 2} - {alone}:
+        part = triangle[alone, 2] / (triangle[alone, 2] - triangle[other, 2])
+        ends.append(triangle[alone, :2] + part * (triangle[other, :2] - triangle[alone, :2]))
+    return np.array(ends)
+
+
+def _view(shown: Shown) -> View:
+    """A camera that sees a box."""
     corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
     box = np.array(shown.middle) + corners * shown.size
-    view = fit_view(box, PANEL[0] / PANEL[1], azimuth=shown.camera[0], elevation=shown.camera[1])
-    floor = min(float(mesh.points[:, 1].min()) for mesh in meshes) - 0.02
-    return draw(_surfaces(meshes, garments, view, lined=lined), view, size=PANEL, floor=floor)
-
-
-def _surfaces(meshes: Sequence[DrawnMesh], garments: Sequence[str], view: View, *, lined: bool) -> list:
-    """The meshes ready to draw."""
-    del view
-    return [surface_of(mesh, lined=lined and mesh.path in garments) for mesh in meshes]
+    return fit_view(box, PANEL[0] / PANEL[1], azimuth=shown.camera[0], elevation=shown.camera[1])
 
 
 def _save(out: Path, drawn: Sequence[np.ndarray], titles: Sequence[str], *, notes: Sequence[Sequence[str]]) -> None:
-    """Write panels in rows of two, labelled."""
-    rows = -(-len(drawn) // 2)
-    sheet = Image.new("RGB", (2 * PANEL[0], rows * PANEL[1]), "white")
+    """Write panels in rows of two, each below its label."""
+    rows, (width, height) = -(-len(drawn) // 2), (PANEL[0], PANEL[1] + BAND)
+    sheet = Image.new("RGB", (2 * width, rows * height), "white")
     pen = ImageDraw.Draw(sheet)
     for place, pixels in enumerate(drawn):
-        corner = (place % 2 * PANEL[0], place // 2 * PANEL[1])
-        sheet.paste(Image.fromarray(pixels), corner)
-        label(pen, corner, PANEL[1], lines=[titles[place], *notes[place]])
-    sheet.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(out, optimize=True)
+        left, top = place % 2 * width, place // 2 * height
+        sheet.paste(Image.fromarray(pixels), (left, top + BAND))
+        label(pen, (left, top), height, lines=[titles[place], ", ".join(notes[place])])
+    sheet.quantize(COLORS, kmeans=4, dither=Image.Dither.NONE).save(out, optimize=True)
 
 
 if __name__ == "__main__":
