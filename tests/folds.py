@@ -92,7 +92,7 @@ def named(cloth: Cloth, name: str = "Sheet", **fields: Any) -> Garment:
     return replace(garment_of(*cloth), path=f"/World/{name}", **fields)
 
 
-def levels_of(*garments: Garment, level: int = 1, dtype: torch.dtype = torch.float32) -> list[Level]:
+def levels_of(*garments: Garment, level: int = 1, dtype: torch.dtype = torch.float32) -> tuple[Level, ...]:
     """The levels of garments solved together."""
     return build_levels(garments, refine_garments(garments, [level] * len(garments)), dtype=dtype)
 
@@ -120,7 +120,7 @@ def view_of(
     """The finest level's cloth in a frame whose upsampled cage is at given positions."""
     lasting = ClothContact(levels, garments)
     each = torch.full((len(garments),), thickness, dtype=base.dtype)
-    return ClothView(lasting, levels[-1], base, thickness=each, stiffness=stiffness)
+    return ClothView(lasting, levels[-1], base, thickness=each, settings=ContactSettings(cloth_stiffness=stiffness))
 
 
 def refiner_with(

@@ -79,7 +79,7 @@ class TestVertexFace:
         soup, rest = Soup.of(level, x), level.rest.double().numpy()
         pairs = moved(level, x).pairs(everything(level), reach(level))
         found = found_faces(soup, pairs)
-        near = beside(soup)[:, soup.faces].any(axis=2)
+        near = np.asarray(beside(soup)[:, soup.faces].any(axis=2))
         normal, tally = normals(soup), 0
         for v, point in enumerate(soup.x):
             corners = [soup.x[soup.faces[:, i]] for i in range(3)]
@@ -89,7 +89,7 @@ class TestVertexFace:
             at_rest = rest[v] - (weight[:, :, None] * rest[soup.faces]).sum(axis=1)
             distance = np.linalg.norm(way, axis=1)
             cosine = way @ normal[v] / np.maximum(distance, 1e-300)
-            same = soup.garment[v] == soup.garment[soup.faces[:, 0]]
+            same: np.ndarray = soup.garment[soup.faces[:, 0]] == soup.garment[v]
             surely = ~near[v] & ~refused(way, at_rest, cosine, same, 1e-3) & (distance < REACH - 1e-5)
             maybe = ~near[v] & ~refused(way, at_rest, cosine, same, -1e-3) & (distance < REACH + 1e-5)
             for side in (1.0, -1.0):
@@ -206,7 +206,7 @@ class TestEdgeEdge:
         assert ((0 < expected[crossed, :2]) | (np.abs(expected[crossed, :2]) < 1e-3)).all()
         keys = {frozenset(map(tuple, np.sort(row.reshape(2, 2), axis=1).tolist())) for row in corners}
         assert len(keys) == len(corners)
-        near = beside(soup)
+        near: np.ndarray = beside(soup)
         assert not near[corners[:, :2, None], corners[:, None, 2:]].any()
 
 
@@ -300,7 +300,7 @@ def test_the_vertices_opposite_an_edge_are_those_of_its_faces():
 def test_rings_grow_by_edges():
     level = levels_of(named(square(4)))[-1]
     mesh = ClothMesh(level, ALL)
-    near = beside(Soup.of(level, level.rest)).astype(int)
+    near: np.ndarray = beside(Soup.of(level, level.rest)).astype(int)
     start = torch.zeros(level.vertex_count, dtype=torch.bool)
     start[7] = True
     for rings in range(4):

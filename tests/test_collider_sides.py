@@ -15,10 +15,11 @@ from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix,
 from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.colliders.pose import SIDES, MeshPose, ShapePose
+from physgraph_usd.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.colliders.sign import signed_distances
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.shot import inspect_shot
+from physgraph_usd.sides import SIDES
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.schema import COLLIDER
 

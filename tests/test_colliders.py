@@ -63,6 +63,14 @@ class TestMeshes:
         edges = np.argwhere(near).astype(np.int32)
         np.testing.assert_array_equal(signed_by(surface, x, edges), signed_by(surface, x))
 
+    def test_between_two_parts_equally_near_is_outside(self):
+        """On the plane of symmetry of a body the pseudonormal of both closest points is none of theirs."""
+        (surface,) = surfaces(together(ball(0.1, at=(0.0, 0.11, 0.0)), ball(0.1, at=(0.0, -0.11, 0.0))))
+        x = torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.01], [0.0, 1e-6, 0.0], [0.0, 0.11, 0.0]], dtype=torch.float64)
+        assert bool((surface.closest(x[:3], endless(3)).side >= 0).all())
+        none = torch.zeros((0, 2), dtype=torch.int32)
+        assert (signed_distances(surface, x, none, reach=1.0) > 0).tolist() == [True, True, True, False]
+
     def test_a_tube_is_open_and_has_a_rim(self):
         soup = tube()
         (surface,) = surfaces(soup)

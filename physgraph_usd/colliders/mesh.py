@@ -132,13 +132,15 @@ class MeshSurface:
         """The closest points within reach [m].
 
         The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface that is right unless the face
-        is buried in another part of the surface; there it is left to `inside`. A certain surface asks `inside` for all.
+        is buried in another part of the surface, or two parts are equally near: their normals make one that is
+        neither's. There it is left to `inside`. A certain surface asks `inside` for all.
         """
         found = self._closest(self.mesh, x, reach)
         if self.certain:
             return replace(found, side=1.0 - 2.0 * self.inside(x).to(x))
         if self.closed and len(x):
-            found.side[self._is_buried(found.face)] = 0.0
+            tied = ((x - found.point) * found.normal).sum(dim=1) * found.side < 0
+            found.side[self._is_buried(found.face) | tied] = 0.0
         return found
 
     def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:

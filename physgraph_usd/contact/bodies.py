@@ -174,7 +174,7 @@ class LevelBodies:
         return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
 
     def _out(self, x: Tensor, extra: Tensor) -> tuple[Tensor, int]:
-        """Push out to the least clearance and more, body by body; returns positions and the passes made.
+        """Push out to the least clearance and more, body by body; the positions and the passes made.
 
         What bodies push to and fro until the passes end is moved by halves, and so to the middle between them.
         """

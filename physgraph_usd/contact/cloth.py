@@ -27,6 +27,8 @@ from .untangle import cut_off, gaps_out
 
 LEAST_OFFSET = 0.25
 """Part of the thickness that parts keep where the input has them closer."""
+WELDED = 0.02
+"""Part of the thickness under which the input has two points as one: a seam, which is not pushed open."""
 ZONE = 2
 """Rings round a crossing of the input within which crossings may wander."""
 SMOOTHINGS = 4
@@ -325,6 +327,7 @@ class ClothView:
         normal = torch.where(wrong.unsqueeze(1), -normal, normal)
         thickness = self._thickness[garment].mean(dim=1)
         offset = torch.minimum(thickness, torch.maximum(distance, LEAST_OFFSET * thickness))
+        offset = torch.where(distance < WELDED * thickness, torch.zeros_like(offset), offset)
         offset = torch.where(wrong & ordered, thickness, offset)
         # What is on the wrong side comes back a little each round: all at once would tear the cloth.
         most = OUT * float(self._level.spacing.mean())

@@ -178,18 +178,16 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
     best_down = wp.float32(far)
     up = wp.int32(-1)
     down = wp.int32(-1)
-    grow = wp.vec3f(far, far, far)
+    grow = wp.vec3f(far)
     query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]) - grow, wp.max(x[a], x[b]) + grow)
     f = wp.int32(0)
     while wp.mesh_query_aabb_next(query, f):
         for side in range(3):
             g = sides[f][side]
-            if g < 0 or g == e:
+            c = edges[wp.max(g, 0)][0]
+            if g < 0 or g == e or meets[garment[a] * garments + garment[c]] == 0:
                 continue
-            c, d = edges[g][0], edges[g][1]
-            if meets[garment[a] * garments + garment[c]] == 0:
-                continue
-            found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[d], 1.0e-12)
+            found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[edges[g][1]], 1.0e-12)
             s, t, distance = found[0], found[1], found[2]
             if not is_inside(s, t) or distance >= wp.max(best_up, best_down) or distance < LEAST:
                 continue

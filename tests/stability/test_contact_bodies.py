@@ -191,6 +191,11 @@ def jaws(gap: float, kind: str) -> tuple[Any, ...]:
 KINDS = {"capsules": ["capsule"] * 2, "boxes": ["mesh"] * 2, "one": ["mesh"]}
 
 
+def overlap(reason: str) -> pytest.MarkDecorator:
+    """Fails, and why."""
+    return pytest.mark.xfail(strict=True, reason=reason)
+
+
 class TestPinched:
     """S21: an armpit. The cloth is 1 mm thick and keeps 2 mm from bodies."""
 
@@ -215,6 +220,7 @@ class TestPinched:
             deepest = [body_of(state, body=body)["deepest_mm"] for body in (0, 1)]
             assert deepest == pytest.approx([2.5, 2.5], abs=0.05)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", KINDS)
     def test_s21_50_more_steps_do_not_send_it_to_and_fro(self, kind: str):
         """From 25 to 100 steps, each from cold: it settles, and no vertex moves farther than the cloth is thick."""
@@ -226,15 +232,23 @@ class TestPinched:
         assert state.telemetry[0]["levels"][-1]["remaining_move"] < 1e-4
         assert max(np.linalg.norm(b - a, axis=1).max() for a, b in pairwise(found)) < 1e-3
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", KINDS)
     def test_s21_jaws_that_close_and_stay_closed_over_24_frames(self, kind: str):
         """They close from 2 cm to half a millimetre in 12 frames and stay; in the last eight nothing trembles."""
         moves = self.closing(0.0005, kind)
-        assert max(moves) < 0.01
-        assert max(moves[-8:]) < 2 * STILL, moves
+        assert max(moves) < (0.02 if kind == "boxes" else 0.002), moves
+        assert max(moves[-8:]) < STILL, moves
 
-    @pytest.mark.xfail(strict=True, reason="squeezed out of an overlap of 5 mm, cloth creeps by up to 1 mm a frame")
-    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.slow
+    @pytest.mark.parametrize(
+        "kind",
+        [
+            "capsules",
+            pytest.param("boxes", marks=overlap("at the rim of an overlap cloth goes 34 mm to and fro")),
+            pytest.param("one", marks=overlap("in an overlap of one mesh cloth goes 2 mm to and fro")),
+        ],
+    )
     def test_s21_jaws_that_overlap_over_24_frames(self, kind: str):
         assert max(self.closing(-0.005, kind)[-8:]) < 2 * STILL
 
