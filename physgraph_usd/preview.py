@@ -141,20 +141,30 @@ def _compose(panels: list[_Panel], code: float | None, size: tuple[int, int], vi
     pen = ImageDraw.Draw(picture)
     for i, panel in enumerate(panels):
         meshes = panel.stage.meshes(code)
-        surfaces = [_surface(mesh, panel) for mesh in meshes]
+        surfaces = [surface_of(mesh, lined=panel.lined and _is_refined(mesh, panel)) for mesh in meshes]
         pixels = draw(surfaces, views[0], size=(width, size[1]), floor=views[1])
         picture.paste(Image.fromarray(pixels), (i * width, 0))
         shown = [mesh for mesh in meshes if mesh.path in panel.garments] or meshes
-        _label(pen, panel.title, shown, (i * width, size[1]))
+        count = f"{sum(len(mesh.points) for mesh in shown):,} vertices"
+        label(pen, (i * width, 0), size[1], lines=[panel.title, count])
     if code is not None:
         place = (size[0] - size[1] // 36, size[1] - size[1] // 24)
         pen.text(place, f"{code:g}", FAINT, ImageFont.load_default(max(size[1] // 40, 8)), anchor="rs")
     return picture
 
 
-def _surface(mesh: DrawnMesh, panel: _Panel) -> Surface:
-    """Prepare a mesh for drawing; edges show on the coarse side only."""
-    lined = panel.lined and (mesh.path in panel.garments or not panel.garments)
+def _is_refined(mesh: DrawnMesh, panel: _Panel) -> bool:
+    """Whether a mesh is what the picture is about; all are where none is named."""
+    return mesh.path in panel.garments or not panel.garments
+
+
+def surface_of(mesh: DrawnMesh, *, lined: bool) -> Surface:
+    """Prepare a mesh for drawing.
+
+    Args:
+        mesh: The mesh.
+        lined: Whether its edges show.
+    """
     surface = Surface(mesh.points, mesh.triangles, mesh.colors, mesh.edges if lined else None)
     while len(surface.points) < LIGHT_VERTICES and len(surface.triangles):
         surface = _split(surface)
@@ -177,16 +187,24 @@ def _split(surface: Surface) -> Surface:
     return Surface(points, quarters.reshape(-1, 3), np.repeat(surface.colors, 4, axis=0), edges)
 
 
-def _label(pen: ImageDraw.ImageDraw, title: str, meshes: list[DrawnMesh], corner: tuple[int, int]) -> None:
-    """Write a panel's title and what it shows."""
-    unit = corner[1] // 36
-    count = sum(len(mesh.points) for mesh in meshes)
+def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lines: Sequence[str]) -> None:
+    """Write a panel's title and, smaller, what it shows.
+
+    Args:
+        pen: Draws on the picture.
+        corner: The panel's left and top [pixels].
+        height: The panel's height [pixels].
+        lines: The title, empty for none, and what stands below it.
+    """
+    unit = height // 36
+    left, top = corner[0] + unit, corner[1]
+    title, *below = lines
     if title:
-        font = ImageFont.load_default(max(int(1.25 * unit), 9))
-        pen.text((corner[0] + unit, 2 * unit), title, INK, font, anchor="ls")
-    below = int((3.3 if title else 2.0) * unit)
+        pen.text((left, top + 2 * unit), title, INK, ImageFont.load_default(max(int(1.25 * unit), 9)), anchor="ls")
     font = ImageFont.load_default(max(int(0.9 * unit), 8))
-    pen.text((corner[0] + unit, below), f"{count:,} vertices", FAINT, font, anchor="ls")
+    for row, line in enumerate(below):
+        place = top + int((3.3 + 1.2 * row) * unit if title else (2.0 + 1.2 * row) * unit)
+        pen.text((left, place), line, FAINT, font, anchor="ls")
 
 
 def _save_loop(pictures: list[Image.Image], out: Path, rate: float, codes: list[float | None]) -> None:
