@@ -41,10 +41,8 @@ LEAST_STRAIN = 1e-2
 UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
-COARSE_STEPS = 4
-"""Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
-COARSE_TOLERANCE = 0.1
-"""Tolerance of a coarse level over the finest's: folds grow slowly at first, and what is not there is not refined."""
+COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
+"""Steps and tolerance of a coarse level over the finest's: coarse steps are cheap, and set the folds, which grow slow."""
 
 
 @dataclass(frozen=True)
