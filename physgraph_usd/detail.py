@@ -44,19 +44,16 @@ class Carried:
         coarse: Cage positions [m], world space.
         detail: Fine positions minus the smooth base, in the moving frames [m], shape (V, 3).
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
-        energy: Elastic energy of the result [J], summed over garments.
     """
 
     coarse: Float[Tensor, "coarse 3"]
     detail: Float[Tensor, "vertices 3"]
     frames: Float[Tensor, "coarse 3 3"]
-    energy: float = 0.0
 
 
 def join(parts: Sequence[Carried]) -> Carried:
     """What several garments carry, as one."""
-    tensors = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
-    return Carried(*tensors, energy=sum(part.energy for part in parts))
+    return Carried(*(torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames")))
 
 
 def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> list[Carried]:
@@ -67,9 +64,8 @@ def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> l
         coarse: Cage vertices of each garment.
         fine: Fine vertices of each garment.
     """
-    pairs = list(zip(coarse, fine, strict=True))
-    share = carried.energy / max(len(pairs), 1)
-    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c], share) for c, f in pairs]
+    pairs = zip(coarse, fine, strict=True)
+    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c]) for c, f in pairs]
 
 
 @dataclass(frozen=True, eq=False)

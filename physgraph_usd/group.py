@@ -33,16 +33,14 @@ from .mesh.subdivide import Refinement
 from .resolution import edge_strain, sharp_folds
 from .scene import Garment, GarmentFrame, recentred
 
-WORTH = 2.0
-"""Elastic energy of carried detail, over that of the upsampled cage and of the last result, beyond which a frame is
-cold: detail that is worth carrying takes compression up and lowers it; carried by a crumpled cage it tears cloth."""
-LEAST_STRAIN = 1e-2
-"""Strain of the whole garment under which that ratio is not looked at."""
+WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.25, 1.0
+"""A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
+upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
 UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
-"""Steps and tolerance of a coarse level over the finest's: coarse steps are cheap, and set the folds, which grow slow."""
+"""Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +157,7 @@ class Group:
             x = x if scaled else start_next
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
-        elastic = forces[-1].elastic_energy(x)
-        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames, elastic)
+        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
         telemetry = self._telemetry(module, x, coarse, reports)
         telemetry["start"] = start
         crossing = torch.zeros_like(self.levels[-1].free[:, 0])
@@ -259,14 +256,9 @@ class Group:
         finest = self.levels[-1]
         base = finest.base.apply(coarse)
         predicted = torch.where(finest.free, predicted, base)
-        carried, plain = (self._forces[-1].elastic_energy(x) for x in (predicted, base))
-        least = LEAST_STRAIN**2 * self._stretch * float(finest.vertex_area.sum())
-        usual = max(plain, least, kept.energy)
-        if carried > WORTH * usual:
-            return (
-                None,
-                f"cold: carried detail has {carried / usual:.3g} times the energy of cage and last frame",
-            )
+        carried, plain = (edge_strain(finest, x)["p99"] for x in (predicted, base))
+        if carried > min(max(WORTH * plain, LEAST_STRAIN), MOST_STRAIN):
+            return None, f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}"
         return predicted, "warm"
 
     def _contact(
@@ -352,8 +344,9 @@ class Group:
         else:
             touched = view.terms(x)
         x = leave_saddle(system(touched, x), level, x, outward=self._outward) if cold else x
+        share = None if cold else budget.steps  # A warm frame has no coarse levels that settle contact before.
         x, made, touched = solve_rounds(
-            system, integrator, x, terms=touched, view=view, level=level.index, budget=budget
+            system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, share=share
         )
         made = freed + made
         if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:

@@ -48,10 +48,6 @@ class LevelForces:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""
         return Tether(self.level, self.density, stiffness, predicted)
 
-    def elastic_energy(self, x: Float[Tensor, "vertices 3"]) -> float:
-        """Energy of the cloth itself [J]."""
-        return sum(ForceModule(self.elastic).energies(x).values())
-
 
 def build_forces(
     level: Level,

@@ -54,6 +54,7 @@ def solve_rounds(
     view: LevelContact,
     level: int,
     budget: Budget,
+    share: int | None = None,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
     """Solve one level in rounds; in one where nothing can touch.
 
@@ -65,6 +66,7 @@ def solve_rounds(
         view: The level's view of what it may touch.
         level: Index for the reports.
         budget: When to stop; its steps are shared by the rounds. What first touches at the end gets a round's more.
+        share: Steps of each round instead of its share.
 
     Returns:
         Final positions [m], a report a round, and the last round's contact terms.
@@ -73,8 +75,8 @@ def solve_rounds(
         SolveError: The energy is not finite.
     """
     reports: list[LevelReport] = []
-    left, last = budget.steps, None
-    share = -(-budget.steps // view.rounds)
+    share, last = share or -(-budget.steps // view.rounds), None
+    left = max(budget.steps, share * view.rounds) if terms else budget.steps
     kept: list[Carry] = []
     while True:
         system = make_system(terms, x)
