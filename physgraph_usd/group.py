@@ -15,13 +15,14 @@ from torch import Tensor
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.rounds import solve_rounds, untangle
+from .contact.rounds import UNTANGLINGS, WARM_UNTANGLINGS, solve_rounds, untangle
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
+from .forces.self_contact import SelfContact
 from .integrate import Method
 from .integrate.base import System
 from .integrate.metric import Metric
@@ -339,12 +340,12 @@ class Group:
             x, report = solve_level(system((), x), integrator, x, level=level.index, budget=budget)
             return x, [report], ()
         freed: list[LevelReport] = []
-        if cold and level is self.levels[0]:
-            x, freed, touched = untangle(system, integrator, x, view=view, level=level.index, budget=budget)
-        else:
-            touched = view.terms(x)
+        most = UNTANGLINGS if level is self.levels[0] else WARM_UNTANGLINGS * (not cold)
+        x, freed, touched = untangle(system, integrator, x, view=view, level=level.index, budget=budget, most=most)
         x = leave_saddle(system(touched, x), level, x, outward=self._outward) if cold else x
-        share = None if cold else budget.steps  # A warm frame has no coarse levels that settle contact before.
+        # A warm frame has no coarse levels that settle contact before; cloth on cloth settles slowly.
+        finest = level is self.levels[-1] and (not cold or any(isinstance(t, SelfContact) for t in touched))
+        share = budget.steps if finest else None
         x, made, touched = solve_rounds(
             system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, share=share
         )

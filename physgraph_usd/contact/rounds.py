@@ -17,7 +17,9 @@ from ..integrate.solve import Budget, LevelReport, solve_level
 from .frame import LevelContact, Touch
 
 UNTANGLINGS = 25
-"""Most rounds that draw out what crosses."""
+"""Most rounds that draw out what crosses from cold, at the cage."""
+WARM_UNTANGLINGS = 4
+"""The same in a frame that starts from the last one's detail, at the finest level."""
 STEPS = 4
 """Steps of each of them."""
 
@@ -30,14 +32,15 @@ def untangle(
     view: LevelContact,
     level: int,
     budget: Budget,
+    most: int,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
-    """Draw out what crosses, in rounds of few steps; nothing where nothing does.
+    """Draw out what crosses, in at most so many rounds of few steps; nothing where nothing does.
 
     Arguments and results are those of `solve_rounds`; the last result is the contact terms at the positions returned.
     """
     reports: list[LevelReport] = []
     terms = view.terms(x)
-    while view.tangled and len(reports) < UNTANGLINGS and (not reports or reports[-1].stopped != "budget"):
+    while view.tangled and len(reports) < most and (not reports or reports[-1].stopped != "budget"):
         short = replace(budget, steps=STEPS, tolerance=0.0)
         x, report = solve_level(make_system(terms, x), integrator, x, level=level, budget=short)
         reports.append(report)
