@@ -1,6 +1,6 @@
 """How still the detail is from frame to frame, and what stillness costs in energy.
 
-    python -m benchmarks.temporal
+    python -m benchmarks.temporal [SAMPLE...]
 
 The detail is the fine cloth minus the upsampled cage; its jerk is the RMS of its third difference over 24 frames, in
 mean fine edges. Energies are means over the frames, without the tether's own.
@@ -8,13 +8,16 @@ mean fine edges. Energies are means over the frames, without the tether's own.
 
 from __future__ import annotations
 
+import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.sleeve import CORES, say
+from physgraph_usd.mesh.subdivide import Refinement
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
@@ -30,7 +33,7 @@ def main() -> None:
     prepare_device("cpu")
     say("| sample | temporal | tether [1/s^2] | jerk [edges] | energy [J] |\n|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("sleeve", "skirt", "flag"):
+        for name in sys.argv[1:] or ("sleeve", "skirt", "flag", "layers"):
             shot = open_shot(write_sample(name, Path(folder)))
             for temporal, stiffness in RUNS:
                 jerk, energy = measure(shot, temporal, stiffness)
@@ -41,17 +44,32 @@ def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
     """Jerk of the detail [mean fine edges] and mean energy [J] of a shot's first frames."""
     settings = replace(RefineOptions(temporal=temporal).solve_settings(), tether=stiffness)
     refiner = Refiner(shot.scene, settings, lanes=CORES)
-    level = refiner.groups[0].levels[-1]
     details, energies = [], []
     for time in shot.scene.times[:FRAMES]:
         frame = shot.frame(time)
         state = refiner.solve(frame)
-        details.append(np.asarray(state.points[0]) - level.from_coarse @ frame.garments[0].points)
+        smooth = [
+            upsampled(chain, each.points) for chain, each in zip(refiner.refinements, frame.garments, strict=True)
+        ]
+        details.append(np.concatenate([np.asarray(p) for p in state.points]) - np.concatenate(smooth))
         entry = state.telemetry[0]
         if "energy_joules" in entry:
             energies.append(sum(entry["energy_joules"]["output"].values()))  # type: ignore[index]
     jerk = np.diff(np.array(details), 3, axis=0)
-    return float(np.sqrt((jerk**2).sum(axis=-1).mean()) / float(level.spacing.mean())), float(np.mean(energies))
+    edges = np.mean([mean_fine_edge(refiner, index) for index in range(len(shot.scene.garments))])
+    return float(np.sqrt((jerk**2).sum(axis=-1).mean()) / edges), float(np.mean(energies))
+
+
+def upsampled(chain: Sequence[Refinement], points: np.ndarray) -> np.ndarray:
+    """The cage placed linearly at the finest vertices [m]."""
+    for refinement in chain:
+        points = refinement.linear @ points
+    return points
+
+
+def mean_fine_edge(refiner: Refiner, index: int) -> float:
+    """Mean rest length of a garment's finest edges [m]."""
+    return float(refiner.groups[index].levels[-1].spacing.mean())
 
 
 if __name__ == "__main__":

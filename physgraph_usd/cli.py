@@ -11,12 +11,14 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
 
 import click
 
 from . import __version__
+from .cli_types import FrameRange, PictureSize, RefineLevel
 from .errors import PhysGraphError, UsageError
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
-EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview"}
+EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview", "matplotlib": "chart", "plotly": "chart"}
 """Which extra brings a module that only some commands need."""
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
@@ -46,54 +48,6 @@ class Commands(click.Group):
             if missing not in EXTRAS:
                 raise
             _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
-
-
-class FrameRange(click.ParamType):
-    """Time codes ``A:B``, or one time code ``A``."""
-
-    name = "A:B"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Turn the text into the first and the last time code."""
-        if isinstance(value, tuple):
-            return value
-        first, colon, last = value.partition(":")
-        try:
-            span = float(first), float(last if colon else first)
-        except ValueError:
-            self.fail(f"{value!r} is not a frame range; write A:B or A, for example 1001:1024", param, ctx)
-        if not span[0] <= span[1]:
-            self.fail(f"{value!r} ends before it starts", param, ctx)
-        return span
-
-
-class RefineLevel(click.ParamType):
-    """A number of subdivisions, or ``auto``, which is passed on as -1."""
-
-    name = "level"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Turn the text into a level."""
-        if value == "auto":
-            return -1
-        if not str(value).isdecimal():
-            self.fail(f"{value!r} is neither a whole number nor 'auto'", param, ctx)
-        return int(value)
-
-
-class PictureSize(click.ParamType):
-    """Width and height in pixels, ``1280x640``."""
-
-    name = "WxH"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Turn the text into width and height."""
-        if isinstance(value, tuple):
-            return value
-        width, _, height = value.partition("x")
-        if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-            self.fail(f"{value!r} is not a size; write WxH, for example 1280x640", param, ctx)
-        return int(width), int(height)
 
 
 def _together(*options: Decorator) -> Decorator:
@@ -139,7 +93,12 @@ layer_options = _together(
     click.option("--velocities", is_flag=True, help="Also write point velocities."),
     click.option("--heat-map", is_flag=True, help="Also write depth inside bodies and crossings as primvars."),
     click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),
-    click.option("--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write what was done as JSON."),
+    click.option(
+        "--report",
+        type=click.Path(path_type=Path),
+        metavar="FILE.json|DIR",
+        help="Write what was done; DIR: as a page.",
+    ),
     overwrite_option,
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )
@@ -174,7 +133,7 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
     """
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
     none = [None] * len(shots)
-    reports = none if report is None else _one_each(shots, report, "--report", suffix=".json")
+    reports = none if report is None else _reports(shots, report)
     roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda")
     given = {name: value for name, value in options.items() if value is not None}
     if len(shots) > 1 and given.get("workers", 1) > 1:
@@ -261,6 +220,48 @@ def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) 
     click.echo(draw(layer, out, times=times or None, **options))
 
 
+@main.command()
+@shot_argument
+@out_option("DIR", "Folder to write into; a chart that was begun there goes on.")
+@scene_options
+@click.option("--device", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--clock", type=click.Choice(["wall", "cpu"]), help="cpu: one core's own time, for busy machines.")
+@click.option("--method", "methods", multiple=True, metavar="NAME", help="Integrator to measure; repeatable.")
+@click.option(
+    "--peer", "peers", multiple=True, metavar="NAME=PYTHON", help="Solver outside, and the Python that has it."
+)
+@click.option("--count", type=click.IntRange(min=1), metavar="N", help="Frames to measure.")
+@click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="How often each time is taken.")
+@click.option("--short", is_flag=True, help="Take less than 15 minutes.")
+@click.option("--budget-minutes", type=float, metavar="M", help="Plan with this time.")
+@overwrite_option
+def chart(shot: str, out: Path, **options: Any) -> None:
+    """Measure SHOT's frames by every method, draw speed against accuracy, and print a summary."""
+    from .chart.options import ChartOptions
+    from .chart.run import chart_shot
+
+    given = {name: value for name, value in options.items() if value not in (None, ())}
+    done = chart_shot(shot, out, ChartOptions(**given, progress=_tell))
+    click.echo("\n".join(done.lines()))
+
+
+@main.command()
+@click.option(
+    "--config", "config_file", required=True, type=click.Path(path_type=Path), metavar="FILE.toml", help="What and how."
+)
+@out_option("DIR", "Folder for the log, the checkpoint, the weights and their card.")
+@click.option("--device", default="cpu", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--minutes", type=float, metavar="M", help="Train so long.  [default: the configuration's]")
+@click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
+def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
+    """Train a learned integrator and print its weights' path."""
+    from .shot import prepare_device
+    from .train.record import run_training
+
+    prepare_device(device)
+    click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))
+
+
 @main.command("schema-path")
 def schema_path() -> None:
     """Print the folder of the schemas, for PXR_PLUGINPATH_NAME."""
@@ -333,6 +334,14 @@ def _one_each(
     return files
 
 
+def _reports(shots: tuple[str, ...], to: Path) -> Sequence[Path]:
+    """One report per shot: a JSON file, or a folder with a page, inside ``to`` where there are several shots."""
+    if to.suffix == ".json" and not to.is_dir():
+        return _one_each(shots, to, "--report", suffix=".json")
+    to.mkdir(parents=True, exist_ok=True)
+    return [to] if len(shots) == 1 else _one_each(shots, to, "--report", suffix="")
+
+
 @contextmanager
 def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
     with click.progressbar(length=1, label=label, file=sys.stderr, hidden=not sys.stderr.isatty()) as bar:
@@ -342,6 +351,12 @@ def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(done - bar.pos)
 
         yield show
+
+
+def _tell(part: float, seconds: float, what: str) -> None:
+    """One line of progress on stderr."""
+    left = f"about {seconds / 60.0:.0f} min left" if seconds > 90.0 else f"about {seconds:.0f} s left"
+    click.echo(f"{part:4.0%}  {left:20s}  {what}", err=True)
 
 
 def _outline(value: Any, indent: str = "") -> Iterator[str]:

@@ -72,6 +72,23 @@ def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> l
     return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c], share) for c, f in pairs]
 
 
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """One frame of a group.
+
+    Attributes:
+        points: World positions of each garment [m].
+        carried: What the next frame needs.
+        telemetry: Plain values.
+        crossing: For each garment, which vertices belong to cloth that crosses cloth, shape (V,), bool.
+    """
+
+    points: list[np.ndarray]
+    carried: Carried
+    telemetry: dict[str, object]
+    crossing: list[np.ndarray]
+
+
 class MovingFrames:
     """The frames of one level's cage and the way from them to the fine vertices."""
 

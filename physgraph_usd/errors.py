@@ -6,6 +6,7 @@
     |   |-- GarmentError    one garment prim is broken: names prim, time code and remedy
     |   `-- SchemaError     an attribute has an unusable type or value
     |-- SolveError          the solver met a state it cannot continue from
+    |-- WeightsError        a network's weights are missing, damaged or of another version
     `-- LayerError          the output layer cannot be written or is invalid
 
 A message gives the value, the place and the choices, in one line each.
@@ -49,6 +50,10 @@ class SchemaError(StageError):
 
 class SolveError(PhysGraphError):
     """The solver met a state it cannot continue from, such as a non-finite energy."""
+
+
+class WeightsError(PhysGraphError):
+    """A network's weights are missing, damaged, or of another kind or version."""
 
 
 class LayerError(PhysGraphError):

@@ -16,8 +16,9 @@ from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
 from .contact.rounds import solve_rounds, untangle
+from .contact.seams import Seams
 from .contact.settings import ContactSettings
-from .detail import Carried, MovingFrames, Reset
+from .detail import Carried, MovingFrames, Reset, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
@@ -40,10 +41,8 @@ LEAST_STRAIN = 1e-2
 UNSETTLED = 0.1
 """Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
-COARSE_STEPS = 4
-"""Steps of a coarse level for each step of the finest: coarse steps are cheap and set the folds."""
-COARSE_TOLERANCE = 0.1
-"""Tolerance of a coarse level over the finest's: folds grow slowly at first, and what is not there is not refined."""
+COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
+"""Steps and tolerance of a coarse level over the finest's: coarse steps are cheap, and set the folds, which grow slow."""
 
 
 @dataclass(frozen=True)
@@ -71,23 +70,6 @@ class SolveSettings:
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """One frame of a group.
-
-    Attributes:
-        points: World positions of each garment [m].
-        carried: What the next frame needs.
-        telemetry: Plain values.
-        crossing: For each garment, which vertices belong to cloth that crosses cloth, shape (V,), bool.
-    """
-
-    points: list[np.ndarray]
-    carried: Carried
-    telemetry: dict[str, object]
-    crossing: list[np.ndarray]
 
 
 class Group:
@@ -200,12 +182,10 @@ class Group:
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
     ) -> dict[str, float]:
         """Energy of each term [J] at the garments' world positions [m], what touches there found anew."""
-        world = np.concatenate([frame.points for frame in frames])
-        origin, forces = world.mean(axis=0), self._forces_for(frames)
-        coarse, x = self._tensor(world - origin), self._tensor(np.concatenate(points) - origin)
-        contact = self._contact(touching, coarse, origin, frames)
+        module, contact, origin = self.potential(frames, touching)
+        x = self._tensor(np.concatenate(points) - origin)
         touched = () if contact is None else contact.at(self.levels[-1]).terms(x)
-        return ForceModule((*forces[-1].module(coarse).forces, *touched)).energies(x)
+        return ForceModule((*module.forces, *touched)).energies(x)
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
@@ -219,13 +199,29 @@ class Group:
         modules, coarse = self.modules(frames)
         parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
         return [
-            System(m, lasting.metric, free=level.free, spacing=level.spacing) for level, lasting, m in parts
+            System(m, lasting.metric, free=level.free, spacing=level.spacing, level=level)
+            for level, lasting, m in parts
         ], coarse
+
+    def use(self, settings: SolveSettings) -> None:
+        """Solve the frames that follow in another way; levels and metrics are kept."""
+        if settings.potential != self._settings.potential:
+            self._material = ()
+        self._settings = settings
+
+    def potential(
+        self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()
+    ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
+        """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
+        world = np.concatenate([frame.points for frame in frames])
+        origin = world.mean(axis=0)
+        module, coarse = self._forces_for(frames)[-1], self._tensor(world - origin)
+        return module.module(coarse), self._contact(touching, coarse, origin, frames), origin
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
-        coarse = self._tensor(np.concatenate([f.points for f in frames]))
-        coarse = coarse - coarse.mean(dim=0)
+        world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
+        coarse = self._tensor((world - world.mean(dim=0)).numpy())
         forces = self._forces_for(frames)
         return [lasting.module(coarse) for lasting in forces], coarse
 
@@ -279,7 +275,10 @@ class Group:
         """What a frame's cloth may touch, or None when there is nothing."""
         settings = self._settings.contact
         cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
-        if not len(self.levels[0].triangles) or (cloth is None and not touching):
+        if not len(self.levels[0].triangles):
+            return None
+        seams = Seams.find(self.levels[0], coarse, self._stretch) if settings.cloth != "off" else None
+        if cloth is None and not touching and seams is None:
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
         settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
@@ -287,7 +286,9 @@ class Group:
         if touching:
             bodies = FrameBodies.begin(self.levels, touching, coarse, origin=origin, settings=settings)
         thickness = [frame.fabric.thickness for frame in frames]
-        return FrameContact(self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings)
+        return FrameContact(
+            self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings, seams=seams
+        )
 
     def _descend(
         self,
@@ -336,7 +337,9 @@ class Group:
 
         def system(touched: Sequence[Touch], at: Tensor) -> System:
             held = metric if view is None else view.metric(metric, touched, at)
-            return System(ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing)
+            return System(
+                ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing, level=level
+            )
 
         integrator = self._settings.method.build()
         if view is None:
@@ -355,7 +358,7 @@ class Group:
         made = freed + made
         if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
             held = torch.stack([term.near(level) for term in touched]).any(dim=0)
-            apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing)
+            apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing, level=level)
             x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
             made.append(report)
         return x, made, touched

@@ -18,6 +18,8 @@ POTENTIALS = ("continuum", "paper")
 MODES = ("over", "sibling")
 CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
 """Forms of contact by their names on the command line."""
+REPORT_NAME = "report.json"
+"""Name of the report in a folder of its own."""
 SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
 _NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
@@ -44,7 +46,7 @@ class RefineOptions:
         contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
         self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
         workers: Processes that share the frames.
-        report: JSON file to write, or None.
+        report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
         velocities: Also write point velocities.
@@ -124,6 +126,12 @@ class RefineOptions:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
-        for file in (self.report, self.root):
+        report = None if self.report is None else json_of(Path(self.report))
+        for file in (report, self.root):
             if file is not None and not (self.overwrite or self.dry_run) and Path(file).exists():
                 raise UsageError(f"{file} exists; choose another name or allow overwriting")
+
+
+def json_of(report: Path) -> Path:
+    """The JSON file of a report: the path itself when it is named so, else in the folder of that name."""
+    return report if report.suffix == ".json" and not report.is_dir() else report / REPORT_NAME

@@ -108,6 +108,24 @@ class Refiner:
         self._last = [None] * len(self._last)
         self._time = None
 
+    def use(self, settings: SolveSettings) -> None:
+        """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
+        self._settings = settings
+        self._parts = Parts(self._scene.garments, together=settings.contact.cloth != "off")
+        for group in self._groups.values():
+            group.use(settings)
+        self.forget()
+
+    def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
+        """Numbers of the garments that are solved together in a frame."""
+        return self._parts.of(frame.garments)
+
+    def touching(self, part: tuple[int, ...], frame: Frame) -> tuple[Touching, ...]:
+        """The surfaces that garments solved together may touch in a frame."""
+        self._bodies.pose(frame.colliders)
+        frames = [frame.garments[index] for index in part]
+        return self._touching(part, frames, self._near(part, frames))
+
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
         """Solve frames in order, one state a frame.
 

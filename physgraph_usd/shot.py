@@ -21,7 +21,8 @@ from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
 from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, leave_out_what_never_was
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
-from .options import RefineOptions
+from .options import RefineOptions, json_of
+from .page.report import write_folder
 from .pipeline import Refiner
 from .report import RefineReport
 from .resolution import choose_levels, too_coarse
@@ -66,15 +67,15 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         solver = _ShotSolver(str(shot), [choice.level for choice in choices], options)
         solver.adopt(opened)
         _write_layer(opened, solver, out, options, report)
+        report.seconds["total"] = clock.perf_counter() - began
+        report.peak_memory_mb = _peak_memory_mb()
+        report.out = out
+        if options.root is not None:
+            write_root(Path(options.root), layer=out, shot=Path(shot), overwrite=options.overwrite)
+        if options.report is not None:
+            _write_report(report, Path(options.report), opened)
     finally:
         opened.close()
-    report.seconds["total"] = clock.perf_counter() - began
-    report.peak_memory_mb = _peak_memory_mb()
-    report.out = out
-    if options.root is not None:
-        write_root(Path(options.root), layer=out, shot=Path(shot), overwrite=options.overwrite)
-    if options.report is not None:
-        report.write(Path(options.report))
     return report
 
 
@@ -246,6 +247,13 @@ def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
     start = clock.perf_counter()
     writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused], heat=outcome.heat)
     return clock.perf_counter() - start
+
+
+def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
+    if json_of(path) == path:
+        report.write(path)
+    else:
+        write_folder(report, path, opened)
 
 
 def _coarse_garments(report: RefineReport) -> list[str]:

@@ -142,7 +142,7 @@ class TestSeveralShots:
         result = run("refine", "a/one.usda", "b/two.usd", "-o", tmp_path / "out", "--report", tmp_path / "reports")
         assert result.exit_code == 0
         assert [call.out.name for call in refined] == ["one.refined.usdc", "two.refined.usdc"]
-        assert [call.options.report.name for call in refined] == ["one.json", "two.json"]
+        assert [call.options.report for call in refined] == [tmp_path / "reports" / name for name in ("one", "two")]
 
     def test_equal_names_are_refused(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
         result = run("refine", "a/shot.usda", "b/shot.usda", "-o", tmp_path / "out")

@@ -62,8 +62,8 @@ def system_of(matrix: np.ndarray, *, metric: np.ndarray | None = None, fixed: tu
 
 def minimum_of(system: System) -> torch.Tensor:
     """Where a quadratic's energy is least."""
-    assert isinstance(system._field, Quadratic)
-    return system._field.minimum
+    assert isinstance(system.field, Quadratic)
+    return system.field.minimum
 
 
 def start(count: int) -> torch.Tensor:
@@ -125,7 +125,7 @@ class TestKeptToEdges:
         mesh, rest = sheet(6, 4)
         group = group_of(mesh, rest)
         level, (system, _) = group.levels[-1], finest_system(group, wave(rest))
-        field = system._field
+        field = system.field
         assert isinstance(field, ForceModule)
         edges = level.edges.numpy()
         return field.rest_matrix(), kept_to_edges(field.rest_matrix(), edges), edges
@@ -219,7 +219,7 @@ class TestQuasiNewton:
         assert all(after <= before for before, after in pairwise(seen))
         assert seen[-1] < seen[0]
 
-    @pytest.mark.parametrize("name", METHODS)
+    @pytest.mark.parametrize("name", [name for name in METHODS if name != "physgraph-paper"])  # that one needs a mesh
     def test_fixed_vertices_never_move(self, name: str):
         system = system_of(spd(12, 9.0), metric=np.eye(12), fixed=(0, 5))
         x = start(12)
@@ -351,7 +351,7 @@ def test_a_part_of_the_cloth_is_solved_while_the_rest_is_held():
     whole, x = finest_system(group_of(mesh, rest, level=1), wave(rest))
     moving = torch.zeros_like(whole.free)
     moving[: len(x) // 2] = True
-    part = System(whole._field, whole._metric, free=whole.free & moving, spacing=whole.spacing)
+    part = System(whole.field, whole.metric, free=whole.free & moving, spacing=whole.spacing, level=whole.level)
     held = ~part.free[:, 0]
     force = part.energy_and_force(x)[1]
     assert not force[held].any()

@@ -10,16 +10,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..forces.contact import Contact
+from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact, Spheres
 from ..integrate.metric import Metric
 from ..level import Level
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
+from .seams import Seams
 from .settings import ContactSettings
 
 FINISHES = 3
 """How often cloth is mended and pushed out of bodies in turn, while either undoes the other."""
-Touch = Contact | SelfContact | Spheres
+Touch = Contact | SelfContact | Spheres | Seam
 """A term that stands for something near."""
 
 
@@ -42,6 +44,7 @@ class LevelContact:
     bodies: LevelBodies | None
     cloth: ClothView | None
     rounds: int
+    seam: Seam | None = None
     _held: tuple[Tensor, Metric] | None = None
 
     def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric:
@@ -62,7 +65,7 @@ class LevelContact:
     def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
         """The forces of what is near positions x [m]; empty where nothing is."""
         parts = [part.term(x) for part in (self.bodies, self.cloth) if part is not None]
-        return tuple(term for term in parts if term is not None)
+        return tuple(term for term in (*parts, self.seam) if term is not None)
 
 
 class FrameContact:
@@ -77,6 +80,7 @@ class FrameContact:
         cloth: ClothContact | None,
         thickness: Sequence[float],
         settings: ContactSettings,
+        seams: Seams | None = None,
     ) -> None:
         """Look at the upsampled cage.
 
@@ -87,11 +91,13 @@ class FrameContact:
             cloth: The group's cloth, or None when cloth is not to touch cloth.
             thickness: Of each garment's cloth [m].
             settings: How contact is solved, with k_c itself as its stiffness.
+            seams: What the input has at one place, or None when nothing is.
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._bodies, self._cloth = bodies, cloth
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
         self._views: dict[int, LevelContact] = {}
+        self._seams = seams
 
     def at(self, level: Level) -> LevelContact:
         """The view of one level, the same at each call."""
@@ -101,7 +107,8 @@ class FrameContact:
             if self._cloth is not None:
                 base = level.base.apply(self._coarse)
                 cloth = ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings)
-            self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds)
+            seam = None if self._seams is None else self._seams.term(level, level.base.apply(self._coarse))
+            self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
         return self._views[level.index]
 
     def finish(
@@ -113,9 +120,12 @@ class FrameContact:
             Positions [m], x itself where nothing had to move; the same before bodies pushed, where the next frame
             starts: it is where forces rest, so that equal frames stay equal; and what had to move.
         """
-        view = self.at(self._levels[-1])
+        finest = self._levels[-1]
+        view = self.at(finest)
         moved: dict[str, object] = {}
         mended = None
+        if self._seams is not None:
+            x = self._seams.close(finest, finest.base.apply(self._coarse), x)
         for _ in range(FINISHES):
             x = x if view.cloth is None else view.cloth.mend(x).x
             mended = x if mended is None else mended
@@ -123,6 +133,8 @@ class FrameContact:
                 x, moved["projected"] = view.bodies.project(x)
             if view.cloth is None or view.bodies is None or not view.cloth.worse(x):
                 break
+        if self._seams is not None:
+            x = self._seams.close(finest, finest.base.apply(self._coarse), x)
         return x, x if mended is None else mended, moved
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:

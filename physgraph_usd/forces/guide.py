@@ -108,6 +108,11 @@ class Guide:
         value = np.asarray(self._map.squares @ self._coarse_weight).ravel() + self._pin_weight
         return torch.as_tensor(value, dtype=x.dtype, device=x.device)
 
+    def hessian(self) -> sp.csr_matrix:
+        """The exact scalar Hessian R^T W R + pins [N/m], shape (V, V), for solvers outside."""
+        spread = self._map.spread_matrix
+        return sp.csr_matrix(spread @ sp.diags(self._coarse_weight) @ spread.T + sp.diags(self._pin_weight))
+
     def rest_matrix(self) -> sp.csr_matrix:
         """The lumped guide [N/m]: the row sums of R^T W R on the diagonal.
 

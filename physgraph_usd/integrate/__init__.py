@@ -12,8 +12,10 @@ from ..errors import UsageError
 from .base import Integrator
 from .first_order import Adam, GradientDescent
 from .guard import Guard
+from .learned import integrator_of
 from .newton import Newton
 from .quasi_newton import QuasiNewton
+from .weights import shipped_network
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ METHODS: dict[str, Method] = {
     "adam": Method(lambda: Guard(Adam()), nested=False),
     "gd": Method(lambda: Guard(GradientDescent()), nested=False),
     "newton": Method(Newton, nested=True),
+    "physgraph": Method(lambda: Guard(integrator_of(shipped_network("physgraph"))), nested=True),
+    "physgraph-paper": Method(lambda: Guard(integrator_of(shipped_network("physgraph-paper"))), nested=False),
 }
 """Every method by its name on the command line."""
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from .metric import Metric
 
 
 @runtime_checkable
@@ -25,12 +24,69 @@ class ForceField(Protocol):
         ...
 
 
+@runtime_checkable
+class Preconditioner(Protocol):
+    """A fixed, symmetric positive definite matrix that can be solved with."""
+
+    @property
+    def diagonal(self) -> Float[Tensor, " vertices"]:
+        """Its diagonal [N/m]."""
+        ...
+
+    def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m]."""
+        ...
+
+
+@runtime_checkable
+class Surface(Protocol):
+    """What a level shows of its mesh; the fields are those of `Level`."""
+
+    @property
+    def spans(self) -> tuple[slice, ...]:
+        """Vertex range of each garment."""
+        ...
+
+    @property
+    def rest(self) -> Float[Tensor, "vertices 3"]:
+        """Rest positions [m]."""
+        ...
+
+    @property
+    def triangles(self) -> Int[Tensor, "triangles 3"]:
+        """Corner vertices."""
+        ...
+
+    @property
+    def edges(self) -> Int[Tensor, "edges 2"]:
+        """End vertices."""
+        ...
+
+    @property
+    def rest_length(self) -> Float[Tensor, " edges"]:
+        """Rest length of the edges [m]."""
+        ...
+
+    @property
+    def vertex_garment(self) -> Int[Tensor, " vertices"]:
+        """Garment number of each vertex."""
+        ...
+
+    @property
+    def lanes(self) -> int:
+        """Most threads that a kernel uses on the CPU."""
+        ...
+
+
 class System:
     """One level in one frame, as an integrator sees it.
 
     Attributes:
         free: False where a vertex may not move, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
+        level: The level's mesh; None for a system that has none.
+        field: The forces.
+        metric: H0.
         evaluations: Number of force evaluations so far.
         metric_solves: Number of metric solves so far.
     """
@@ -38,37 +94,43 @@ class System:
     def __init__(
         self,
         field: ForceField,
-        metric: Metric,
+        metric: Preconditioner,
         *,
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
+        level: Surface | None = None,
     ) -> None:
         """Join a force field with its metric and its mask."""
-        self._field, self._metric = field, metric
-        self.free, self.spacing = free, spacing
+        self.field, self.metric = field, metric
+        self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
         self.evaluations = 0
         self.metric_solves = 0
 
     def shares_metric(self, other: System) -> bool:
         """Whether what was learned of the curvature under another system holds under this one."""
-        return self._metric is other._metric
+        return self.metric is other.metric
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N]; the force on vertices that may not move is zero."""
         self.evaluations += 1
-        energy, force = self._field.energy_and_force(x)
+        energy, force = self.field.energy_and_force(x)
         return float(energy), force if self._all_free else force * self.free
 
     def apply_metric_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with."""
         self.metric_solves += 1
-        move = self._metric.solve(force)
+        move = self.metric.solve(force)
         return move if self._all_free else move * self.free
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each vertex's Hessian block [N/m], positive."""
-        return self._field.diagonal(x).clamp_min(torch.finfo(x.dtype).tiny)
+        return self.field.diagonal(x).clamp_min(torch.finfo(x.dtype).tiny)
+
+    @cached_property
+    def rest_diagonal(self) -> Float[Tensor, " vertices"]:
+        """Diagonal of H0 [N/m], positive; 1 where a vertex may not move."""
+        return self.metric.diagonal.to(self.spacing)
 
     def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
         """RMS of H0^-1 F over the free vertices, in local edge lengths."""

@@ -7,7 +7,7 @@ import math
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, Integrator, System
+from .base import Carry, Integrator, System, resumed
 from .quasi_newton import backtrack
 
 
@@ -26,6 +26,10 @@ class Guard:
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Start the wrapped integrator."""
         return self._inner.start(system, x)
+
+    def resume(self, system: System, carry: Carry) -> Carry:
+        """Go on under forces that changed a little, as the wrapped integrator can."""
+        return resumed(self._inner, system, carry)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step whose energy is not above the last one's."""

@@ -67,6 +67,12 @@ class Metric:
         springs = sp.diags(diagonal.double().cpu().numpy())
         return Metric(sp.csr_matrix(self._plain + springs), free=self._mask, dtype=self._dtype)
 
+    @property
+    def diagonal(self) -> Float[Tensor, " vertices"]:
+        """Diagonal of H0 [N/m], float64 on the CPU; 1 where a vertex may not move."""
+        diagonal = torch.as_tensor(self.matrix.diagonal() / self._scale)
+        return torch.where(self._mask.cpu().squeeze(1), diagonal, 1.0)
+
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero where a vertex may not move."""
         out = torch.empty_like(force)

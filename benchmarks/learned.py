@@ -1,0 +1,147 @@
+"""The learned integrators on garments that they were not trained on, beside nested quasi-Newton.
+
+    python -m benchmarks.learned [FILE.safetensors ...] [--fabrics jersey,denim,silk] [--cache FILE.json] [--shots ...]
+
+Two tables. The first has every shot and fabric: the gaps at two schedules. The second has one row a candidate: its gap
+over quasi-Newton's at the same number of force evaluations, the time of the same descents over quasi-Newton's, and the
+time to a gap of 3% over quasi-Newton's, as medians over shots and fabrics; on the CPU time is that of all threads
+together. Everything is guarded. Cards stand beside
+the weights (`physgraph-usd train` writes them). Samples are always there; real shots where PHYSGRAPH_DATA names their
+folder. No body pushes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from physgraph_usd.integrate.base import Integrator
+from physgraph_usd.integrate.guard import Guard
+from physgraph_usd.integrate.learned import integrator_of
+from physgraph_usd.integrate.network import PhysgraphConfig
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.integrate.weights import FOLDER, Network, load_network
+from physgraph_usd.shot import prepare_device
+
+from .unseen import FABRICS, SHOTS, Case, cases, descend
+
+SCHEDULES = ((5, 5, 5), (10, 10, 5))
+FRONT = ((5, 5, 5), (10, 10, 5), (20, 10, 5), (20, 20, 5), (40, 20, 6), (40, 40, 8), (80, 80, 12))
+"""Schedules among which the quickest to a gap of 3% is looked for."""
+ENOUGH = 0.03
+REPEATS = 2
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables."""
+    given = parsed(arguments)
+    prepare_device(given.device)
+    files = given.weights or sorted(FOLDER.glob("physgraph*.safetensors"))
+    candidates = {file: load(file, given.device) for file in files}
+    results: dict[Path, list[dict[str, float]]] = {file: [] for file in files}
+    names = [f"{file.stem}" for file in files]
+    say("| shot, fabric | vertices | quasi-Newton | " + " | ".join(names) + " |\n|---|---|---|" + "---|" * len(names))
+    options = {"shots": given.shots.split(","), "fabrics": given.fabrics.split(",")}
+    for case in cases(**options, device=given.device, cache=given.cache):
+        base = measured(case, QuasiNewton())
+        cells = []
+        for file, (network, _) in candidates.items():
+            row = compared(measured(case, Guard(integrator_of(network))), base)
+            results[file].append(row)
+            cells.append(", ".join(f"{row[f'gap {s}']:.2%}" for s in SCHEDULES) + f" ({row['corrected']:.0f})")
+        gaps = ", ".join(f"{base[f'gap {s}']:.2%}" for s in SCHEDULES)
+        say(f"| {case.name} | {case.group.levels[-1].vertex_count} | {gaps} | " + " | ".join(cells) + " |")
+    say(f"\ngaps at {' and '.join(map(str, SCHEDULES))}; in brackets steps that the guard corrected")
+    summary(candidates, results)
+
+
+def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command's options."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights", type=Path, nargs="*", help="weights; those that ship when none are named")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--fabrics", default=",".join(FABRICS))
+    parser.add_argument("--shots", default=",".join(SHOTS))
+    parser.add_argument("--cache", type=Path, default=None, help="file that keeps the least energies")
+    return parser.parse_args(arguments)
+
+
+def load(file: Path, device: str) -> tuple[Network, dict[str, Any]]:
+    """Weights and their card."""
+    card = file.with_suffix(".json")
+    about = json.loads(card.read_text(encoding="utf-8")) if card.exists() else {}
+    kind = about.get("kind") or ("physgraph-paper" if "paper" in file.stem else "physgraph")
+    return load_network(file, kind=kind, device=device), about
+
+
+def measured(case: Case, integrator: Integrator) -> dict[str, float]:
+    """Gaps, times and corrections of a method on a case."""
+    found: dict[str, float] = {"corrected": 0.0, "reached": float("inf")}
+    for steps in dict.fromkeys((*SCHEDULES, *FRONT)):
+        if found["reached"] < float("inf") and steps not in SCHEDULES:
+            continue
+        runs = [descend(case.group, case.systems, case.coarse, integrator, steps=steps) for _ in range(REPEATS)]
+        gap, spent = case.gap(runs[0].energy), statistics.median(run.milliseconds for run in runs)
+        if steps in SCHEDULES:
+            found |= {f"gap {steps}": gap, f"ms {steps}": spent}
+            found["corrected"] += sum(n for mover, n in runs[0].movers.items() if mover != integrator.name)
+        if gap <= ENOUGH:
+            found["reached"] = min(found["reached"], spent)
+    return found
+
+
+def compared(ours: dict[str, float], theirs: dict[str, float]) -> dict[str, float]:
+    """Our figures with their ratios to another's."""
+    ratios = {
+        f"{kind} ratio {s}": ours[f"{kind} {s}"] / theirs[f"{kind} {s}"] for kind in ("gap", "ms") for s in SCHEDULES
+    }
+    return ours | ratios | {"reach ratio": ours["reached"] / theirs["reached"]}
+
+
+def summary(
+    candidates: dict[Path, tuple[Network, dict[str, Any]]], results: dict[Path, list[dict[str, float]]]
+) -> None:
+    """Print one row a candidate."""
+    head = ["weights", "hash", "network", "seed", "minutes", "patches"]
+    head += [f"gap ratio {s}" for s in SCHEDULES] + [f"ms ratio {s}" for s in SCHEDULES] + ["ms to 3%, ratio"]
+    say("\n| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+    for file, (network, card) in candidates.items():
+        rows = results[file]
+        if not rows:
+            continue
+        config = card.get("config", {})
+        cells = [file.stem, str(card.get("sha256", "-"))[:8], in_words(network), str(config.get("seed", "-"))]
+        cells += [str(card.get("minutes", "-")), str(config.get("patches", {}).get("count", "-"))]
+        cells += [
+            f"{statistics.median(row[f'{kind} ratio {s}'] for row in rows):.2f}"
+            for kind in ("gap", "ms")
+            for s in SCHEDULES
+        ]
+        reached = [row["reach ratio"] for row in rows if row["reach ratio"] == row["reach ratio"]]
+        cells.append(f"{statistics.median(reached):.2f} ({len(reached)})" if reached else "-")
+        say("| " + " | ".join(cells) + " |")
+    say(f"\nmedians over {max(map(len, results.values()), default=0)} shots and fabrics")
+
+
+def in_words(network: Network) -> str:
+    """Vectors, width and rounds."""
+    config = network.config
+    if isinstance(config, PhysgraphConfig):
+        extras = "".join(f", {name}" for name in ("strain", "means") if getattr(config, name))
+        return f"{' '.join(config.vectors)}; W={config.width}, M={config.rounds}{extras}"
+    return f"latent {config.latent}, M={config.rounds}, H={config.history}, {config.features} features"
+
+
+def say(line: str) -> None:
+    """Write a line to standard output."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

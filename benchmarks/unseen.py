@@ -1,0 +1,197 @@
+"""Garments that no network was trained on, the energies between which they move, and descents through their levels."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from physgraph_usd.fabric import PRESETS
+from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.integrate import method_named
+from physgraph_usd.integrate.base import Carry, Integrator, System
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.integrate.saddle import leave_saddle
+from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.level import refine_garments
+from physgraph_usd.samples import write_sample
+from physgraph_usd.scene import Garment, GarmentFrame
+from physgraph_usd.usd.reader import open_shot
+
+SHOTS: dict[str, tuple[str, float | None]] = {
+    "sleeve": ("", None),
+    "tshirt": ("", None),
+    "flag": ("", 12.0),
+    "skirt": ("", None),
+    "swatch": ("", None),
+    "01_newton_shirt_dab_cm.usdc": ("/shot/char/shirt_geo", 1030.0),
+    "02_makehuman_usdskel_dm.usdc": ("/shot/char/shorts", 30.0),
+    "06_torus_pull.usda": ("/shot/cloth", 30.0),
+    "09_cesiumman_kilt/shot.usda": ("/shot/kilt", 24.0),
+}
+"""Samples and, where the folder of real assets is there, shots: garment and time code (None: the last)."""
+FABRICS = ("jersey", "denim", "silk")
+LEVEL = 2
+REFERENCE = ((150, 150, 200), (40, 80, 200))
+"""Nested quasi-Newton in float64 behind the least energy known."""
+LANES = os.cpu_count() or 1
+
+
+@dataclass(eq=False)
+class Case:
+    """One garment in one frame and one fabric.
+
+    Attributes:
+        name: Shot and fabric.
+        group: Its levels, float32.
+        frame: Its pose and fabric.
+        systems: One a level.
+        coarse: Recentred cage [m].
+        start: Energy of the upsampled cage [J].
+        least: Least energy known [J].
+    """
+
+    name: str
+    group: Group
+    frame: GarmentFrame
+    systems: list[System]
+    coarse: torch.Tensor
+    start: float
+    least: float
+
+    def gap(self, energy: float) -> float:
+        """(Phi - Phi*) / (Phi0 - Phi*)."""
+        return (energy - self.least) / (self.start - self.least)
+
+
+def cases(
+    *,
+    shots: Sequence[str] = tuple(SHOTS),
+    fabrics: Sequence[str] = FABRICS,
+    device: str = "cpu",
+    cache: Path | None = None,
+    level: int = LEVEL,
+) -> Iterator[Case]:
+    """Cases one after another; real shots are left out where they are not there.
+
+    Args:
+        shots: Names out of `SHOTS`.
+        fabrics: Presets.
+        device: "cpu" or "cuda".
+        cache: JSON file that keeps the least energies, or None.
+        level: Subdivisions.
+    """
+    known: dict[str, float] = json.loads(cache.read_text()) if cache and cache.exists() else {}
+    for name in shots:
+        opened = _opened(name)
+        if opened is None:
+            continue
+        garment, gravity, points = opened
+        for fabric in fabrics:
+            frame = replace(points, fabric=PRESETS[fabric])
+            label = f"{name.partition('/')[0].partition('.')[0]}, {fabric}"
+            single, double = (
+                _group(garment, gravity, d, level=level, device=device) for d in (torch.float32, torch.float64)
+            )
+            key = f"{label}, level {level}"
+            if key not in known:
+                known[key] = least_of(double, frame)
+                if cache:
+                    cache.write_text(json.dumps(known, indent=1))
+            systems, coarse = single.systems([frame])
+            start = systems[-1].energy_and_force(single.levels[-1].base.apply(coarse))[0]
+            yield Case(label, single, frame, systems, coarse, start, known[key])
+
+
+def least_of(group: Group, frame: GarmentFrame) -> float:
+    """The least energy of some long nested solves [J]."""
+    systems, coarse = group.systems([frame])
+    return min(descend(group, systems, coarse, QuasiNewton(), steps=steps).energy for steps in REFERENCE)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What a descent came to.
+
+    Attributes:
+        energy: [J].
+        milliseconds: Time of the steps: wall time on CUDA; on the CPU that of all threads together, which other work on
+            the machine does not lengthen.
+        evaluations: Force evaluations.
+        movers: Steps by who made them.
+        x: Positions [m].
+    """
+
+    energy: float
+    milliseconds: float
+    evaluations: int
+    movers: dict[str, int]
+    x: torch.Tensor
+
+
+def descend(
+    group: Group, systems: Sequence[System], coarse: torch.Tensor, integrator: Integrator, *, steps: Sequence[int]
+) -> Descent:
+    """Walk the levels with so many force evaluations at each, the one at its start not counted.
+
+    The upsampled cage is taken off its saddle first, as the solver does it; that is not counted either.
+    """
+    x = group.levels[-len(steps)].base.apply(coarse)
+    energy, spent, evaluations = math.inf, 0.0, 0
+    movers: dict[str, int] = {}
+    clock = time.perf_counter if x.is_cuda else time.process_time
+    for level, system, count in zip(group.levels[-len(steps) :], systems[-len(steps) :], steps, strict=True):
+        x = x if level.from_below is None or x.shape[0] == level.vertex_count else level.from_below.apply(x)
+        x = leave_saddle(system, level, x, outward=torch.ones(1, device=x.device))
+        before, began = system.evaluations, clock()
+        carry = integrator.start(system, x)
+        while system.evaluations - before <= count and carry.mover != "stayed":
+            carry = integrator.step(system, carry)
+            movers[carry.mover] = movers.get(carry.mover, 0) + 1
+        if x.is_cuda:
+            torch.cuda.synchronize()
+        spent += clock() - began
+        evaluations += system.evaluations - before
+        x, energy = carry.x, carry.energy
+    return Descent(energy, 1e3 * spent, evaluations, movers, x)
+
+
+def history(system: System, integrator: Integrator, x: torch.Tensor, steps: int) -> list[float]:
+    """Energies of so many steps at one level, the start first [J]."""
+    energies: list[float] = []
+
+    def observe(carry: Carry) -> None:
+        energies.append(carry.energy)
+
+    solve_level(system, integrator, x, level=0, budget=Budget(steps), observe=observe)
+    return energies
+
+
+def _opened(name: str) -> tuple[Garment, np.ndarray, GarmentFrame] | None:
+    """Garment, gravity and frame of a shot, or None where it is not there."""
+    prim, time_code = SHOTS[name]
+    with tempfile.TemporaryDirectory() as folder:
+        if prim:
+            data = Path(os.environ.get("PHYSGRAPH_DATA", "../shared/data")) / "shots" / name
+            if not data.exists():
+                return None
+            shot = open_shot(str(data), garments=[prim])
+        else:
+            shot = open_shot(str(write_sample(name, Path(folder))))
+        frame = shot.frame(time_code if time_code is not None else shot.scene.times[-1])
+        garment = shot.scene.garments[0]
+        return replace(garment, colliders=()), shot.scene.gravity, frame.garments[0]
+
+
+def _group(garment: Garment, gravity: np.ndarray, dtype: torch.dtype, *, level: int, device: str) -> Group:
+    settings = SolveSettings(method_named("quasi-newton"))
+    chains = refine_garments([garment], [level])
+    return Group([garment], chains, gravity, settings, dtype=dtype, device=device, lanes=LANES)

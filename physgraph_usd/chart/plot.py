@@ -1,0 +1,134 @@
+"""The chart as a picture: PNG and SVG for documents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator, SymmetricalLogLocator
+
+from .methods import DEFAULT, SMOOTH, UPSAMPLED
+from .styles import Style, styles
+from .table import Chart, Point
+from .words import FAR, Change, changes, percent, title
+
+FLOOR = 1e-4
+"""Least gap that is drawn: Phi* itself is known no better."""
+CEILING = 1.6
+RULES: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "svg.hashsalt": "physgraph",
+    "svg.fonttype": "none",
+}
+ONE_POINT = {DEFAULT: "*", UPSAMPLED: "s", SMOOTH: "D"}
+"""Signs of the curves of one point."""
+
+
+def draw_chart(chart: Chart, folder: Path) -> None:
+    """Write ``chart.png`` and ``chart.svg``.
+
+    Args:
+        chart: The chart.
+        folder: Where they go.
+    """
+    with mpl.rc_context(RULES):
+        figure = _figure(chart)
+        figure.savefig(folder / "chart.png", dpi=160)
+        figure.savefig(folder / "chart.svg", metadata={"Date": None})
+
+
+def _figure(chart: Chart) -> Figure:
+    steps = changes(chart)
+    heights = [4.2, *([2.6] if chart.panels else []), *([0.6 + 0.28 * len(steps)] if steps else [])]
+    figure = Figure(figsize=(9.6, sum(heights) + 1.0), layout="constrained")
+    figure.suptitle(title(chart), x=0.01, ha="left", fontsize=11)
+    parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    look = styles(chart)
+    axes = parts[0].subplots()
+    _curves(axes, chart, look)
+    parts[0].legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
+    if chart.panels:
+        panels = parts[1].subplots(1, len(chart.panels), squeeze=False)[0]
+        for axes, (name, words) in zip(panels, chart.panels.items(), strict=True):
+            _contact(axes, name, words, chart=chart, look=look)
+    if steps:
+        _terms(parts[-1].subplots(1, 3, sharey=True, width_ratios=[1.0, 1.0, 1.5]), steps)
+    return figure
+
+
+def _curves(axes: Axes, chart: Chart, look: dict[str, Style]) -> None:
+    """Gap against time."""
+    for name in chart.methods:
+        _line(axes, name, chart.curve(name), look[name], [max(p.gap, FLOOR) for p in chart.curve(name)])
+    axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Energy gap (Phi - Phi*) / (Phi0 - Phi*)")
+    least = min((p.gap for p in chart.points), default=FLOOR)
+    axes.set_ylim(max(FLOOR, min(0.5 * least, 0.01)) if least > 0 else FLOOR, CEILING)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.axhline(0.03, color="#b0b0b0", linewidth=0.8, linestyle=":")
+
+
+def _line(axes: Axes, name: str, points: tuple[Point, ...], style: Style, heights: list[float]) -> None:
+    """One method."""
+    alone = name in ONE_POINT
+    axes.plot(
+        [max(p.ms, 1e-2) for p in points],
+        heights,
+        color=style.colour,
+        linestyle="" if alone else "--" if style.dashed else "-",
+        marker=ONE_POINT.get(name, "o"),
+        markersize=11 if name == DEFAULT else 5 if alone else 3,
+        linewidth=1.4,
+        zorder=5 if name == DEFAULT else 2,
+        label=name,
+        clip_on=False,
+    )
+
+
+def _contact(axes: Axes, name: str, words: str, *, chart: Chart, look: dict[str, Style]) -> None:
+    """One measure of contact against time."""
+    for method in chart.methods:
+        points = chart.curve(method)
+        _line(axes, method, points, look[method], [float(getattr(p, name)) for p in points])
+    axes.set(xscale="log", xlabel="milliseconds a frame", title=words[0].upper() + words[1:])
+    axes.set_yscale("symlog", linthresh=0.01 if name == "percent" else 1.0)
+    axes.set_ylim(bottom=0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _terms(panels: Any, steps: list[Change]) -> None:
+    """What each part of the model costs and buys."""
+    places = list(range(len(steps)))[::-1]
+    cost, buys, said = panels
+    for axes, values, colour, digits in (
+        (cost, [each.cost_ms for each in steps], "#0072b2", 0),
+        (buys, [min(each.moved_mm, FAR) for each in steps], "#009e73", 2),
+    ):
+        axes.barh(places, values, color=colour, height=0.6)
+        axes.grid(visible=False, axis="y")
+        axes.xaxis.set_major_locator(MaxNLocator(4) if axes is cost else SymmetricalLogLocator(base=10, linthresh=1))
+        for place, value in zip(places, values, strict=True):
+            told = f" over {value:.0f}" if value == FAR else f" {value:.{digits}f}"
+            axes.text(max(value, 0.0), place, told, va="center", fontsize=7.5, color="#444444")
+    cost.set(yticks=places, title="Costs [ms a frame]")
+    cost.set_yticklabels([each.name for each in steps])
+    cost.margins(x=0.25)
+    cost.axvline(0.0, color="#888888", linewidth=0.8)
+    buys.set(title="Moves the result [mm]", xscale="symlog")
+    buys.set_xlim(0, 8.0 * max(1.0, *(min(each.moved_mm, FAR) for each in steps)))
+    buys.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    said.set(title="Buys")
+    said.axis("off")
+    for place, each in zip(places, steps, strict=True):
+        said.text(0.0, place, each.buys, va="center", fontsize=7.5, color="#444444", in_layout=False)

@@ -1,0 +1,35 @@
+"""One colour and one sign a method, the same in pictures and on the page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .methods import DEFAULT, SMOOTH, UPSAMPLED
+from .table import Chart
+
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c6d31")
+"""Okabe and Ito's colours, which colour-blind readers tell apart, and two more."""
+BASELINE = "#6e6e6e"
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a curve is drawn.
+
+    Attributes:
+        colour: As "#rrggbb".
+        dashed: Whether the curve is broken: the method as it is not used by default.
+    """
+
+    colour: str
+    dashed: bool
+
+
+def styles(chart: Chart) -> dict[str, Style]:
+    """A style for each curve: the colour is the integrator's, a broken line is flat."""
+    nested = {point.method: point.nested for point in chart.points}
+    family = {point.method: (point.integrator or point.method).removesuffix("-flat") for point in chart.points}
+    names = [family[name] for name in chart.methods if name not in {DEFAULT, SMOOTH, UPSAMPLED}]
+    colours = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(set(names)))}
+    found = {name: Style(colours.get(family[name], BASELINE), nested[name] is False) for name in chart.methods}
+    return found | {DEFAULT: Style("#111111", False)}

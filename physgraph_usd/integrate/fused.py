@@ -1,0 +1,172 @@
+"""`Physgraph` without messages as one kernel: features, layers and combination of a vertex never leave the registers.
+
+In torch a step at 26,000 vertices writes some forty arrays; on a CPU that costs several force evaluations. The kernel
+does the same arithmetic (`tests/test_learned.py` holds one against the other) and, as every kernel here, runs on CUDA
+as it is.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from ..mesh.lanes import Launch
+from ..mesh.stencil import vectors
+from .network import FLOOR, Physgraph, PhysgraphConfig
+
+LOG_SCALE = 0.5 / math.log(10.0)
+"""The networks see (log10 + 3) / 2 of a length."""
+
+
+def can_fuse(config: PhysgraphConfig, dtype: torch.dtype) -> bool:
+    """Whether the kernel covers a network: no messages, no strain, no means, two hidden layers, float32."""
+    plain = not (config.rounds or config.strain or config.means)
+    return plain and config.depth == 2 and dtype == torch.float32
+
+
+class FusedPhysgraph:
+    """A network's weights and buffers for one number of vertices.
+
+    Attributes:
+        vertices: That number.
+        count: Number of vectors.
+    """
+
+    def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, lanes: int) -> None:
+        """Lay out the weights.
+
+        Args:
+            network: A network that `can_fuse` covers.
+            vertices: Number of vertices.
+            longest: Longest displacement in local edge lengths.
+            device: "cpu" or a CUDA device.
+            lanes: Most threads that the kernel uses on the CPU.
+        """
+        config = network.config
+        self.vertices, self.count, width = vertices, len(config.vectors), config.width
+        self._stack = torch.zeros((self.count, vertices, 3), device=device)
+        self._out = torch.zeros((vertices, 3), device=device)
+        self._bias, self._clock = network.encode.bias.detach(), network.encode_means.weight.detach()[:, 0]
+        self._first = self._bias.clone().reshape(1, width)
+        hidden, last = network.hidden[0], network.decode
+        start = torch.zeros(self.count, device=device)
+        start[0] = 1.0
+        tables = [network.encode.weight.T, self._first, hidden.weight.T, hidden.bias, last.weight.T, last.bias + start]
+        self._kept = [self._first if t is self._first else t.detach().contiguous().clone() for t in tables]
+        kinds = [width, width, width, width, self.count, self.count]
+        packed = [
+            wp.from_torch(t.reshape(-1, n), dtype=wp.types.vector(length=n, dtype=wp.float32), requires_grad=False)
+            for t, n in zip(self._kept, kinds, strict=True)
+        ]
+        kernel = fused_kernel(self.count, width)
+        flat, spacing = vectors(self._stack.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
+        inputs = [vertices, flat, spacing, longest, *packed, vectors(self._out)]
+        self._launch = Launch(kernel, vertices, inputs, device=device, lanes=lanes)
+
+    def __call__(
+        self, combined: Sequence[Float[Tensor, "vertices 3"]], spacing: Float[Tensor, " vertices"], step: int
+    ) -> Float[Tensor, "vertices 3"]:
+        """The displacement [m], no longer than allowed; valid until the next call.
+
+        Args:
+            combined: The configuration's vectors [m].
+            spacing: Mean rest edge at each vertex [m].
+            step: Number of steps made before.
+        """
+        torch.stack(list(combined), out=self._stack)
+        torch.add(self._bias, self._clock, alpha=math.log1p(step) - 1.5, out=self._first[0])
+        self._launch({2: wp.from_torch(spacing, requires_grad=False)})
+        return self._out
+
+
+@functools.lru_cache(maxsize=8)
+def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device: str, lanes: int) -> FusedPhysgraph:
+    """The same, kept for the next frame; the network's weights must not change any more."""
+    return FusedPhysgraph(network, vertices, longest, device=device, lanes=lanes)
+
+
+def _encoder(count: int) -> Any:
+    """Adds the features' part to the first layer: lengths as logarithms, then cosines of all pairs."""
+    directions = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
+    floor, log_scale = FLOOR**2, 0.5 * LOG_SCALE
+
+    @wp.func
+    def encoded(v: wp.array(dtype=wp.vec3f), i: wp.int32, vertices: wp.int32, scale: wp.float32, w: Any, start: Any):
+        unit = directions()
+        h = start
+        for a in range(wp.static(count)):
+            s = v[a * vertices + i] * scale
+            square = wp.dot(s, s) + wp.float32(wp.static(floor))
+            h = h + w[a] * (wp.static(log_scale) * wp.log(square) + wp.float32(1.5))
+            inverse = wp.float32(1.0) / wp.sqrt(square)
+            unit[a, 0] = s[0] * inverse
+            unit[a, 1] = s[1] * inverse
+            unit[a, 2] = s[2] * inverse
+        row = wp.int32(wp.static(count))
+        for a in range(wp.static(count)):
+            for b in range(a + 1, wp.static(count)):
+                cosine = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
+                h = h + w[row] * cosine
+                row = row + 1
+        return h
+
+    return encoded
+
+
+def _layer(width: int) -> Any:
+    """A layer after a rectifier."""
+
+    @wp.func
+    def layer(h: Any, w: Any, start: Any):
+        out = start
+        for k in range(wp.static(width)):
+            out = out + w[k] * wp.max(h[k], wp.float32(0.0))
+        return out
+
+    return layer
+
+
+@functools.cache
+def fused_kernel(count: int, width: int) -> wp.Kernel:
+    """The kernel for so many vectors and so wide a network; vectors are stored one after another."""
+    encoded, layer = _encoder(count), _layer(width)
+
+    @wp.kernel(module="unique")
+    def fused(
+        first: wp.int32,
+        vertices: wp.int32,
+        v: wp.array(dtype=Any),
+        spacing: wp.array(dtype=wp.float32),
+        longest: wp.float32,
+        w1: wp.array(dtype=Any),
+        b1: wp.array(dtype=Any),
+        w2: wp.array(dtype=Any),
+        b2: wp.array(dtype=Any),
+        w3: wp.array(dtype=Any),
+        b3: wp.array(dtype=Any),
+        out: wp.array(dtype=Any),
+    ):
+        i = first + wp.tid()
+        h = encoded(v, i, vertices, wp.float32(1.0) / spacing[i], w1, b1[0])
+        c = layer(layer(h, w2, b2[0]), w3, b3[0])
+        move = v[i] * c[0]
+        for a in range(1, wp.static(count)):
+            move = move + v[a * vertices + i] * c[a]
+        far, most = wp.length(move), longest * spacing[i]
+        if far > most:
+            move = move * (most / far)
+        out[i] = move
+
+    wide, narrow = (wp.array(dtype=wp.types.vector(length=n, dtype=wp.float32)) for n in (width, count))
+    space, numbers = wp.array(dtype=wp.vec3f), wp.array(dtype=wp.float32)
+    types = [wp.int32, wp.int32, space, numbers, wp.float32, wide, wide, wide, wide, narrow, narrow, space]
+    return wp.overload(fused, types)

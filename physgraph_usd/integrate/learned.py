@@ -1,0 +1,296 @@
+"""The learned integrators: one force evaluation a step, no line search; the guard around them keeps them safe.
+
+| symbol | here | meaning |
+|---|---|---|
+| H0^-1 F | ``preconditioned`` | displacement that a linear cloth of the rest shape would answer with [m] |
+| v_i | ``vectors`` | what the network may combine, in local edge lengths |
+| c_i | ``coefficients`` | what the network answers |
+| D | ``move`` | sum_i c_i v_i, no longer than `LONGEST` edges at any vertex |
+
+Both see a `System` and nothing else. Weights are read from safetensors files that carry their kind, their configuration
+and a hash of the numbers.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..errors import SolveError
+from .base import Carry, Surface, System
+from .fused import can_fuse, fused_physgraph
+from .network import Graph, PaperNetwork, Physgraph
+
+NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
+
+LONGEST = 5.0
+"""Most edge lengths that a vertex moves in a step."""
+SECANTS = 5
+"""Secant pairs kept for the L-BFGS direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Secant:
+    """A difference of positions, of negative forces, of their images under H0^-1, and 1 / s.y of each garment or 0."""
+
+    move: Tensor
+    yields: Tensor
+    image: Tensor
+    inverse: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    """The last steps, newest first: H0^-1 F, displacements [m] and forces [N]; the secants; the number of steps."""
+
+    images: tuple[Tensor, ...]
+    forces: tuple[Tensor, ...]
+    moves: tuple[Tensor, ...] = ()
+    pairs: tuple[_Secant, ...] = ()
+    step: int = 0
+    graph: Graph | None = field(default=None, repr=False)
+
+
+class LearnedMetric:
+    """`physgraph`: a network chooses, vertex by vertex, how a few vectors make the step."""
+
+    name = "physgraph"
+
+    def __init__(self, network: Physgraph, *, fuse: bool = True) -> None:
+        """Keep the network.
+
+        Args:
+            network: The network.
+            fuse: Run it as one kernel where there is one for it and no gradient is asked for.
+        """
+        self._network = network
+        trained = not any(parameter.requires_grad for parameter in network.parameters())
+        self._fuse = fuse and trained and can_fuse(network.config, torch.float32)
+
+    def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
+        """Evaluate x with an empty memory."""
+        self._network = placed(self._network, system)
+        energy, force = system.energy_and_force(x)
+        image = system.apply_metric_inverse(force)
+        memory = _Memory((image,), (force,), graph=graph_of(system))
+        return Carry(x, energy, force, image, self.name, memory)
+
+    def resume(self, system: System, carry: Carry) -> Carry:
+        """Evaluate the carry's positions under forces that changed a little; the last displacements are kept."""
+        energy, force = system.energy_and_force(carry.x)
+        image = system.apply_metric_inverse(force)
+        old: _Memory = carry.memory
+        memory = replace(old, images=(image, *old.images[1:]), forces=(force, *old.forces[1:]))
+        return Carry(carry.x, energy, force, image, self.name, memory)
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        """One step along the network's combination."""
+        move = self.propose(system, carry)
+        x = carry.x + move
+        energy, force = system.energy_and_force(x)
+        image = system.apply_metric_inverse(force)
+        return Carry(x, energy, force, image, self.name, self._remember(carry, move, force, image=image))
+
+    def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
+        """The displacement of the next step [m]."""
+        memory: _Memory = carry.memory
+        combined = [self._vector(name, system, carry) for name in self._network.config.vectors]
+        if self._fuse and carry.x.dtype == torch.float32:
+            lanes = 1 if system.level is None else system.level.lanes
+            device = str(system.spacing.device)
+            fused = fused_physgraph(self._network, len(system.spacing), LONGEST, device=device, lanes=lanes)
+            return fused(combined, system.spacing, memory.step) * system.free
+        vectors = torch.stack(combined, dim=1)  # V N 3
+        needed = self._network.config.strain or self._network.config.rounds > 0
+        strain = edge_strain(system, carry.x).float() if needed else None
+        scaled = vectors / system.spacing.reshape(-1, 1, 1)  # V N 3
+        graph = memory.graph
+        assert graph is not None
+        coefficients = self._network(scaled.float(), strain, memory.step, graph=graph).to(vectors)  # V N
+        move = (coefficients.unsqueeze(2) * vectors).sum(dim=1)  # V 3
+        return limited(move, system.spacing) * system.free
+
+    def _vector(self, name: str, system: System, carry: Carry) -> Tensor:
+        """One of `network.VECTORS` [m]; zero where the past does not reach so far."""
+        memory: _Memory = carry.memory
+        if name == "secant":
+            assert memory.graph is not None
+            return secant_direction(carry.force, memory.images[0], memory.pairs, graph=memory.graph)
+        if name == "normal":
+            normal = vertex_normals(system, carry.x)
+            return (memory.images[0] * normal).sum(dim=1, keepdim=True) * normal
+        kind, age = name.rstrip("0123456789"), int(name[-1]) if name[-1].isdigit() else 0
+        if kind == "move":
+            known, age = memory.moves, age - 1
+        else:
+            known = memory.images if kind == "metric" else memory.forces
+        if age >= len(known):
+            return torch.zeros_like(carry.x)
+        return known[age] / system.rest_diagonal.unsqueeze(1) if kind == "diagonal" else known[age]
+
+    def _remember(self, carry: Carry, move: Tensor, force: Tensor, *, image: Tensor) -> _Memory:
+        old: _Memory = carry.memory
+        pairs = old.pairs
+        if "secant" in self._network.config.vectors:
+            assert old.graph is not None
+            pair = _secant(move, carry.force - force, old.images[0] - image, graph=old.graph)
+            pairs = (*pairs, pair)[-SECANTS:]
+        return replace(
+            old,
+            images=(image, *old.images[:2]),
+            forces=(force, *old.forces[:1]),
+            moves=(move, *old.moves[:1]),
+            pairs=pairs,
+            step=old.step + 1,
+        )
+
+
+class LearnedPaper:
+    """`physgraph-paper`: the paper's network, fed past displacements and forces along the edges of the mesh."""
+
+    name = "physgraph-paper"
+
+    def __init__(self, network: PaperNetwork) -> None:
+        """Keep the network."""
+        self._network = network
+
+    def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
+        """Evaluate x with an empty history."""
+        self._network = placed(self._network, system)
+        energy, force = system.energy_and_force(x)
+        # A third of the trace of the Hessian's blocks, at the start: what the force is measured in (A7).
+        stiffness = system.diagonal(x).unsqueeze(1)
+        return Carry(x, energy, force, None, self.name, _Memory((stiffness,), (force,)))
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        """One step of the network."""
+        memory: _Memory = carry.memory
+        move = self.propose(system, carry)
+        x = carry.x + move
+        energy, force = system.energy_and_force(x)
+        keep = self._network.config.history
+        forces, moves = (force, *memory.forces)[:keep], (move, *memory.moves)[:keep]
+        return Carry(x, energy, force, None, self.name, replace(memory, forces=forces, moves=moves))
+
+    def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
+        """The displacement of the next step [m]."""
+        memory: _Memory = carry.memory
+        graph, config = graph_of(system), self._network.config
+        scaled = config.features == "scaled"
+        length = system.spacing.unsqueeze(1)  # V 1
+        unit, force_unit = (length, memory.images[0] * length) if scaled else (1.0, 1.0)
+        none = [torch.zeros_like(carry.x)] * config.history
+        moves = [-move / unit for move in (*memory.moves, *none)[: config.history]]
+        forces = [force / force_unit for force in (*memory.forces, *none)[: config.history]]
+        vertex = torch.cat([*moves, *forces], dim=1)  # V 6H
+        ends = graph.edges.long()
+        sender, receiver = torch.cat([ends[:, 0], ends[:, 1]]), torch.cat([ends[:, 1], ends[:, 0]])
+        rest = _level(system).rest
+        size = 0.5 * (length[sender] + length[receiver]) if scaled else 1.0
+        spans = [(x[receiver] - x[sender]) / size for x in (carry.x, rest)]
+        edge = torch.cat([part for s in spans for part in (s, s.norm(dim=1, keepdim=True))], dim=1)  # 2E 8
+        fixed = (~system.free).to(torch.float32)
+        out = self._network(vertex.float(), edge.float(), fixed, sender=sender, receiver=receiver)
+        return limited(out.to(carry.x) * length, system.spacing) * system.free
+
+
+def placed(network: NetworkT, system: System) -> NetworkT:
+    """The network on the system's device: itself, or a copy."""
+    parameter, device = next(network.parameters()), system.spacing.device
+    return network if parameter.device == device else copy.deepcopy(network).to(device)
+
+
+def integrator_of(network: Physgraph | PaperNetwork) -> LearnedMetric | LearnedPaper:
+    """The integrator that uses a network."""
+    return LearnedMetric(network) if isinstance(network, Physgraph) else LearnedPaper(network)
+
+
+def secant_direction(
+    force: Float[Tensor, "vertices 3"],
+    image: Float[Tensor, "vertices 3"],
+    pairs: tuple[_Secant, ...],
+    *,
+    graph: Graph,
+) -> Float[Tensor, "vertices 3"]:
+    """The L-BFGS direction [m], as in `quasi_newton`, for each garment by itself.
+
+    Args:
+        force: [N].
+        image: H0^-1 F [m].
+        pairs: Secants, oldest first.
+        graph: Which vertex belongs to which garment.
+    """
+    weights = []
+    for pair in reversed(pairs):
+        weight = pair.inverse * _dots(pair.move, force, graph)
+        force = torch.addcmul(force, weight, pair.yields, value=-1.0)
+        image = torch.addcmul(image, weight, pair.image, value=-1.0)
+        weights.append(weight)
+    if pairs:
+        newest = pairs[-1]
+        own = newest.inverse > 0
+        size = _dots(newest.yields, newest.image, graph)
+        image = image * torch.where(own, 1.0 / torch.where(own, newest.inverse * size, 1.0), 1.0)
+    for pair, weight in zip(pairs, reversed(weights), strict=True):
+        image = torch.addcmul(image, weight - pair.inverse * _dots(pair.yields, image, graph), pair.move)
+    return image
+
+
+def _secant(move: Tensor, yields: Tensor, image: Tensor, *, graph: Graph) -> _Secant:
+    """A secant that counts where its curvature is safely positive."""
+    curvature = _dots(move, yields, graph)
+    floor = 1e-8 * (_dots(move, move, graph) * _dots(yields, yields, graph)).sqrt()
+    good = (curvature > floor) & (_dots(yields, image, graph) > 0)
+    return _Secant(move, yields, image, torch.where(good, 1.0 / torch.where(good, curvature, 1.0), 0.0))
+
+
+def _dots(a: Tensor, b: Tensor, graph: Graph) -> Tensor:
+    """Scalar products of each garment, at each of its vertices."""
+    if graph.garments == 1:
+        return torch.dot(a.reshape(-1), b.reshape(-1)).reshape(1, 1)
+    return graph.total((a * b).sum(dim=1, keepdim=True))[graph.owner]
+
+
+def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices"]) -> Float[Tensor, "vertices 3"]:
+    """The displacement, shortened to `LONGEST` local edge lengths at each vertex (STABILITY.md S12)."""
+    size = move.square().sum(dim=1, keepdim=True).clamp_min(torch.finfo(move.dtype).tiny).sqrt()
+    return move * (LONGEST * spacing.unsqueeze(1) / size).clamp_max(1.0)
+
+
+def graph_of(system: System) -> Graph:
+    """Garments and edges of a system; without a level, one garment without edges."""
+    level = system.level
+    if level is None:
+        owner = torch.zeros(len(system.spacing), dtype=torch.int64, device=system.spacing.device)
+        edges = owner.new_zeros((0, 2)).int()
+        return Graph(owner, 1, edges, system.spacing.float(), system.spacing.new_zeros(0).float())
+    spacing, rest = system.spacing.float(), level.rest_length.float()
+    return Graph(level.vertex_garment.long(), len(level.spans), level.edges, spacing, rest)
+
+
+def edge_strain(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:
+    """Extension of each edge over its rest length."""
+    level = _level(system)
+    ends = level.edges.long()
+    square = (x[ends[:, 1]] - x[ends[:, 0]]).square().sum(dim=1)
+    return square.clamp_min(1e-30).sqrt() / level.rest_length - 1.0
+
+
+def vertex_normals(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+    """Area-weighted unit normals; zero where triangles have no area."""
+    corners = _level(system).triangles.long()
+    corner = x[corners]
+    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    total = torch.zeros_like(x).index_add_(0, corners.T.reshape(-1), area.repeat(3, 1))
+    return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
+
+
+def _level(system: System) -> Surface:
+    if system.level is None:
+        raise SolveError("this network needs a mesh, and the system has none")
+    return system.level

@@ -1,0 +1,148 @@
+"""Weights on disk: safetensors that say what they are, and are refused by name when they are not what they say.
+
+The file's metadata holds the kind of network, its configuration, the format's version and a hash of the numbers, so a
+file that was cut, edited or made for another version never reaches a garment.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any, overload
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from ..errors import WeightsError
+from .network import VECTORS, PaperConfig, PaperNetwork, Physgraph, PhysgraphConfig
+
+VERSION = "1"
+"""Format of the file and meaning of the features; other versions are refused."""
+FOLDER = Path(__file__).resolve().parents[1] / "weights"
+"""The weights that ship."""
+
+Network = Physgraph | PaperNetwork
+
+
+def kind_of(network: Network) -> str:
+    """The integrator that a network belongs to."""
+    return "physgraph" if isinstance(network, Physgraph) else "physgraph-paper"
+
+
+@overload
+def make_network(config: PhysgraphConfig) -> Physgraph: ...
+@overload
+def make_network(config: PaperConfig) -> PaperNetwork: ...
+def make_network(config: PhysgraphConfig | PaperConfig) -> Network:
+    """An untrained network."""
+    return Physgraph(config) if isinstance(config, PhysgraphConfig) else PaperNetwork(config)
+
+
+def save_network(network: Network, file: Path) -> str:
+    """Write weights and what they are.
+
+    Args:
+        network: The network.
+        file: The .safetensors to write.
+
+    Returns:
+        The hash of the weights, in hexadecimal.
+    """
+    tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    about = {
+        "kind": kind_of(network),
+        "version": VERSION,
+        "config": json.dumps(asdict(network.config)),
+        "sha256": hash_of(tensors),
+    }
+    save_file(tensors, file, metadata=about)
+    return about["sha256"]
+
+
+def load_network(file: Path, *, kind: str, device: str = "cpu") -> Network:
+    """Read weights.
+
+    Args:
+        file: A file that `save_network` wrote.
+        kind: "physgraph" or "physgraph-paper".
+        device: Where to put them.
+
+    Returns:
+        The network, ready for use.
+
+    Raises:
+        WeightsError: The file is missing, damaged, of another kind or of another version.
+    """
+    tensors, about = _read(Path(file))
+    if about.get("version") != VERSION:
+        raise WeightsError(f"{file} has version {about.get('version')!r}; this release reads {VERSION!r}")
+    if about.get("kind") != kind:
+        raise WeightsError(f"{file} holds weights of '{about.get('kind')}', not of '{kind}'")
+    if about.get("sha256") != hash_of(tensors):
+        raise WeightsError(f"{file} is damaged: its numbers do not have the hash that it names")
+    try:
+        network = make_network(_config(kind, json.loads(about.get("config", ""))))
+        network.load_state_dict(tensors)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise WeightsError(f"{file} does not fit its own configuration: {error}") from error
+    if not all(bool(value.isfinite().all()) for value in tensors.values() if value.is_floating_point()):
+        raise WeightsError(f"{file} holds numbers that are not finite")
+    return network.requires_grad_(False).eval().to(device)
+
+
+@cache
+def shipped_network(kind: str) -> Network:
+    """The weights that ship with the package.
+
+    Raises:
+        WeightsError: They are not there.
+    """
+    return load_network(FOLDER / f"{kind}.safetensors", kind=kind)
+
+
+def hash_of(tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of names, types, shapes and numbers, in hexadecimal."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    if not file.is_file():
+        raise WeightsError(f"no weights at {file}; `physgraph-usd train` makes them")
+    try:
+        with safe_open(str(file), framework="pt") as opened:
+            names = list(opened.keys())
+            return {name: opened.get_tensor(name) for name in names}, dict(opened.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{file} cannot be read: {error}") from error
+
+
+def _config(kind: str, values: dict[str, Any]) -> PhysgraphConfig | PaperConfig:
+    if kind == "physgraph-paper":
+        return PaperConfig(**values)
+    own: dict[str, Any] = values | {"vectors": tuple(values["vectors"])}
+    config = PhysgraphConfig(**own)
+    unknown = [name for name in config.vectors if name not in VECTORS]
+    if unknown:
+        raise ValueError(f"unknown vectors {unknown}")
+    return config
+
+
+def random_network(config: PhysgraphConfig | PaperConfig, *, seed: int, scale: float = 1.0) -> Network:
+    """A network with random weights, the last layer's too: what the guard must withstand (STABILITY.md S37)."""
+    generator = torch.Generator().manual_seed(seed)
+    network = make_network(config)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            fan = parameter.shape[-1] if parameter.dim() > 1 else 1
+            parameter.copy_(scale * torch.randn(parameter.shape, generator=generator) / fan**0.5)
+    return network.requires_grad_(False).eval()

@@ -1,0 +1,154 @@
+"""Writes a run's report into a folder: ``report.json`` and ``report.html``."""
+
+from __future__ import annotations
+
+import base64
+import html
+import importlib
+import tempfile
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ..errors import LayerError, StageError
+from ..options import REPORT_NAME
+from ..report import RefineReport
+from ..usd.reader import Shot
+from .document import document, table
+from .plot import SCRIPT, plot
+from .series import Series, add_jerk, read_series
+
+PAGE_NAME = "report.html"
+PICTURES = 3
+"""Time codes that are drawn, at most."""
+SIZE = (1280, 640)
+PLOTS = (
+    ("energy", "Energy by term [mJ]"),
+    ("strain", "Extension of the edges: median, 99th percentile and largest [%]"),
+    ("inside", "Vertices inside bodies"),
+    ("depth", "Deepest vertex inside bodies [mm]"),
+    ("crossings", "Edges through faces"),
+    ("jerk", "Jerk of the detail: third difference between samples, RMS [fine edges]"),
+    ("time", "Time [ms]"),
+)
+
+
+def write_folder(report: RefineReport, folder: Path, shot: Shot) -> None:
+    """Write a run's report as JSON and as a page.
+
+    Args:
+        report: The report of a run that wrote a layer.
+        folder: Where it goes; made where it is not there.
+        shot: The shot, open.
+    """
+    report.write(folder / REPORT_NAME)
+    series = [read_series(report, index) for index in range(len(report.garments))]
+    assert report.out is not None
+    add_jerk(series, report, shot, report.out)
+    partial = folder / (PAGE_NAME + ".part")
+    partial.write_text(page(report, series), encoding="utf-8")
+    partial.replace(folder / PAGE_NAME)
+
+
+def page(report: RefineReport, series: Sequence[Series]) -> str:
+    """The page as HTML.
+
+    Args:
+        report: The report.
+        series: Lines of every garment.
+    """
+    parts = [_head(report), _warnings(report), _pictures(report), _model(report), _garments(report)]
+    times = [frame["time"] for frame in report.frames]
+    for index, own in enumerate(series):
+        parts.append(f"<h2>&lt;{html.escape(own.path)}&gt; over time</h2>")
+        drawn = [
+            plot(f"{name}-{index}", title, [0.0 if t is None else t for t in times], getattr(own, name))
+            for name, title in PLOTS
+        ]
+        parts.append("".join(drawn) or "<p>No frame says anything of it.</p>")
+    parts.append(_options(report))
+    return document(f"Refined: {Path(report.shot).name}", "\n".join(parts), script=SCRIPT)
+
+
+def _head(report: RefineReport) -> str:
+    count, failed = len(report.frames), len(report.failed)
+    done = f"{count - failed} of {count} time codes" if failed else f"{count} time code{'s' if count != 1 else ''}"
+    seconds = report.seconds.get("total", 0.0)
+    each = f", {1e3 * report.seconds.get('frames', 0.0) / count:.0f} ms each" if count else ""
+    return (
+        f"<h1>{html.escape(Path(report.shot).name)}</h1>"
+        f"<p id='summary'>{done} written to {html.escape(str(report.out))} in {seconds:.1f} s{each}; "
+        f"peak memory {report.peak_memory_mb:.0f} MB.</p>"
+    )
+
+
+def _warnings(report: RefineReport) -> str:
+    """Warnings, each with its prim and time code, and frames that failed."""
+    if not report.warnings:
+        return "<h2>Warnings</h2><p id='warnings'>None.</p>"
+    lines = "".join(f"<li>{html.escape(warning)}</li>" for warning in report.warnings)
+    return f"<h2>Warnings</h2><ul class='warnings' id='warnings'>{lines}</ul>"
+
+
+def _pictures(report: RefineReport) -> str:
+    """Coarse beside fine at a few time codes."""
+    title = "<h2>Before and after</h2>"
+    if missing := [name for name in ("PIL", "embreex") if find_spec(name) is None]:
+        return f"{title}<p class='note'>No pictures: {missing[0]} is missing; pip install 'physgraph-usd[preview]'</p>"
+    written = [frame["time"] for frame in report.frames if "garments" in frame]
+    picks = sorted({round(i * (len(written) - 1) / (PICTURES - 1)) for i in range(PICTURES)}) if written else []
+    try:
+        return title + "".join(_picture(report, written[i]) for i in picks)
+    except (StageError, LayerError) as error:
+        return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"
+
+
+def _picture(report: RefineReport, time: float | None) -> str:
+    """One picture inside the page."""
+    draw = importlib.import_module("..preview", __package__).preview  # Needs an extra that a report can do without.
+    times = None if time is None else [time]
+    with tempfile.TemporaryDirectory() as folder:
+        file = draw(report.out, Path(folder) / "picture.png", shot=report.shot, times=times, size=SIZE)
+        data = base64.b64encode(file.read_bytes()).decode("ascii")
+    said = "the only frame" if time is None else f"time code {time:g}"
+    return (
+        f"<figure><img alt='coarse beside refined, {said}' width='{SIZE[0]}' height='{SIZE[1]}' "
+        f"src='data:image/png;base64,{data}'><figcaption>{said}</figcaption></figure>"
+    )
+
+
+def _model(report: RefineReport) -> str:
+    """What was modelled and left out, and why."""
+    return (
+        "<h2>What was modelled</h2>"
+        + table("modelled", ("term", "how"), list(report.modelled.items()))
+        + "<h2>What was left out</h2>"
+        + table("left-out", ("what", "why"), list(report.left_out.items()))
+    )
+
+
+def _garments(report: RefineReport) -> str:
+    """Size, level and fabric of each garment, and where the values come from."""
+    rows = [
+        (
+            garment["path"],
+            f"{garment['points']:,} points, {' x '.join(f'{length:.2f}' for length in garment['size_m'])} m",
+            f"level {garment['level']}, edges of {garment['fine_edge_mm']:.2f} mm: {garment['level_reason']}",
+            ", ".join(f"{name} {value:.4g}" for name, value in garment["fabric"].items() if value is not None),
+            ", ".join(f"{name}: {source}" for name, source in garment["sources"].items()) or "fallbacks",
+        )
+        for garment in report.garments
+    ]
+    return "<h2>Garments</h2>" + table("garments", ("garment", "cage", "level", "values (SI)", "from"), rows)
+
+
+def _options(report: RefineReport) -> str:
+    rows = [(name, _plain(value)) for name, value in report.options.items()]
+    return "<h2>Options</h2>" + table("options", ("option", "value"), rows)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value)) or "-"
+    return "-" if value is None else str(value)

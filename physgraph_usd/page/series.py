@@ -1,0 +1,125 @@
+"""What a run's frames say over time, garment by garment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import LayerError, StageError
+from ..pipeline import Refiner
+from ..report import RefineReport
+from ..usd.readback import RefinedLayer
+from ..usd.reader import Shot
+
+Line = list[float | None]
+
+
+@dataclass(eq=False)
+class Series:
+    """One garment over time.
+
+    Attributes:
+        path: The garment.
+        energy: Energy by term, and of the upsampled input [mJ].
+        strain: Size of the edges' extension [%].
+        inside: Vertices inside bodies, before and after.
+        depth: Depth of the deepest [mm], before and after.
+        crossings: Edges through faces, of bodies and of cloth, before and after.
+        time: Milliseconds of each stage.
+        jerk: RMS third difference of the detail [fine edges].
+    """
+
+    path: str
+    energy: dict[str, Line] = field(default_factory=dict)
+    strain: dict[str, Line] = field(default_factory=dict)
+    inside: dict[str, Line] = field(default_factory=dict)
+    depth: dict[str, Line] = field(default_factory=dict)
+    crossings: dict[str, Line] = field(default_factory=dict)
+    time: dict[str, Line] = field(default_factory=dict)
+    jerk: dict[str, Line] = field(default_factory=dict)
+
+
+def read_series(report: RefineReport, index: int) -> Series:
+    """One garment's lines from a report's frames; a value is None where a frame does not say it."""
+    found = Series(report.garments[index]["path"])
+    for place, frame in enumerate(report.frames):
+        entry = frame["garments"][index] if "garments" in frame else {}
+        for name, values in _said(entry, frame).items():
+            lines: dict[str, Line] = getattr(found, name)
+            for label, value in values.items():
+                line = lines.setdefault(label, [None] * len(report.frames))
+                line[place] = value
+    return found
+
+
+def _said(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """What one frame says of a garment, by field and line."""
+    said: dict[str, dict[str, float]] = {"time": _milliseconds(entry, frame)}
+    if "energy_joules" in entry:
+        output, given = entry["energy_joules"]["output"], entry["energy_joules"]["input"]
+        said["energy"] = {name: 1e3 * value for name, value in output.items()}
+        said["energy"] |= {"total": 1e3 * sum(output.values()), "upsampled input": 1e3 * sum(given.values())}
+    if "strain" in entry:
+        said["strain"] = {name: 100.0 * value for name, value in entry["strain"].items()}
+    contact = entry.get("contact", {})
+    bodies = contact.get("bodies", {}).values()
+    for when in ("before", "after"):
+        if bodies:
+            said.setdefault("inside", {})[when] = sum(body[when]["inside"] for body in bodies)
+            said.setdefault("depth", {})[when] = max(body[when]["deepest_mm"] for body in bodies)
+            said.setdefault("crossings", {})[f"bodies, {when}"] = sum(body[when]["crossings"] for body in bodies)
+        if "cloth" in contact:
+            said.setdefault("crossings", {})[f"cloth, {when}"] = contact["cloth"][when]["crossings"]
+    return said
+
+
+def _milliseconds(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, float]:
+    spent = dict(entry.get("milliseconds", {}))
+    return ({"read": frame["read_ms"]} if "read_ms" in frame and spent else {}) | spent
+
+
+def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: Path) -> None:
+    """Measure how unsteady the detail is, from the layer that was written.
+
+    Args:
+        series: Lines of every garment; each gets its jerk where four samples in a row are there.
+        report: The run's report.
+        shot: The shot, open.
+        layer: The layer that was written.
+    """
+    written = RefinedLayer(layer)
+    chains = Refiner.subdivide(shot.scene, [garment["level"] for garment in report.garments])
+    for index, own in enumerate(series):
+        garment, steps = shot.scene.garments[index], chains[index]
+        edge = 1e-3 * report.garments[index]["fine_edge_mm"]
+        recent: list[np.ndarray | None] = []
+        line: Line = []
+        for frame in report.frames:
+            recent = [*recent[-3:], _detail(written, shot, frame["time"], index=index, steps=steps)]
+            known = [each for each in recent if each is not None and len(each) >= len(garment.rest)]
+            line.append(third_difference(known) / edge if len(known) == 4 and edge > 0 else None)
+        own.jerk = {"jerk": line}
+
+
+def _detail(
+    written: RefinedLayer, shot: Shot, time: float | None, *, index: int, steps: Sequence[Any]
+) -> np.ndarray | None:
+    """Fine positions less the linearly upsampled cage [m], or None where the frame has no sample."""
+    try:
+        fine = written.points(shot, index, time)
+        coarse = shot.frame(time).garments[index].points
+    except (StageError, LayerError):
+        return None
+    for step in steps:
+        coarse = np.asarray(step.linear @ coarse)
+    return None if fine is None or fine.shape != coarse.shape else fine - coarse
+
+
+def third_difference(detail: Sequence[np.ndarray]) -> float:
+    """RMS over the vertices of the third difference of four states, in their unit."""
+    third = np.diff(np.stack(detail), n=3, axis=0)[0]
+    return float(np.sqrt(np.square(third).sum(axis=1).mean())) if len(third) else 0.0

@@ -1,0 +1,1 @@
+"""Training: patches, the loop and the record of what was trained."""

@@ -1,0 +1,325 @@
+"""The training loop: unroll steps on patches, follow the energy down, keep a record."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..integrate.base import Integrator
+from ..integrate.learned import integrator_of
+from ..integrate.network import PaperConfig, PaperNetwork, Physgraph, PhysgraphConfig
+from ..integrate.quasi_newton import QuasiNewton
+from ..integrate.weights import make_network
+from .patches import Patch, PatchConfig, make_patches
+from .unroll import JointSystem
+
+HARMLESS = 0.02
+"""Part of the energy at the start below which the logarithm of the gap stops to reward."""
+SCHEDULES = ((5, 5, 5), (10, 10, 5))
+"""Steps a level at which held-out patches are measured."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that a training run depends on.
+
+    Attributes:
+        kind: "physgraph" or "physgraph-paper".
+        network: Size of the network.
+        patches: What it is trained on.
+        seed: Of patches, weights and order.
+        minutes: How long to train, patches not counted.
+        iterations: Most iterations, or None.
+        batch: Patches an iteration.
+        unroll: Steps that gradients flow through.
+        segments: Most unrolls one after another on a patch; later ones start where the last one ended.
+        through_forces: Gradients flow through forces too, by differences; else through displacements only (A19).
+        loss: "ratio" or "log" of the gap, averaged over the steps (A18).
+        raw: Part of the starts that are the upsampled cage.
+        middle: Part of the starts where an earlier unroll ended; the others come from a solved level below.
+        own: Part of those that the network itself has solved; quasi-Newton the others.
+        turn: Turn each start at random (A8); only where neither gravity nor guide has a direction.
+        rate: Adam's first rate; it falls to a hundredth along a cosine.
+        clip: Largest norm of the gradient.
+        average: Decay of the weights' running mean, which is what is kept.
+        held_out: Patches to measure on, of another seed.
+    """
+
+    kind: str = "physgraph"
+    network: PhysgraphConfig | PaperConfig = field(default_factory=PhysgraphConfig)
+    patches: PatchConfig = field(default_factory=PatchConfig)
+    seed: int = 1
+    minutes: float = 5.0
+    iterations: int | None = None
+    batch: int = 4
+    unroll: int = 10
+    segments: int = 3
+    through_forces: bool = False
+    loss: str = "log"
+    raw: float = 0.4
+    middle: float = 0.15
+    own: float = 0.5
+    turn: bool = False
+    rate: float = 3e-3
+    clip: float = 1.0
+    average: float = 0.99
+    held_out: int = 8
+
+
+class Trainer:
+    """A network in training.
+
+    Attributes:
+        config: The run.
+        network: The network.
+        iteration: Iterations made.
+        seconds: Time they took.
+        curve: What was measured on the way.
+    """
+
+    def __init__(self, config: TrainConfig, *, device: str = "cpu", like: Trainer | None = None) -> None:
+        """Make patches and an untrained network.
+
+        Args:
+            config: The run.
+            device: "cpu" or a CUDA device.
+            like: A finished run on the same patches, which are taken over, or None.
+        """
+        self.config, self.device = config, device
+        torch.manual_seed(config.seed)
+        self.network = make_network(config.network).to(device)
+        self._mean = torch.optim.swa_utils.AveragedModel(
+            self.network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
+        )
+        self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
+        shared = like is not None and (like.config.patches, like.config.seed) == (config.patches, config.seed)
+        self.patches = (
+            like.patches if like and shared else make_patches(config.patches, seed=config.seed, device=device)
+        )
+        self._held_out = like._held_out if like and shared else None
+        for patch in self.patches:
+            patch.kept.clear()
+        self._rng = np.random.default_rng(config.seed + 1)
+        self.iteration, self.seconds = 0, 0.0
+        self.curve: list[dict[str, Any]] = []
+
+    def train(self, *, every: float = 60.0, say: Any = None, keep: Path | None = None) -> None:
+        """Train until the time or the iterations are spent.
+
+        Args:
+            every: Seconds between measurements on held-out patches.
+            say: Called with a line at each measurement.
+            keep: File for checkpoints, or None.
+        """
+        config = self.config
+        measured, losses = self.seconds, []
+        while self.progress < 1.0:
+            began = time.perf_counter()
+            losses.append(self.iterate())
+            self.seconds += time.perf_counter() - began
+            if self.seconds - measured >= every or self.progress >= 1.0:
+                measured = self.seconds
+                row = {"iteration": self.iteration, "minutes": self.seconds / 60, "loss": float(np.mean(losses))}
+                row |= {"held_out": self.held_out_ratios()} if config.held_out else {}
+                losses = []
+                self.curve.append(row)
+                if say:
+                    say(json.dumps(row))
+                if keep:
+                    self.save(keep)
+
+    @property
+    def progress(self) -> float:
+        """Part of the run that is done."""
+        config = self.config
+        parts = [self.seconds / (60.0 * config.minutes)]
+        if config.iterations is not None:
+            parts.append(self.iteration / config.iterations)
+        return max(parts)
+
+    def iterate(self) -> float:
+        """One iteration; returns the mean loss."""
+        config, done = self.config, self.progress
+        for group in self._optimiser.param_groups:
+            group["lr"] = config.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0))))
+        steps = max(2, round(config.unroll * min(1.0, 0.3 + 2.8 * done)))
+        self._optimiser.zero_grad()
+        self.network.train()
+        loss = self._descend(steps)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+        if all(bool(p.grad.isfinite().all()) for p in self.network.parameters() if p.grad is not None):
+            self._optimiser.step()
+            self._mean.update_parameters(self.network)
+        self.iteration += 1
+        return loss
+
+    def _descend(self, steps: int) -> float:
+        """Unroll a batch, segment after segment; gradients add up. Returns the mean loss."""
+        config = self.config
+        items = [self._draw() for _ in range(config.batch)]
+        system = JointSystem([p.systems[i] for p, i in items], through_forces=config.through_forces)
+        starts = [self._begin(patch, index) for patch, index in items]
+        x = torch.cat([self._turned(start) for start in starts] if config.turn else starts)
+        integrator = integrator_of(self.network)
+        segments = int(self._rng.integers(1, config.segments + 1))
+        carry, total = integrator.start(system, x), 0.0
+        before = system.energies[-1].detach()
+        for _ in range(segments):
+            before = system.energies[-1].detach()
+            system.energies.clear()
+            carry = detached(carry)
+            for _ in range(steps):
+                carry = integrator.step(system, carry)
+            reached = torch.stack(system.energies)  # K B
+            for (patch, index), column in zip(items, reached.detach().T.tolist(), strict=True):
+                patch.least[index] = min([patch.least[index], *filter(math.isfinite, column)])
+            least = before.new_tensor([patch.least[index] for patch, index in items])
+            loss = loss_of(reached, before, least, kind=config.loss)
+            if not bool(loss.isfinite()):
+                break
+            (loss / segments).backward()
+            total += float(loss.detach()) / segments
+        self._keep(items, system, carry.x.detach(), before)
+        return total
+
+    def _turned(self, x: Tensor) -> Tensor:
+        """The positions after a random rotation."""
+        turn = np.linalg.qr(self._rng.normal(size=(3, 3)))[0]
+        return x @ torch.as_tensor(turn * np.linalg.det(turn), dtype=x.dtype, device=x.device)
+
+    def _draw(self) -> tuple[Patch, int]:
+        patch = self.patches[int(self._rng.integers(len(self.patches)))]
+        return patch, int(self._rng.integers(len(patch.systems)))
+
+    def _begin(self, patch: Patch, index: int) -> Tensor:
+        """A start at a level: the upsampled cage, or the end of a solve of the level below or of this level."""
+        dice = self._rng.random()
+        if dice < self.config.raw or (index == 0 and 0 not in patch.kept):
+            return patch.begin(index)
+        if dice > 1.0 - self.config.middle and index in patch.kept:
+            return patch.kept[index]
+        if index == 0:
+            return patch.begin(index)
+        prolong = patch.group.levels[index].from_below
+        assert prolong is not None
+        own = self._rng.random() < self.config.own
+        return prolong.apply(patch.kept[index - 1] if own and index - 1 in patch.kept else patch.solved[index - 1])
+
+    def _keep(self, items: Sequence[tuple[Patch, int]], system: JointSystem, x: Tensor, before: Tensor) -> None:
+        """Keep where the network came to, as a start for later; what went uphill is forgotten."""
+        for (patch, index), span, old, new in zip(
+            items, system.spans, before.tolist(), system.energies[-1].tolist(), strict=True
+        ):
+            if new <= old:
+                patch.kept[index] = x[span].clone()
+
+    def averaged(self) -> Physgraph | PaperNetwork:
+        """The running mean of the weights, ready for use."""
+        network = make_network(self.config.network).to(self.device)
+        network.load_state_dict(self._mean.module.state_dict())
+        return network.requires_grad_(False).eval()
+
+    def held_out_ratios(self) -> dict[str, float]:
+        """Gap over that of quasi-Newton at the same steps, geometric mean over held-out patches."""
+        if self._held_out is None:
+            config = replace(self.config.patches, count=self.config.held_out)
+            self._held_out = make_patches(config, seed=10_000 + self.config.seed, device=self.device)
+        ours = integrator_of(self.averaged())
+        table = {}
+        for schedule in SCHEDULES:
+            ratios = []
+            for patch in self._held_out:
+                mine, theirs = (nested_gap(patch, integrator, schedule) for integrator in (ours, QuasiNewton()))
+                ratios.append(math.log(max(mine, 1e-3) / max(theirs, 1e-3)))
+            table[str(schedule)] = round(math.exp(float(np.mean(ratios))), 4)
+        return table
+
+    def save(self, file: Path) -> None:
+        """Write a checkpoint from which the run can go on."""
+        state = {
+            "network": self.network.state_dict(),
+            "mean": self._mean.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "rng": self._rng.bit_generator.state,
+            "torch": torch.get_rng_state(),
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "curve": self.curve,
+            "patches": [(patch.kept, patch.least) for patch in self.patches],
+        }
+        part = file.with_suffix(".part")
+        torch.save(state, part)
+        part.replace(file)
+
+    def resume(self, file: Path) -> None:
+        """Go on from a checkpoint of the same configuration."""
+        state = torch.load(file, map_location=self.device, weights_only=False)
+        self.network.load_state_dict(state["network"])
+        self._mean.load_state_dict(state["mean"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._rng.bit_generator.state = state["rng"]
+        torch.set_rng_state(state["torch"].cpu())
+        self.iteration, self.seconds, self.curve = state["iteration"], state["seconds"], state["curve"]
+        for patch, (kept, least) in zip(self.patches, state["patches"], strict=True):
+            patch.kept, patch.least = kept, least
+
+
+def loss_of(
+    energies: Float[Tensor, "steps patches"],
+    before: Float[Tensor, " patches"],
+    least: Float[Tensor, " patches"],
+    *,
+    kind: str,
+) -> Float[Tensor, ""]:
+    """Mean over steps and patches of the gap, or of its logarithm, relative to the start.
+
+    Args:
+        energies: Energies of the steps [J].
+        before: Energies at the start [J].
+        least: Least energies known [J].
+        kind: "ratio" or "log".
+    """
+    scale = torch.maximum(before - least, 1e-6 * before.abs()).clamp_min(1e-30)
+    gap = (energies - least) / scale
+    # Beyond the start's own gap only the logarithm counts: one patch that blows up must not outweigh the rest.
+    if kind == "ratio":
+        return torch.where(gap < 1.0, gap, 1.0 + gap.clamp_min(1.0).log()).mean()
+    return (gap.clamp_min(0.0) + HARMLESS).log().mean()
+
+
+def detached(carry: Any) -> Any:
+    """The carry without the graph that led to it."""
+    if isinstance(carry, Tensor):
+        return carry.detach()
+    if isinstance(carry, tuple):
+        return tuple(detached(item) for item in carry)
+    if is_dataclass(carry) and not isinstance(carry, type):
+        return replace(carry, **{f.name: detached(getattr(carry, f.name)) for f in fields(carry)})
+    return carry
+
+
+def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> float:
+    """Gap at the finest level after so many steps a level, the last entries for the finest levels."""
+    x = patch.begin(0)
+    energy = math.inf
+    counts = steps[-len(patch.systems) :] if len(patch.systems) <= len(steps) else (steps[0], *steps)
+    with torch.no_grad():
+        for index, count in enumerate(counts):
+            level, system = patch.group.levels[index], patch.systems[index]
+            x = x if level.from_below is None else level.from_below.apply(x)
+            carry = integrator.start(system, x)
+            for _ in range(count):
+                carry = integrator.step(system, carry)
+            x, energy = carry.x, carry.energy
+    gap = (energy - patch.least[-1]) / (patch.start[-1] - patch.least[-1])
+    return gap if math.isfinite(gap) else 1e6

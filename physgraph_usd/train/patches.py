@@ -1,0 +1,260 @@
+"""Patches of cloth to train on, made from numbers alone: shapes, meshes, fabrics, borders and poses at random.
+
+A patch is a sheet, a tube or a dome of 6 to 12 cage edges (A21), irregular or in quads whose diagonals alternate. It is
+posed by a smooth random deformation, and some patches are draped first: our own solver lets the cage hang from what is
+fixed. No asset is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from scipy.spatial import Delaunay
+from torch import Tensor
+
+from ..fabric import Fabric
+from ..group import Group, SolveSettings
+from ..integrate import METHODS
+from ..integrate.base import System
+from ..integrate.quasi_newton import QuasiNewton
+from ..integrate.saddle import leave_saddle
+from ..integrate.solve import Budget, solve_level
+from ..level import refine_garments
+from ..mesh.topology import PolygonMesh, edges_of
+from ..scene import Garment, GarmentFrame
+
+SHAPES = ("sheet", "tube", "dome")
+BORDERS = ("fixed", "one side", "free")
+
+
+@dataclass(frozen=True)
+class PatchConfig:
+    """What patches are made.
+
+    Attributes:
+        count: Number of patches.
+        levels: Least and most subdivisions.
+        edges: Least and most cage edges along a side.
+        decades: How far stiffnesses range in all, in powers of ten; two thirds of them lie in the middle half.
+        elastic: Stretch and bending only, the border fixed, as in the paper; else gravity and guide too.
+        most_vertices: Finest vertices beyond which a patch has one level less.
+        reference_steps: Quasi-Newton steps a level behind the least energy known.
+    """
+
+    count: int = 64
+    levels: tuple[int, int] = (1, 3)
+    edges: tuple[int, int] = (6, 12)
+    decades: float = 3.0
+    elastic: bool = False
+    most_vertices: int = 4000
+    reference_steps: int = 150
+
+
+@dataclass(eq=False)
+class Patch:
+    """One patch in one pose.
+
+    Attributes:
+        group: The solver's levels.
+        frame: Its pose and fabric.
+        systems: One system a level, cage first.
+        coarse: Recentred cage positions [m].
+        start: Energy of the linearly upsampled cage at each level [J].
+        least: Least energy known at each level [J].
+        words: What it is.
+        solved: Positions after some steps of nested quasi-Newton at each level [m].
+        kept: Positions where the network in training last came to, by level [m].
+    """
+
+    group: Group
+    frame: GarmentFrame
+    systems: list[System]
+    coarse: Tensor
+    words: str
+    start: list[float] = field(default_factory=list)
+    least: list[float] = field(default_factory=list)
+    solved: list[Tensor] = field(default_factory=list)
+    kept: dict[int, Tensor] = field(default_factory=dict)
+
+    def begin(self, index: int) -> Tensor:
+        """The upsampled cage at a level [m], off the saddle where it is flat."""
+        level, outward = self.group.levels[index], torch.ones(1, device=self.coarse.device)
+        return leave_saddle(self.systems[index], level, level.base.apply(self.coarse), outward=outward)
+
+
+def make_patches(config: PatchConfig, *, seed: int, device: str) -> list[Patch]:
+    """Make patches; those whose pose is all but at rest are made again.
+
+    Args:
+        config: What patches.
+        seed: The same seed makes the same patches.
+        device: "cpu" or a CUDA device.
+    """
+    patches: list[Patch] = []
+    rng = np.random.default_rng(seed)
+    while len(patches) < config.count:
+        patch = _patch(config, rng, device)
+        measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
+        drop = [a - b for a, b in zip(patch.start, patch.least, strict=True)]
+        if all(np.isfinite(drop)) and min(drop) > 1e-3 * abs(patch.start[-1]) + 1e-12:
+            patches.append(patch)
+    return patches
+
+
+def measure(patch: Patch, steps: int, *, presolve: int) -> None:
+    """Find the energies between which a patch's levels move, by nested quasi-Newton.
+
+    Args:
+        patch: The patch.
+        steps: Steps a level behind the least energy known.
+        presolve: Steps a level of a second, shorter solve whose positions are kept.
+    """
+    patch.start, patch.least, patch.solved = [], [], []
+    x = short = patch.begin(0)
+    for index, (level, system) in enumerate(zip(patch.group.levels, patch.systems, strict=True)):
+        x, short = (x, short) if level.from_below is None else map(level.from_below.apply, (x, short))
+        x, report = solve_level(system, QuasiNewton(), x, level=index, budget=Budget(steps))
+        short, _ = solve_level(system, QuasiNewton(), short, level=index, budget=Budget(presolve))
+        patch.start.append(system.energy_and_force(level.base.apply(patch.coarse))[0])
+        patch.least.append(report.energy_after)
+        patch.solved.append(short)
+
+
+def _patch(config: PatchConfig, rng: np.random.Generator, device: str) -> Patch:
+    mesh, flat, closed = _mesh(config, rng)
+    shape = "tube" if closed else str(rng.choice([s for s in SHAPES if s != "tube"]))
+    edge = 10 ** rng.uniform(-2.3, -1.3)
+    rest = edge * _rolled(flat, shape, rng)
+    border = "fixed" if config.elastic else str(rng.choice(BORDERS, p=(0.25, 0.25, 0.5)))
+    pin = _pinned(mesh, flat, border)
+    fabric, guide, gravity = _material(config, rng, free=border == "free")
+    one = np.ones(len(rest))
+    levels = int(rng.integers(config.levels[0], config.levels[1] + 1))
+    while levels > 1 and len(rest) * 4**levels > config.most_vertices:
+        levels -= 1
+    garment = Garment("/Patch", mesh, rest, levels, False, bool(rng.random() < 0.3), one, one, one, one, pin)
+    points = _posed(rest, rng)
+    settings = SolveSettings(METHODS["quasi-newton"])
+    build = {"dtype": torch.float32, "device": device}
+    if rng.random() < 0.5 and pin.any():
+        points = _draped(Group([garment], [()], gravity, settings, **build), points, fabric, guide=guide, rng=rng)
+    group = Group([garment], refine_garments([garment], [levels]), gravity, settings, **build)
+    frame = GarmentFrame(points, fabric, guide)
+    systems, coarse = group.systems([frame])
+    words = f"{shape}, {'quads' if not mesh.is_triangles else 'triangles'}, border {border}, levels {levels}"
+    return Patch(group, frame, systems, coarse, words)
+
+
+def _mesh(config: PatchConfig, rng: np.random.Generator) -> tuple[PolygonMesh, np.ndarray, bool]:
+    """A cage in the plane, in cage edges: topology, points of shape (V, 2), and whether its sides are joined."""
+    columns, rows = (int(n) for n in rng.integers(config.edges[0], config.edges[1] + 1, 2))
+    closed = rng.random() < 0.35
+    if closed or rng.random() < 0.4:
+        return (*_quads(columns, rows, rng, closed=closed), closed)
+    points = np.stack(np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0)), axis=2).reshape(-1, 2)
+    points[:, 0] += 0.5 * (points[:, 1] % 2)
+    points[:, 1] *= np.sqrt(0.75)
+    points += rng.uniform(-0.3, 0.3, points.shape) * rng.random()
+    triangles = Delaunay(points).simplices
+    a, b, c = (points[triangles[:, i]] for i in range(3))
+    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    longest = np.max([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    triangles = triangles[(np.abs(area) > 0.15) & (longest < 2.2)]
+    triangles[area[(np.abs(area) > 0.15) & (longest < 2.2)] < 0] = triangles[
+        area[(np.abs(area) > 0.15) & (longest < 2.2)] < 0
+    ][:, ::-1]
+    used, corners = np.unique(triangles, return_inverse=True)
+    return PolygonMesh(np.full(len(triangles), 3), corners.reshape(-1), len(used)), points[used], False
+
+
+def _quads(columns: int, rows: int, rng: np.random.Generator, *, closed: bool) -> tuple[PolygonMesh, np.ndarray]:
+    """A grid of quads, or of triangles whose diagonals alternate; joined to a tube where closed."""
+    columns = max(columns, 8) if closed else columns
+    width = columns if closed else columns + 1
+    v, u = np.meshgrid(np.arange(rows + 1.0), np.arange(float(width)), indexing="ij")
+    cell_v, cell_u = np.divmod(np.arange(rows * columns), columns)
+    right = (cell_u + 1) % width
+    low, high = cell_v * width, (cell_v + 1) * width
+    quads = np.stack([low + cell_u, low + right, high + right, high + cell_u], axis=1)
+    points = np.stack([u.ravel(), v.ravel()], axis=1)
+    if rng.random() < 0.5:
+        return PolygonMesh(np.full(len(quads), 4), quads.reshape(-1), len(points)), points
+    turned = (cell_u + cell_v) % 2 == 1
+    quads[turned] = np.roll(quads[turned], 1, axis=1)
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return PolygonMesh(np.full(len(triangles), 3), triangles.reshape(-1), len(points)), points
+
+
+def _rolled(flat: np.ndarray, shape: str, rng: np.random.Generator) -> np.ndarray:
+    """The rest shape in cage edges."""
+    u, v = flat.T
+    if shape == "tube":
+        columns = u.max() + 1.0
+        radius = columns / (2 * np.pi) * (1.0 + rng.uniform(-0.03, 0.03) * (v - v.mean()))
+        angle = 2 * np.pi * u / columns
+        return np.stack([radius * np.cos(angle), v, -radius * np.sin(angle)], axis=1)
+    centre, size = flat.mean(axis=0), np.ptp(flat, axis=0).max()
+    height = 0.0 if shape == "sheet" else rng.uniform(0.05, 0.3)
+    square = ((flat - centre) ** 2).sum(axis=1)
+    return np.stack([u, v, -height * square / size], axis=1)
+
+
+def _posed(rest: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Squeezed, sheared, twisted, bent and waved at random, then turned anywhere."""
+    centre, size = rest.mean(axis=0), float(np.ptp(rest, axis=0).max())
+    frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    x = (rest - centre) @ frame / size
+    squeeze = 1.0 + np.array([-rng.uniform(0.03, 0.3), rng.uniform(-0.15, 0.03), rng.uniform(-0.15, 0.03)])
+    x = x * squeeze[rng.permutation(3)]
+    x[:, 0] += rng.normal(0.0, 0.08) * x[:, 1]
+    turn = rng.normal(0.0, 0.7) * x[:, 1]
+    cosine, sine = np.cos(turn), np.sin(turn)
+    x = np.stack([cosine * x[:, 0] - sine * x[:, 2], x[:, 1], sine * x[:, 0] + cosine * x[:, 2]], axis=1)
+    x[:, 2] += rng.normal(0.0, 0.3) * x[:, 1] ** 2
+    for _ in range(int(rng.integers(1, 5))):
+        direction, offset = rng.normal(size=3), rng.uniform(0, 2 * np.pi)
+        wave = np.pi * rng.uniform(1.0, 4.0) * direction / np.linalg.norm(direction)
+        amplitude = rng.normal(size=3) * 0.03 * np.pi / np.linalg.norm(wave) * rng.random()
+        x += np.sin(x @ wave + offset)[:, None] * amplitude
+    x += rng.normal(size=x.shape) * 0.1 * rng.random() ** 2 / np.sqrt(len(x))
+    return x @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T * size
+
+
+def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:
+    """1 on the fixed part of the border."""
+    pin = np.zeros(mesh.vertex_count)
+    edges = edges_of(mesh.triangulate().triangles, mesh.vertex_count)
+    rim = np.unique(edges.vertices[edges.face_count == 1])
+    if border == "fixed":
+        pin[rim] = 1.0
+    elif border == "one side":
+        pin[rim[flat[rim, 1] > flat[:, 1].max() - 0.5]] = 1.0
+    return pin
+
+
+def _material(config: PatchConfig, rng: np.random.Generator, *, free: bool) -> tuple[Fabric, float, np.ndarray]:
+    """Fabric, guide stiffness [N/m^3] and gravity [m/s^2]."""
+    half = 0.5 * config.decades
+    stretch, bend = (
+        middle * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for middle in (100.0, 5e-6)
+    )
+    direction = rng.normal(size=3)
+    down = 9.81 * direction / np.linalg.norm(direction) * (0.0 if config.elastic else float(rng.random() < 0.7))
+    guide = 2000.0 * 10 ** rng.uniform(-0.7, 0.7) if free or rng.random() < 0.8 else 0.0
+    return Fabric(stretch, bend, rng.uniform(0.08, 0.6)), 0.0 if config.elastic else guide, down
+
+
+def _draped(group: Group, points: np.ndarray, fabric: Fabric, *, guide: float, rng: np.random.Generator) -> np.ndarray:
+    """The cage after some steps of our own solver, softer than the cloth so that it folds as a cage does."""
+    soft = Fabric(fabric.stretch, 100.0 * fabric.bend, fabric.density)
+    systems, x = group.systems([GarmentFrame(points, soft, 0.1 * guide)])
+    x, _ = solve_level(systems[0], QuasiNewton(), x, level=0, budget=Budget(int(rng.integers(2, 20))))
+    return x.double().cpu().numpy()
+
+
+def describe(patches: Sequence[Patch]) -> list[str]:
+    """One line a patch."""
+    return [f"{p.words}, {p.group.levels[-1].vertex_count} vertices" for p in patches]

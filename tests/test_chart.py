@@ -1,0 +1,340 @@
+"""The chart: gaps against a reference, times, resuming, and the files that come of it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("pxr", reason="charts read stages with usd-core")
+pytest.importorskip("matplotlib", reason="charts are drawn with matplotlib")
+pytest.importorskip("plotly", reason="charts are drawn with plotly")
+
+from browser import hover, opened
+from click.testing import CliRunner
+from PIL import Image
+from pxr import Usd, UsdGeom
+from shots import cloth_shot, refine
+
+from physgraph_usd import cli
+from physgraph_usd.chart.journal import Journal
+from physgraph_usd.chart.measure import expected_ms, rungs
+from physgraph_usd.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
+from physgraph_usd.chart.options import LONG, SHORT, ChartOptions
+from physgraph_usd.chart.peers.run import PEERS, Peer, parse_peers
+from physgraph_usd.chart.plan import make_plan
+from physgraph_usd.chart.run import chart_shot
+from physgraph_usd.chart.table import Chart, Point, typical
+from physgraph_usd.chart.words import settings
+from physgraph_usd.errors import UsageError
+from physgraph_usd.integrate import METHODS, Method
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
+
+ECHO = """
+import sys
+import numpy as np
+problem = np.load(sys.argv[1])
+x = problem[f"base{int(problem['levels']) - 1}"]
+ms = np.array([5.0, 5.0])
+np.savez(sys.argv[2], x_0_1=x, ms_0_1=ms, x_1_1=x, ms_1_1=ms)
+"""
+"""A solver outside that does nothing."""
+
+OPTIONS = ChartOptions(
+    level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=5.0
+)
+QUICK = replace(OPTIONS, budget_minutes=0.02)
+
+
+def shot_with_ball(path: Path) -> Path:
+    """A waving sheet with a ball in it."""
+    shot = cloth_shot(path, size=(8, 6))
+    stage = Usd.Stage.Open(str(shot))
+    points = UsdGeom.Mesh.Get(stage, "/World/cloth").GetPointsAttr().Get(6.0)
+    ball = UsdGeom.Sphere.Define(stage, "/World/ball")
+    ball.GetRadiusAttr().Set(1.5)
+    ball.AddTranslateOp().Set(tuple(float(sum(p[axis] for p in points)) / len(points) for axis in range(3)))
+    stage.Save()
+    return shot
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Chart]:
+    """A shot, its chart's folder and the chart."""
+    folder = tmp_path_factory.mktemp("chart")
+    shot = shot_with_ball(folder / "sheet.usda")
+    return shot, folder / "out", chart_shot(shot, folder / "out", OPTIONS)
+
+
+def point(method: str, steps: int, ms: float, gap: float) -> Point:
+    return Point(
+        method=method,
+        integrator=method,
+        nested=True,
+        steps=steps,
+        made=steps,
+        tolerance=0.0,
+        ms=ms,
+        ms_median=ms,
+        ms_least=ms,
+        gap=gap,
+        energy=gap,
+        energies={"stretch": gap},
+        strain=0.0,
+        inside=0,
+        percent=0.0,
+        deepest_mm=0.0,
+        crossings=0,
+        tangles=0,
+        frames=1,
+        repeats=1,
+    )
+
+
+def chart_of(*points: Point) -> Chart:
+    return Chart({"waited": 0.0}, points, (), (), ())
+
+
+def test_gaps_lie_between_the_reference_and_plain_upsampling(made: tuple[Path, Path, Chart]):
+    chart = made[2]
+    assert chart.curve(UPSAMPLED)[0].gap == pytest.approx(1.0)
+    assert all(p.gap >= -1e-12 for p in chart.points)
+    assert chart.curve("quasi-newton")[-1].gap < 0.2 < chart.curve("gd")[0].gap
+    assert set(chart.methods) >= {DEFAULT, UPSAMPLED, SMOOTH, "quasi-newton", "gd", "gd, nested"}
+
+
+def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Chart], tmp_path: Path):
+    shot, _, chart = made
+    report = refine(
+        shot, tmp_path / "fine.usdc", level=1, steps=12, temporal="off", frames=(6.0, 6.0), colliders=["/World/ball"]
+    )
+    [garment] = report.frames[0]["garments"]
+    (own,) = chart.curve(DEFAULT)
+    told = garment["energy_joules"]["output"]
+    for name in ("stretch", "bending", "guide"):
+        assert own.energies[name] == pytest.approx(told[name], rel=1e-3)
+    after = garment["contact"]["bodies"]["/World/ball"]["after"]
+    assert (own.inside, own.crossings) == (after["inside"], after["crossings"])
+    assert chart.curve(UPSAMPLED)[0].inside > 0
+
+
+def test_terms_tell_what_is_worse_without_them(made: tuple[Path, Path, Chart]):
+    rows = {row["term"]: row for row in made[2].terms}
+    assert rows["contact"]["without"]["inside"] > rows["contact"]["with"]["inside"]
+    assert rows["level 0"]["without"]["energy"] > rows["level 1"]["without"]["energy"]
+    assert rows["level 1"]["moved_mm"] == 0.0
+    assert min(rows["tether"][which]["jerk"] for which in ("with", "without")) > 0.0
+    assert {"gravity", "bending", "guide", "warm"} <= set(rows)
+
+
+def test_the_files(made: tuple[Path, Path, Chart]):
+    _, folder, chart = made
+    with (folder / "chart.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows[0][0] == "method"
+    assert len(rows) == len(chart.points) + 1
+    told = json.loads((folder / "chart.json").read_text(encoding="utf-8"))
+    assert told["default"] == chart.default_place()
+    assert len(told["points"]) == len(chart.points)
+    with Image.open(folder / "chart.png") as picture:
+        assert picture.width > 800
+    assert (folder / "chart.svg").read_text(encoding="utf-8").count("<text") > 20
+
+
+def test_a_second_run_measures_nothing_again(made: tuple[Path, Path, Chart]):
+    shot, folder, _ = made
+    before = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
+    chart_shot(shot, folder, QUICK)
+    after = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
+    assert after.startswith(before)
+    rows = [json.loads(line) for line in after.splitlines()]
+    keys = [tuple(row.get(name) for name in ("row", "method", "steps", "frame", "repeat", "term")) for row in rows]
+    assert len(set(keys)) == len(keys)
+
+
+def test_an_interrupted_run_goes_on(made: tuple[Path, Path, Chart], tmp_path: Path):
+    shot, folder, chart = made
+    whole = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
+    out = shot.parent / "cut"
+    out.mkdir()
+    (out / "chart.rows.jsonl").write_text(whole[: 4 * len(whole) // 5], encoding="utf-8")
+    again = chart_shot(shot, out, QUICK)
+    energies, known = ({(p.method, p.steps): p.energy for p in each.points} for each in (again, chart))
+    both = energies.keys() & known.keys()
+    assert len(both) > 5
+    assert {key: energies[key] for key in both} == {key: known[key] for key in both}
+
+
+def test_another_shot_in_the_same_folder_is_refused(made: tuple[Path, Path, Chart]):
+    shot, folder, _ = made
+    with pytest.raises(UsageError, match="another shot or of other options"):
+        chart_shot(shot, folder, replace(OPTIONS, level=0))
+
+
+@pytest.mark.browser
+def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
+    _, folder, chart = made
+    with opened(folder / "chart.html") as page:
+        page.locator(".legend .traces").first.wait_for()
+        panels = 1 + len(chart.panels)
+        curves = page.locator("#curves .scatterlayer .trace")
+        assert page.locator(".legend .traces").count() == len(chart.methods)
+        assert curves.count() == panels * len(chart.methods)
+        index = chart.methods.index("gd, nested")
+        said = hover(page, curves.nth(index).locator(".points path").nth(1))
+        own = chart.curve("gd, nested")[1]
+        assert f"gd, nested, {own.steps} steps there" in said
+        assert f"{own.ms:.1f} ms a frame" in said
+        page.locator(".legend .traces").nth(index).locator(".legendtoggle").click()
+        page.wait_for_function(
+            f"document.querySelectorAll('#curves .scatterlayer .trace').length == {panels * (len(chart.methods) - 1)}"
+        )
+        assert "contact" in page.locator("#terms").text_content()
+
+
+def test_times_to_a_gap_are_read_between_budgets():
+    chart = chart_of(
+        point("a", 1, 10.0, 0.4), point("a", 2, 20.0, 0.5), point("a", 4, 40.0, 0.1), point("b", 1, 5.0, 0.6)
+    )
+    assert chart.time_to("a", 0.4) == 10.0
+    assert chart.time_to("a", 0.2) == pytest.approx(20.0)
+    assert chart.time_to("a", 0.01) is None
+    assert chart.times_to(0.2) == {"a": pytest.approx(20.0)}
+
+
+@pytest.mark.parametrize(("ms", "on_front"), [(19.0, True), (21.0, True), (30.0, False)])
+def test_the_default_is_on_the_front_or_not(ms: float, on_front: bool):
+    place = chart_of(point("a", 1, 10.0, 0.4), point("a", 4, 40.0, 0.1), point(DEFAULT, 12, ms, 0.2)).default_place()
+    assert place is not None
+    assert place["on_front"] is on_front
+    assert place["ratio"] == pytest.approx(ms / 20.0)
+
+
+def test_a_busy_machine_is_told():
+    chart = replace(chart_of(point("a", 1, 10.0, 0.4)), about={"waited": 0.3})
+    assert "waited for a core 30% of the time" in chart.busy
+    assert chart.busy in list(chart.lines()) or chart.default_place() is None
+
+
+def test_noise_that_only_adds_is_left_out():
+    assert typical([10.0, 30.0, 11.0, 90.0, 12.0]) == 11.0
+    assert typical([10.0]) == 10.0
+
+
+def test_every_integrator_is_found_when_the_chart_is_made(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(METHODS, "newcomer", Method(lambda: QuasiNewton(history=2), nested=True))
+    curves = {curve.name: curve.method.nested for curve in find_curves()}
+    assert set(METHODS) <= set(curves)
+    assert curves["newcomer, flat"] is False
+    assert curves["gd, nested"] is True
+    assert "quasi-newton, flat" not in curves
+    with pytest.raises(UsageError, match="unknown integrator 'nobody'"):
+        find_curves(["nobody"])
+
+
+def test_budgets_grow_by_the_size_s_factor():
+    assert list(rungs(2.0))[:5] == [1, 2, 4, 8, 16]
+    assert list(rungs(1.5))[:8] == [1, 2, 3, 4, 6, 8, 12, 16]
+
+
+def test_the_next_budget_is_expected_on_a_line():
+    rows = [{"steps": 1, "ms": 718.0}, {"steps": 2, "ms": 1206.0}, {"steps": 4, "ms": 9e9}]
+    assert expected_ms(rows[:1], 1, 2.0) == 718.0
+    assert expected_ms(rows, 2, 2.0) == pytest.approx(1206.0 + 2 * 488.0)
+
+
+@pytest.mark.parametrize("default_ms", [5.0, 300.0, 1500.0])
+def test_the_short_form_is_planned_under_its_time(default_ms: float):
+    plan = make_plan(SHORT, curves=12, default_ms=default_ms, elapsed_ms=default_ms, judge_ms=0.2 * default_ms)
+    assert plan.minutes <= 12.0
+    assert plan.frames >= 1
+    assert plan.repeats >= SHORT.repeats
+    assert make_plan(LONG, curves=12, default_ms=default_ms, elapsed_ms=default_ms, judge_ms=0.0).minutes > plan.minutes
+
+
+@pytest.mark.parametrize("changes", [{"count": 0}, {"budget_minutes": -1.0}, {"device": "tpu"}, {"clock": "sun"}])
+def test_wrong_options_are_refused(changes: dict[str, Any]):
+    with pytest.raises(UsageError):
+        replace(ChartOptions(), **changes).check()
+
+
+def test_a_line_that_was_cut_off_is_dropped(tmp_path: Path):
+    journal = Journal(tmp_path, {"shot": "a"}, overwrite=False)
+    journal.add("point", method="a", ms=1.0)
+    file = tmp_path / "chart.rows.jsonl"
+    file.write_text(file.read_text(encoding="utf-8") + '{"row": "poi', encoding="utf-8")
+    again = Journal(tmp_path, {"shot": "a"}, overwrite=False)
+    again.add("point", method="b", ms=math.pi)
+    assert [row["method"] for row in Journal(tmp_path, {"shot": "a"}, overwrite=False).rows("point")] == ["a", "b"]
+
+
+def test_a_solver_outside_is_measured_by_the_same_ruler(
+    made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any
+):
+    """A peer that hands back the plain upsampling has a gap of 1."""
+    adapter = tmp_path / "echo.py"
+    adapter.write_text(ECHO, encoding="utf-8")
+    monkeypatch.setitem(PEERS, "echo", Peer("Echo", str(adapter), "nothing of the problem"))
+    shot = made[0]
+    options = replace(QUICK, methods=("gd",), peers=(f"echo={sys.executable}",))
+    chart = chart_shot(shot, tmp_path / "out", options)
+    assert [(p.steps, p.nested, p.repeats) for p in chart.curve("Echo, nested")] == [(1, True, 2)]
+    assert chart.curve("Echo")[0].gap == pytest.approx(1.0, abs=1e-6)
+    assert chart.curve("Echo")[0].ms == 5.0
+    assert "nothing of the problem" in settings(chart.curve("Echo")[0])
+
+
+def test_a_solver_outside_that_fails_is_told(made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any):
+    adapter = tmp_path / "broken.py"
+    adapter.write_text("raise SystemExit('out of luck')", encoding="utf-8")
+    monkeypatch.setitem(PEERS, "broken", Peer("Broken", str(adapter), ""))
+    options = replace(QUICK, methods=("gd",), peers=(f"broken={sys.executable}",))
+    chart = chart_shot(made[0], tmp_path / "out", options)
+    assert [row["error"] for row in chart.failed] == ["Broken ended with code 1: out of luck"]
+
+
+@pytest.mark.parametrize("given", ["nobody=python", "newton", "newton=no/such/python"])
+def test_wrong_peers_are_refused(given: str):
+    with pytest.raises(UsageError, match="peer"):
+        parse_peers([given])
+
+
+LINE = (
+    "--level",
+    "1",
+    "--method",
+    "quasi-newton",
+    "--method",
+    "gd",
+    "--collider",
+    "/World/ball",
+    "--budget-minutes",
+    "0.02",
+)
+
+
+def test_the_command_prints_a_summary_and_tells_progress(made: tuple[Path, Path, Chart], tmp_path: Path):
+    shot, folder, _ = made
+    shutil.copytree(folder, tmp_path / "out")
+    result = CliRunner().invoke(cli.main, ["chart", str(shot), "-o", str(tmp_path / "out"), *LINE])
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("| method | ms to 10% | ms to 3% | ms to 1% | least gap | at ms |")
+    assert "refine's default: " in result.stdout
+    assert "left" in result.stderr
+
+
+@pytest.mark.parametrize("missing", ["matplotlib", "plotly"])
+def test_a_missing_library_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, missing: str):
+    for name in [name for name in sys.modules if name.startswith("physgraph_usd.chart")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    result = CliRunner().invoke(cli.main, ["chart", "shot.usda", "-o", str(tmp_path / "out")])
+    assert result.exit_code == 1
+    assert result.stderr == f"error: {missing} is not installed: pip install 'physgraph-usd[chart]'\n"

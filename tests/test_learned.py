@@ -1,0 +1,269 @@
+"""The learned integrators: what holds for any weights, and that files which are not what they say are refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cloth import DOWN, FABRIC, GUIDE, finest_system, group_of, sheet, wave
+from safetensors import safe_open
+from safetensors.torch import save_file
+from sheets import rotation
+
+from physgraph_usd.errors import WeightsError
+from physgraph_usd.fabric import Fabric
+from physgraph_usd.group import Group
+from physgraph_usd.integrate import METHODS
+from physgraph_usd.integrate.base import Carry, Integrator, System
+from physgraph_usd.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
+from physgraph_usd.integrate.network import VECTORS, PaperConfig, Physgraph, PhysgraphConfig
+from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
+from physgraph_usd.level import refine_garments
+from physgraph_usd.scene import GarmentFrame
+
+ALL = PhysgraphConfig(vectors=VECTORS, width=16, rounds=1, strain=True)
+PLAIN = PhysgraphConfig(width=16)
+LOCAL = PhysgraphConfig(width=16, means=False)
+PAPER = PaperConfig(latent=16, rounds=3)
+SMALL = 0.1
+"""Scale of random weights whose steps keep the cloth whole."""
+
+
+def problem(dtype: torch.dtype = torch.float64, level: int = 1) -> tuple[System, torch.Tensor]:
+    mesh, rest = sheet(6, 5)
+    return finest_system(group_of(mesh, rest, level=level, dtype=dtype), wave(rest))
+
+
+def run(integrator: Integrator, system: System, x: torch.Tensor, *, steps: int = 3) -> Carry:
+    carry = integrator.start(system, x)
+    for _ in range(steps):
+        carry = integrator.step(system, carry)
+    return carry
+
+
+@pytest.mark.parametrize("config", [PLAIN, LOCAL, ALL])
+def test_untrained_it_takes_the_metric_step(config: PhysgraphConfig):
+    system, x = problem()
+    integrator = integrator_of(make_network(config))
+    carry = integrator.start(system, x)
+    assert carry.preconditioned is not None
+    expected = limited(carry.preconditioned, system.spacing)
+    assert torch.allclose(integrator.propose(system, carry).detach(), expected, atol=1e-12)
+
+
+def test_untrained_the_papers_network_stays():
+    system, x = problem()
+    carry = run(integrator_of(make_network(PAPER).eval().requires_grad_(False)), system, x)
+    assert torch.equal(carry.x, x)
+
+
+@pytest.mark.parametrize("vectors", [("metric", "move1", "diagonal"), ("secant", "metric", "metric1", "move1")])
+def test_one_kernel_does_what_torch_does(vectors: tuple[str, ...]):
+    system, x = problem(torch.float32, level=2)
+    network = random_network(PhysgraphConfig(vectors=vectors, width=16, means=False), seed=7, scale=0.3)
+    assert isinstance(network, Physgraph)
+    one, other = LearnedMetric(network), LearnedMetric(network, fuse=False)
+    carry = one.start(system, x)
+    for _ in range(4):
+        carry = one.step(system, carry)
+        move, expected = one.propose(system, carry), other.propose(system, carry)
+        assert float((move - expected).abs().max()) < 1e-5 * float(expected.abs().max())
+        assert not bool(move[~system.free.squeeze(1)].any())
+
+
+@pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])
+def test_one_evaluation_a_step(config: PhysgraphConfig | PaperConfig):
+    system, x = problem()
+    run(integrator_of(random_network(config, seed=1, scale=SMALL)), system, x, steps=4)
+    assert system.evaluations == 5
+
+
+@pytest.mark.parametrize(("dtype", "most"), [(torch.float32, 1e-4), (torch.float64, 1e-5)])
+@pytest.mark.parametrize("config", [PLAIN, LOCAL, ALL])
+def test_s11_it_turns_with_the_cloth(config: PhysgraphConfig, dtype: torch.dtype, most: float):
+    mesh, rest = sheet(6, 5)
+    turn, far = rotation(3), np.array([1e5, -2e5, 3e5])
+    integrator = integrator_of(random_network(config, seed=2, scale=SMALL))
+    ends = []
+    for points, about, down in ((wave(rest), rest, DOWN), (wave(rest) @ turn.T + far, rest @ turn.T, turn @ DOWN)):
+        system, x = finest_system(group_of(mesh, about, level=2, dtype=dtype, gravity=down), points)
+        carry = run(integrator, system, x)
+        ends.append(((carry.x - x).double().numpy(), float(system.spacing.mean())))
+    assert np.abs(ends[0][0]).max() > 0.01 * ends[0][1]
+    error = np.abs(ends[1][0] @ turn - ends[0][0]).max() / ends[0][1]
+    assert error < most, error
+
+
+@pytest.mark.parametrize("config", [PLAIN, PAPER])
+@pytest.mark.parametrize(("size", "stiffer"), [(100.0, 1.0), (1.0, 1000.0), (0.01, 1e-3)])
+def test_no_units_reach_the_network(config: PhysgraphConfig | PaperConfig, size: float, stiffer: float):
+    """The same cloth at another size, every force scaled alike, makes the same step."""
+    mesh, rest = sheet(6, 5)
+    integrator = integrator_of(random_network(config, seed=2, scale=SMALL if config is PLAIN else 1.0))
+    moves = []
+    for s, c in ((1.0, 1.0), (size, stiffer)):
+        fabric = Fabric(c * FABRIC.stretch, c * s**2 * FABRIC.bend, c * FABRIC.density / s)
+        group = group_of(mesh, s * rest, level=1)
+        systems, coarse = group.systems([GarmentFrame(s * wave(rest), fabric, c * GUIDE / s**2)])
+        x = group.levels[-1].base.apply(coarse)
+        moves.append((run(integrator, systems[-1], x).x - x) / s)
+    assert float((moves[1] - moves[0]).abs().max()) < 1e-5 * 0.025
+
+
+def test_raw_features_do_see_units():
+    """The paper's own features are the comparison: they change with the scene's scale, so the test above can fail."""
+    mesh, rest = sheet(6, 5)
+    integrator = integrator_of(random_network(replace(PAPER, features="paper"), seed=2))
+    moves = []
+    for c in (1.0, 1000.0):
+        fabric = Fabric(c * FABRIC.stretch, c * FABRIC.bend, c * FABRIC.density)
+        group = group_of(mesh, rest, level=1)
+        systems, coarse = group.systems([GarmentFrame(wave(rest), fabric, c * GUIDE)])
+        x = group.levels[-1].base.apply(coarse)
+        moves.append(run(integrator, systems[-1], x).x - x)
+    assert float((moves[1] - moves[0]).abs().max()) > 1e-3 * 0.025
+
+
+@pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])
+def test_s34_a_run_repeats_bit_for_bit(config: PhysgraphConfig | PaperConfig):
+    ends = []
+    for _ in range(2):
+        system, x = problem(torch.float32)
+        ends.append(run(integrator_of(random_network(config, seed=3, scale=SMALL)), system, x, steps=5).x)
+    assert torch.equal(ends[0], ends[1])
+
+
+@pytest.mark.parametrize("config", [PLAIN, PAPER])
+@pytest.mark.parametrize("factor", [0.0, 1e-6, 1e6])
+def test_s12_no_force_no_step_and_no_step_beyond_the_cap(config: PhysgraphConfig | PaperConfig, factor: float):
+    class Scaled:
+        """Forces times a factor, their stiffness as it was."""
+
+        def __init__(self, system: System) -> None:
+            self.system = system
+
+        def energy_and_force(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            energy, force = self.system.field.energy_and_force(x)
+            return factor * energy, factor * force
+
+        def diagonal(self, x: torch.Tensor) -> torch.Tensor:
+            return self.system.field.diagonal(x)
+
+    base, x = problem()
+    system = System(Scaled(base), base.metric, free=base.free, spacing=base.spacing, level=base.level)
+    integrator = integrator_of(random_network(config, seed=4))
+    move = integrator.propose(system, integrator.start(system, x))
+    longest = float((move.norm(dim=1) / system.spacing).max())
+    assert np.isfinite(longest)
+    assert longest <= LONGEST * (1 + 1e-6)
+    if factor == 0.0 and config is PLAIN:
+        assert longest == 0.0
+
+
+def test_s10_without_means_a_patch_moves_as_it_would_in_a_larger_garment():
+    """Beside three copies of itself and a resting sheet, a garment's displacement is its own."""
+    mesh, rest = sheet(6, 5)
+    integrator = integrator_of(random_network(LOCAL, seed=5, scale=SMALL))
+    alone, x = finest_system(group_of(mesh, rest, level=1), wave(rest))
+    one = run(integrator, alone, x).x - x
+    group = group_of(mesh, rest, level=1)
+    garments = list(group.garments) * 2
+    both = Group(garments, refine_garments(garments, [1, 1]), DOWN, group._settings, dtype=torch.float64, device="cpu")
+    frames = [GarmentFrame(wave(rest), FABRIC, GUIDE), GarmentFrame(rest + np.array([0.0, 0.0, 1.0]), FABRIC, GUIDE)]
+    systems, coarse = both.systems(frames)
+    begin = both.levels[-1].base.apply(coarse)
+    two = (run(integrator, systems[-1], begin).x - begin)[: len(one)]
+    assert float((two - one).abs().max()) < 0.01 * float(one.abs().max())
+
+
+def test_weights_come_back_as_they_were(tmp_path: Path):
+    for config, kind in ((ALL, "physgraph"), (PAPER, "physgraph-paper")):
+        network = random_network(config, seed=6)
+        file = tmp_path / "w.safetensors"
+        digest = save_network(network, file)
+        again = load_network(file, kind=kind)
+        assert again.config == config
+        assert all(torch.equal(a, b) for a, b in zip(network.parameters(), again.parameters(), strict=True))
+        assert save_network(again, tmp_path / "again.safetensors") == digest
+
+
+def spoilt(file: Path, how: str) -> None:
+    """Spoil a weights file."""
+    with safe_open(str(file), framework="pt") as opened:
+        about = dict(opened.metadata())
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}
+    data = file.read_bytes()
+    if how == "missing":
+        file.unlink()
+    elif how == "cut":
+        file.write_bytes(data[: len(data) // 2])
+    elif how == "empty":
+        file.write_bytes(b"")
+    elif how == "text":
+        file.write_text("weights")
+    elif how == "one bit":
+        file.write_bytes(data[:-3] + bytes([data[-3] ^ 1]) + data[-2:])
+    elif how == "other version":
+        save_file(tensors, file, metadata=about | {"version": "0"})
+    elif how == "no metadata":
+        save_file(tensors, file)
+    elif how == "other width":
+        config = json.loads(about["config"]) | {"width": 17}
+        save_file(tensors, file, metadata=about | {"config": json.dumps(config)})
+    elif how == "unknown vector":
+        config = json.loads(about["config"]) | {"vectors": ["metric", "moon"]}
+        save_file(tensors, file, metadata=about | {"config": json.dumps(config)})
+    else:
+        network = make_network(PLAIN)
+        network.decode.bias.data.fill_(torch.nan)
+        save_network(network, file)
+
+
+@pytest.mark.parametrize(
+    ("how", "word"),
+    [
+        ("missing", "no weights at"),
+        ("cut", "cannot be read"),
+        ("empty", "cannot be read"),
+        ("text", "cannot be read"),
+        ("one bit", "damaged"),
+        ("other version", "version '0'"),
+        ("no metadata", "version None"),
+        ("other width", "does not fit"),
+        ("unknown vector", "moon"),
+        ("NaN", "not finite"),
+    ],
+)
+def test_s37_wrong_weights_are_refused_by_name(tmp_path: Path, how: str, word: str):
+    file = tmp_path / "w.safetensors"
+    save_network(random_network(PLAIN, seed=1), file)
+    spoilt(file, how)
+    with pytest.raises(WeightsError, match=word) as caught:
+        load_network(file, kind="physgraph")
+    assert str(file) in str(caught.value)
+
+
+def test_s37_weights_of_the_other_kind_are_refused(tmp_path: Path):
+    file = tmp_path / "w.safetensors"
+    save_network(random_network(PAPER, seed=1), file)
+    with pytest.raises(WeightsError, match="'physgraph-paper', not of 'physgraph'"):
+        load_network(file, kind="physgraph")
+
+
+@pytest.mark.parametrize("kind", ["physgraph", "physgraph-paper"])
+def test_shipped_weights_solve_and_have_a_card(kind: str):
+    file = FOLDER / f"{kind}.safetensors"
+    if not file.exists():
+        pytest.skip(f"no weights of {kind} ship")
+    card = json.loads(file.with_suffix(".json").read_text())
+    with safe_open(str(file), framework="pt") as opened:
+        assert opened.metadata()["sha256"] == card["sha256"]
+    system, x = problem(torch.float32, level=2)
+    _, report = solve_level(system, METHODS[kind].build(), x, level=2, budget=Budget(8))
+    assert report.energy_after < report.energy_before
+    assert report.movers[kind] >= 6

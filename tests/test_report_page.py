@@ -1,0 +1,146 @@
+"""The report as a folder: a page with pictures, plots over time and words, beside the JSON."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import re
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pxr", reason="shots are read with usd-core")
+
+from browser import opened
+from shots import CLOTH, TIMES, cloth_shot, refine
+
+from physgraph_usd.errors import LayerError, UsageError
+from physgraph_usd.options import json_of
+from physgraph_usd.page.plot import plot
+from physgraph_usd.page.report import page
+from physgraph_usd.page.series import add_jerk, read_series, third_difference
+from physgraph_usd.report import RefineReport
+from physgraph_usd.usd.readback import RefinedLayer
+from physgraph_usd.usd.reader import open_shot
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, RefineReport]:
+    """A shot with a frame that cannot be solved, its layer and report; the page lies in ``report``."""
+    folder = tmp_path_factory.mktemp("page")
+    shot = cloth_shot(folder / "sheet.usda", times=(*TIMES, 7.0, 8.0), broken={3.0: math.nan})
+    return shot, folder / "fine.usdc", refine(shot, folder / "fine.usdc", report=folder / "report")
+
+
+def text_of(made: tuple[Path, Path, RefineReport]) -> str:
+    return (made[1].parent / "report" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_folder_holds_the_page_and_the_same_json(made: tuple[Path, Path, RefineReport]):
+    told = json.loads((made[1].parent / "report" / "report.json").read_text(encoding="utf-8"))
+    assert told == json.loads(made[2].to_json())
+    assert text_of(made).startswith("<!doctype html>")
+    assert sorted(file.name for file in (made[1].parent / "report").iterdir()) == ["report.html", "report.json"]
+
+
+def test_warnings_name_prim_and_time_code(made: tuple[Path, Path, RefineReport]):
+    warnings = re.search(r"id='warnings'>(.*?)</ul>", text_of(made), re.S)
+    assert warnings
+    assert "time code 3" in warnings[1]
+    assert f"&lt;{CLOTH}&gt;" in warnings[1]
+
+
+def test_what_was_left_out_and_why(made: tuple[Path, Path, RefineReport]):
+    text = text_of(made)
+    for name, why in (made[2].modelled | made[2].left_out).items():
+        assert f"<td>{name}</td>" in text
+        assert html.escape(why) in text
+
+
+def test_pictures_are_in_the_page(made: tuple[Path, Path, RefineReport]):
+    pytest.importorskip("embreex", reason="pictures cast rays with embreex")
+    assert text_of(made).count("src='data:image/png;base64,") == 3
+
+
+def test_jerk_is_told_where_four_samples_in_a_row_are_there(made: tuple[Path, Path, RefineReport]):
+    drawn = re.search(r"id='jerk-0'.*?data-plot='(.*?)'", text_of(made), re.S)
+    assert drawn
+    told = json.loads(html.unescape(drawn[1]))
+    assert told["times"] == ["1", "2", "3", "4", "5", "6", "7", "8"]
+    assert [value is not None for value in told["values"][0]] == [False] * 6 + [True] * 2
+
+
+def test_the_third_difference_of_a_cubic_is_six_times_its_factor():
+    way = np.array([[1.0, 2.0, 2.0], [0.0, 0.0, 3.0]])
+    detail = [way * time**3 + time**2 - 4.0 * time + 1.0 for time in (3.0, 4.0, 5.0, 6.0)]
+    assert third_difference(detail) == pytest.approx(18.0)
+
+
+def test_a_frozen_shot_has_no_jerk(tmp_path: Path):
+    shot = cloth_shot(tmp_path / "still.usda", frozen=True)
+    report = refine(shot, tmp_path / "fine.usdc")
+    series = [read_series(report, 0)]
+    with closing(open_shot(str(shot))) as opened_shot:
+        add_jerk(series, report, opened_shot, tmp_path / "fine.usdc")
+    assert series[0].jerk["jerk"][:3] == [None] * 3
+
+
+def test_series_are_gaps_where_a_frame_failed(made: tuple[Path, Path, RefineReport]):
+    series = read_series(made[2], 0)
+    assert series.energy["total"][2] is None
+    assert series.energy["total"][1] == pytest.approx(
+        1e3 * sum(made[2].frames[1]["garments"][0]["energy_joules"]["output"].values())
+    )
+
+
+def test_a_plot_keeps_its_lines_inside_and_breaks_them_at_gaps():
+    svg = plot(
+        "p", "Title [mm]", [1.0, 2.0, 3.0, 4.0], {"a": [0.0, 5.0, None, -2.0], "b": [math.inf, None, None, None]}
+    )
+    assert svg.count("<polyline") == 1
+    assert svg.count("<circle") == 3
+    places = [(float(x), float(y)) for x, y in re.findall(r"cx='([\d.]+)' cy='([\d.]+)'", svg)]
+    assert all(64 <= x <= 1108 and 8 <= y <= 166 for x, y in places)
+    assert places[1][1] < places[0][1] < places[2][1]
+    assert plot("p", "nothing", [1.0], {"a": [None]}) == ""
+
+
+def test_names_are_escaped():
+    report = RefineReport("<script>alert(1)</script>.usda", None, {}, warnings=["</a> & <b>"])
+    text = page(report, [])
+    assert "<script>alert" not in text
+    assert "&lt;/a&gt; &amp; &lt;b&gt;" in text
+
+
+def test_where_the_json_goes(tmp_path: Path):
+    assert json_of(tmp_path / "a.json") == tmp_path / "a.json"
+    assert json_of(tmp_path / "a") == tmp_path / "a" / "report.json"
+    (tmp_path / "b.json").mkdir()
+    assert json_of(tmp_path / "b.json") == tmp_path / "b.json" / "report.json"
+
+
+def test_an_existing_report_is_not_overwritten(made: tuple[Path, Path, RefineReport], tmp_path: Path):
+    with pytest.raises(UsageError, match="exists"):
+        refine(made[0], tmp_path / "again.usdc", report=made[1].parent / "report")
+
+
+def test_a_layer_that_is_not_ours_is_refused(made: tuple[Path, Path, RefineReport]):
+    with pytest.raises(LayerError, match="no refined layer"):
+        RefinedLayer(made[0])
+
+
+@pytest.mark.browser
+def test_the_page_in_a_browser(made: tuple[Path, Path, RefineReport]):
+    with opened(made[1].parent / "report" / "report.html") as shown:
+        plots = shown.locator("svg.plot")
+        assert plots.count() >= 4
+        box = shown.locator("#energy-0").bounding_box()
+        shown.locator("#energy-0").hover(position={"x": 0.999 * box["width"], "y": 0.5 * box["height"]})
+        said = shown.locator("[data-of='energy-0']").text_content()
+        entry = made[2].frames[-1]["garments"][0]["energy_joules"]["output"]
+        assert "time code 8" in said
+        assert f"bending {1e3 * entry['bending']:.4g}" in said
+        assert shown.locator("#energy-0 .cursor").evaluate("line => line.style.visibility") == "visible"

@@ -1,0 +1,268 @@
+"""Training: patches, gradients through forces, the record of a run, and going on after an interruption."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from physgraph_usd.cli import main
+from physgraph_usd.errors import UsageError
+from physgraph_usd.integrate.learned import integrator_of
+from physgraph_usd.integrate.network import PaperConfig, PhysgraphConfig
+from physgraph_usd.integrate.weights import load_network, random_network
+from physgraph_usd.train import record
+from physgraph_usd.train.loop import TrainConfig, Trainer, detached, loss_of, nested_gap
+from physgraph_usd.train.patches import Patch, PatchConfig, describe, make_patches
+from physgraph_usd.train.unroll import JointSystem
+
+FEW = PatchConfig(count=3, levels=(1, 1), edges=(5, 6), reference_steps=20)
+TINY = """
+kind = "{kind}"
+minutes = 5.0
+iterations = {iterations}
+batch = 2
+unroll = 3
+segments = 1
+held_out = 1
+[network]
+{network}
+[patches]
+count = 2
+levels = [1, 1]
+edges = [5, 5]
+reference_steps = 10
+"""
+
+
+@pytest.fixture(scope="module")
+def patches() -> list[Patch]:
+    return make_patches(FEW, seed=3, device="cpu")
+
+
+def test_the_same_seed_makes_the_same_patches(patches: list[Patch]):
+    again = make_patches(FEW, seed=3, device="cpu")
+    assert describe(again) == describe(patches)
+    for one, other in zip(patches, again, strict=True):
+        assert torch.equal(one.coarse, other.coarse)
+        assert one.least == other.least
+        assert one.frame.fabric == other.frame.fabric
+    assert not torch.equal(make_patches(FEW, seed=4, device="cpu")[0].coarse, patches[0].coarse)
+
+
+def test_patches_have_room_to_fall(patches: list[Patch]):
+    for patch in patches:
+        assert all(low < high for low, high in zip(patch.least, patch.start, strict=True))
+
+
+def test_patches_differ_in_shape_mesh_border_and_fabric():
+    many = make_patches(PatchConfig(count=24, levels=(1, 1), edges=(5, 6), reference_steps=3), seed=5, device="cpu")
+    words = " ".join(patch.words for patch in many)
+    for word in ("sheet", "tube", "dome", "quads", "triangles", "border fixed", "border one side", "border free"):
+        assert word in words
+    for values in ([p.frame.fabric.stretch for p in many], [p.frame.fabric.bend for p in many]):
+        assert np.log10(max(values) / min(values)) > 1.5
+        assert np.log10(max(values) / min(values)) <= 3.0 + 1e-9
+
+
+def test_elastic_patches_feel_stretch_and_bending_only():
+    for patch in make_patches(replace(FEW, elastic=True), seed=6, device="cpu"):
+        module, _ = patch.group.modules([patch.frame])
+        energies = module[-1].energies(patch.begin(len(patch.systems) - 1))
+        assert energies["gravity"] == 0.0
+        assert energies["guide"] == 0.0
+        assert not bool(patch.group.levels[-1].free.all())
+
+
+def joint(patches: list[Patch], *, through_forces: bool = True) -> tuple[JointSystem, torch.Tensor]:
+    system = JointSystem([p.systems[-1] for p in patches], through_forces=through_forces)
+    return system, torch.cat([p.begin(len(p.systems) - 1) for p in patches])
+
+
+@pytest.mark.parametrize(
+    "config", [PhysgraphConfig(width=8), PhysgraphConfig(("secant", "metric", "normal"), 8, 2, 1, True)]
+)
+def test_patches_side_by_side_move_as_they_do_alone(patches: list[Patch], config: PhysgraphConfig):
+    integrator = integrator_of(random_network(config, seed=1, scale=0.1))
+    system, x = joint(patches)
+    together = integrator.start(system, x)
+    for _ in range(3):
+        together = integrator.step(system, together)
+    for number, (patch, span) in enumerate(zip(patches, system.spans, strict=True)):
+        carry = integrator.start(patch.systems[-1], x[span])
+        for _ in range(3):
+            carry = integrator.step(patch.systems[-1], carry)
+        spacing = float(patch.systems[-1].spacing.mean())
+        assert float((carry.x - together.x[span]).abs().max()) < 1e-3 * spacing
+        assert float(system.energies[-1][number]) == pytest.approx(carry.energy, rel=1e-4)
+
+
+def test_the_energys_gradient_is_minus_the_force(patches: list[Patch]):
+    system, x = joint(patches)
+    x.requires_grad_()
+    system.energy_and_force(x)
+    (gradient,) = torch.autograd.grad(system.energies[-1].sum(), x)
+    _, force = system.energy_and_force(x.detach())
+    assert torch.allclose(gradient * system.free, -force, rtol=1e-5, atol=1e-7 * float(force.abs().max()))
+
+
+def test_the_forces_gradient_is_a_product_with_the_hessian(patches: list[Patch]):
+    """u . H w by the gradient of u . F against a difference quotient of it along w, for smooth u and w."""
+    system, x = joint(patches[:1])
+    generator = torch.Generator().manual_seed(1)
+    u, w = (system.apply_metric_inverse(torch.randn(x.shape, generator=generator)) * system.free for _ in range(2))
+    w = 0.01 * w / (w.norm(dim=1) / system.spacing).max()
+    there = x.clone().requires_grad_()
+    _, force = system.energy_and_force(there)
+    (gradient,) = torch.autograd.grad((u * force).sum(), there)
+    quotient = 0.5 * float((u * (system.energy_and_force(x + w)[1] - system.energy_and_force(x - w)[1])).sum())
+    assert float((gradient * w).sum()) == pytest.approx(quotient, rel=0.03)
+
+
+def test_without_gradients_through_forces_only_displacements_count(patches: list[Patch]):
+    system, x = joint(patches, through_forces=False)
+    x.requires_grad_()
+    _, force = system.energy_and_force(x)
+    assert not force.requires_grad
+
+
+def test_the_loss_counts_gaps_of_each_patch_relative_to_its_own_start():
+    before, least = torch.tensor([2.0, 20.0]), torch.tensor([1.0, 10.0])
+    energies = torch.tensor([[1.5, 15.0], [1.25, 12.5]])
+    assert float(loss_of(energies, before, least, kind="ratio")) == pytest.approx(0.375)
+    scaled = loss_of(1e3 * energies, 1e3 * before, 1e3 * least, kind="log")
+    assert float(scaled) == pytest.approx(float(loss_of(energies, before, least, kind="log")))
+    huge = loss_of(torch.tensor([[1e9, 1e9]]), before, least, kind="ratio")
+    assert 10 < float(huge) < 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("through_forces", [False, True])
+def test_training_lowers_the_loss(through_forces: bool):
+    config = TrainConfig(
+        network=PhysgraphConfig(width=8, means=False),
+        patches=FEW,
+        iterations=30,
+        unroll=5,
+        segments=1,
+        raw=1.0,
+        held_out=0,
+        average=0.8,
+        through_forces=through_forces,
+    )
+    trainer = Trainer(config)
+    index = [len(patch.systems) - 1 for patch in trainer.patches]
+
+    def mean_gap() -> float:
+        integrator = integrator_of(trainer.averaged())
+        return float(
+            np.mean([nested_gap(p, integrator, (0,) * i + (5,)) for p, i in zip(trainer.patches, index, strict=True)])
+        )
+
+    before = mean_gap()
+    trainer.train()
+    assert trainer.iteration == 30
+    assert mean_gap() < before
+
+
+def test_detached_carries_hold_no_graph(patches: list[Patch]):
+    system, x = joint(patches)
+    network = random_network(PhysgraphConfig(width=8), seed=1, scale=0.1).requires_grad_()
+    integrator = integrator_of(network)
+    carry = integrator.step(system, integrator.start(system, x))
+    assert carry.x.requires_grad
+    after = detached(carry)
+    assert not after.x.requires_grad
+    assert not any(move.requires_grad for move in after.memory.moves)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["train", *map(str, arguments)])
+
+
+def configured(folder: Path, *, kind: str = "physgraph", iterations: int = 4) -> Path:
+    network = "width = 8\nmeans = false" if kind == "physgraph" else "latent = 8\nrounds = 2"
+    file = folder / f"{kind}-{iterations}.toml"
+    file.write_text(TINY.format(kind=kind, iterations=iterations, network=network))
+    return file
+
+
+@pytest.mark.parametrize("kind", ["physgraph", "physgraph-paper"])
+def test_a_run_leaves_weights_a_card_and_a_log(tmp_path: Path, kind: str):
+    config = configured(tmp_path, kind=kind)
+    result = run("--config", config, "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    weights = tmp_path / "out" / f"{kind}.safetensors"
+    assert result.stdout.strip() == str(weights)
+    load_network(weights, kind=kind)
+    card = json.loads(weights.with_suffix(".json").read_text())
+    assert card["iterations"] == 4
+    assert card["command"].startswith(f"physgraph-usd train --config {config}")
+    assert card["config"]["seed"] == 1
+    assert len(card["patches"]) == 2
+    lines = (tmp_path / "out" / "log.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["iteration"] == 4
+
+
+def test_a_run_goes_on_where_it_was(tmp_path: Path):
+    """Four iterations, then four more, are eight: the same weights, bit for bit, when the schedule is the same."""
+    config = TrainConfig(
+        network=PhysgraphConfig(width=8), patches=FEW, minutes=60.0, iterations=8, unroll=3, batch=2, held_out=0
+    )
+    whole = Trainer(config)
+    whole.train()
+    half = Trainer(config)
+    for _ in range(4):
+        half.iterate()
+    half.save(tmp_path / "checkpoint.pt")
+    rest = Trainer(config)
+    rest.resume(tmp_path / "checkpoint.pt")
+    assert rest.iteration == 4
+    rest.seconds = 0.0
+    rest.train()
+    assert rest.iteration == whole.iteration
+    assert all(
+        torch.equal(a, b) for a, b in zip(whole.averaged().parameters(), rest.averaged().parameters(), strict=True)
+    )
+
+
+def test_resume_and_fresh_runs_are_not_confused(tmp_path: Path):
+    config = configured(tmp_path)
+    assert "nothing to resume" in run("--config", config, "-o", tmp_path / "out", "--resume").stderr
+    assert run("--config", config, "-o", tmp_path / "out").exit_code == 0
+    again = run("--config", config, "-o", tmp_path / "out")
+    assert again.exit_code == 2
+    assert "holds a run" in again.stderr
+    assert run("--config", configured(tmp_path, iterations=6), "-o", tmp_path / "out", "--resume").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("kind = 'oracle'", "unknown kind 'oracle'"),
+        ("sped = 3", "unknown sped"),
+        ("[network]\nvectors = ['moon']", "unknown vectors moon"),
+        ("[patches]\nnumber = 3", "unknown number"),
+        ("seed = ", "is not TOML"),
+    ],
+)
+def test_wrong_configurations_are_refused_by_name(tmp_path: Path, text: str, word: str):
+    file = tmp_path / "wrong.toml"
+    file.write_text(text)
+    with pytest.raises(UsageError, match=word):
+        record.read_config(file)
+    assert run("--config", tmp_path / "none.toml", "-o", tmp_path / "out").exit_code == 2
+
+
+def test_the_committed_configurations_can_be_read():
+    folder = Path(record.__file__).parent
+    kinds = {record.read_config(file).kind for file in folder.glob("*.toml")}
+    assert kinds == {"physgraph", "physgraph-paper"}
+    paper = record.read_config(folder / "physgraph-paper.toml")
+    assert isinstance(paper.network, PaperConfig)
+    assert (paper.network.latent, paper.network.rounds, paper.unroll, paper.patches.elastic) == (128, 10, 5, True)
