@@ -41,15 +41,15 @@ LEVEL, RUN_UP = 2, 6
 PANEL, BAND, COLORS = (540, 420), 50, 144
 """A panel's size, the height of its label [pixels], and colours in a picture."""
 FORMS = {
-    "Elastic forces only": {"contact": "off", "self_contact": "off"},
-    "With the body": {"self_contact": "off"},
-    "With the body and itself": {},
+    "Elastic forces only": RefineOptions(contact="off", self_contact="off"),
+    "With the body": RefineOptions(self_contact="off"),
+    "With the body and itself": RefineOptions(),
 }
 """Titles and options of the refined panels."""
 NO_BODY = {
     "Elastic forces only": FORMS["Elastic forces only"],
-    "With the spheres of the paper": {"self_contact": "paper"},
-    "With the other sheet and itself": {},
+    "With the spheres of the paper": RefineOptions(self_contact="paper"),
+    "With the other sheet and itself": RefineOptions(),
 }
 FINER = 3
 """Samples per pixel along each axis of a section."""
@@ -77,7 +77,7 @@ class Shown:
     middle: tuple[float, float, float]
     size: tuple[float, float, float]
     camera: tuple[float, float]
-    forms: dict[str, dict[str, str]]
+    forms: dict[str, RefineOptions]
     heat: tuple[int, ...] = ()
     section: bool = False
 
@@ -119,7 +119,7 @@ def picture(name: str, shown: Shown, folder: Path, out: Path) -> Path:
     layers = [folder / f"{i}.usdc" for i in range(len(shown.forms))]
     for layer, options in zip(layers, shown.forms.values(), strict=True):
         frames = (max(shown.time - RUN_UP, 1.0), shown.time)
-        refine_shot(shot, layer, RefineOptions(frames=frames, level=LEVEL, heat_map=True, **options))
+        refine_shot(shot, layer, replace(options, frames=frames, level=LEVEL, heat_map=True))
     garments = refined_in(layers[0])
     meshes = [DrawnStage(shot).meshes(shown.time)]
     meshes += [DrawnStage(shot, layer).meshes(shown.time) for layer in layers]
@@ -186,7 +186,7 @@ def measured(shot: Path, time: float, refined: Sequence[Sequence[DrawnMesh]]) ->
 def _sums(said: dict[str, Any], when: str) -> dict[str, int]:
     """The figures of a panel, summed over bodies; those of bodies are left out where there are none."""
     bodies, cloth = said.get("bodies"), said.get("cloth")
-    sums = {} if bodies is None else dict.fromkeys(("inside", "pinched", "body"), 0)
+    sums: dict[str, int] = {} if bodies is None else {"inside": 0, "pinched": 0, "body": 0}
     for values in (bodies or {}).values():
         for name, key in (("inside", "inside"), ("pinched", "pinched"), ("body", "crossings")):
             sums[name] += values[when][key]
