@@ -19,6 +19,8 @@ from .bodies import Touching
 
 REACH = 2.0
 """How far the cloth is expected to leave its cage's bounds, in mean cage edges."""
+AT_ONE_PLACE, COPY = 1e-4, 0.5
+"""A cage with so many of its points at points of another, in mean edges, is a copy of it: they do not touch."""
 NEVER = -float("inf")
 """Offset of a garment from a surface that it does not feel."""
 
@@ -63,7 +65,9 @@ class Parts:
         for index in (a, b):
             points = frames[index].points
             trees[index] = trees.get(index) or cKDTree(points[np.isfinite(points).all(axis=1)])
-        return bool(np.isfinite(trees[a].query(trees[b].data, distance_upper_bound=reach)[0]).any())
+        distance = trees[a].query(trees[b].data, distance_upper_bound=reach)[0]
+        copies = distance < AT_ONE_PLACE * (self._edges[a] + self._edges[b])
+        return bool(np.isfinite(distance).any()) and float(copies.mean()) < COPY
 
 
 def touch_one_another(a: Garment, b: Garment) -> bool:
