@@ -159,7 +159,7 @@ class Group:
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
         carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
-        telemetry = self._telemetry(module, x, coarse, reports)
+        telemetry = self._telemetry(module, result, coarse, reports)
         telemetry["start"] = start
         crossing = torch.zeros_like(self.levels[-1].free[:, 0])
         if contact is not None:
