@@ -34,6 +34,8 @@ from .mesh.subdivide import Refinement
 from .resolution import edge_strain, sharp_folds
 from .scene import Garment, GarmentFrame, recentred
 
+TORN = 0.5
+"""The same percentile of a result beyond which a frame that started warm is solved again from cold."""
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.25, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
@@ -156,6 +158,10 @@ class Group:
             scaled = result is not x
             result, start_next, moved = contact.finish(result)
             x = x if scaled else start_next
+        if start == "warm" and edge_strain(self.levels[-1], result)["p99"] > TORN:
+            again = self.solve(frames, None, at=at, touching=touching)
+            again.telemetry["start"] = "cold: from the last frame's detail the cloth tore"
+            return again
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
         carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
