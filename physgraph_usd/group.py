@@ -29,7 +29,7 @@ from .integrate.metric import Metric
 from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
-from .level_forces import LevelForces, build_forces
+from .level_forces import LevelForces, blame, build_forces
 from .mesh.subdivide import Refinement
 from .resolution import edge_strain, sharp_folds
 from .scene import Garment, GarmentFrame, recentred
@@ -139,6 +139,16 @@ class Group:
         Raises:
             SolveError: A term of the potential is not finite.
         """
+        solved, strain = self._attempt(frames, kept, at, touching)
+        if solved.telemetry["start"] == "warm" and strain > TORN:
+            solved, _ = self._attempt(frames, None, at, touching)
+            solved.telemetry["start"] = f"cold: the last frame's detail tore the cloth, straining it by {strain:.3g}"
+        return solved
+
+    def _attempt(
+        self, frames: Sequence[GarmentFrame], kept: Carried | None, at: float | None, touching: Sequence[Touching]
+    ) -> tuple[Solved, float]:
+        """Solve one frame; also the 99th percentile of the edges' strain."""
         clock = time.perf_counter()
         forces = self._forces_for(frames)
         world = np.concatenate([frame.points for frame in frames])
@@ -150,7 +160,7 @@ class Group:
         try:
             x, reports, module = self._descend(forces, coarse, predicted, clock, contact=contact)
         except SolveError as error:
-            raise SolveError(self._blame(forces[-1], coarse, error, at)) from error
+            raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
         result = self._frames.scaled(coarse, x, gain)
         moved: dict[str, object] = {}
@@ -158,15 +168,11 @@ class Group:
             scaled = result is not x
             result, start_next, moved = contact.finish(result)
             x = x if scaled else start_next
-        if start == "warm" and edge_strain(self.levels[-1], result)["p99"] > TORN:
-            again = self.solve(frames, None, at=at, touching=touching)
-            again.telemetry["start"] = "cold: from the last frame's detail the cloth tore"
-            return again
         solved = time.perf_counter()
         carried = self._frames.store(coarse, x)
         carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
-        telemetry = self._telemetry(module, result, coarse, reports)
-        telemetry["start"] = start
+        strain = edge_strain(self.levels[-1], result)
+        telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start}
         crossing = torch.zeros_like(self.levels[-1].free[:, 0])
         if contact is not None:
             measured, crossing = contact.measure(result)
@@ -180,7 +186,8 @@ class Group:
         points = result.double().cpu().numpy() + origin
         points[self._fixed] = self._place_fixed @ world
         spans, crosses = self.levels[-1].spans, crossing.cpu().numpy()
-        return Solved([points[span] for span in spans], carried, telemetry, [crosses[span] for span in spans])
+        own = [points[span] for span in spans], carried, telemetry, [crosses[span] for span in spans]
+        return Solved(*own), strain["p99"]
 
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
@@ -384,15 +391,5 @@ class Group:
                 "input": module.energies(finest.base.apply(coarse)),
                 "output": module.energies(x),
             },
-            "strain": edge_strain(finest, x),
             "sharp_folds": sharp_folds(finest, x),
         }
-
-    def _blame(self, lasting: LevelForces, coarse: Tensor, error: SolveError, at: float | None) -> str:
-        """Name prim, time and the term that is not finite."""
-        x = self.levels[-1].base.apply(coarse)
-        energies = lasting.module(coarse).energies(x)
-        broken = [name for name, value in energies.items() if not np.isfinite(value)] or ["none at the input"]
-        where = ", ".join(f"<{garment.path}>" for garment in self.garments)
-        when = "" if at is None else f" at time code {at:g}"
-        return f"{where}{when}: {error}; terms that are not finite: {', '.join(broken)}"

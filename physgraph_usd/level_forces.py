@@ -80,3 +80,19 @@ def build_forces(
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
     return LevelForces(level, elastic, body, guide, metric, density)
+
+
+def blame(
+    garments: Sequence[Garment],
+    lasting: LevelForces,
+    coarse: Float[Tensor, "coarse 3"],
+    *,
+    error: Exception,
+    at: float | None,
+) -> str:
+    """Name prims, time code and the terms that are not finite at the upsampled cage."""
+    energies = lasting.module(coarse).energies(lasting.level.base.apply(coarse))
+    broken = [name for name, value in energies.items() if not np.isfinite(value)] or ["none at the input"]
+    where = ", ".join(f"<{garment.path}>" for garment in garments)
+    when = "" if at is None else f" at time code {at:g}"
+    return f"{where}{when}: {error}; terms that are not finite: {', '.join(broken)}"
