@@ -65,7 +65,7 @@ class Parts:
         for index in (a, b):
             points = frames[index].points
             trees[index] = trees.get(index) or cKDTree(points[np.isfinite(points).all(axis=1)])
-        distance: np.ndarray = trees[a].query(trees[b].data, distance_upper_bound=reach)[0]
+        distance = np.asarray(trees[a].query(trees[b].data, distance_upper_bound=reach)[0])
         copies = np.mean(distance < AT_ONE_PLACE * (self._edges[a] + self._edges[b]))
         return bool(np.isfinite(distance).any()) and float(copies) < COPY
 
