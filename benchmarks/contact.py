@@ -51,6 +51,7 @@ def main() -> None:
     times: dict[str, list[float]] = {name: [] for name in cases}
     solve: dict[str, list[float]] = {name: [] for name in cases}
     said: dict[str, Any] = {}
+    count = 0
     for repeat in range(REPEATS):
         for name, (*_, pose) in cases.items():
             refiners[name].forget()
@@ -60,7 +61,7 @@ def main() -> None:
             times[name].append(1e3 * (time.perf_counter() - began))
             solve[name].append(sum(level["milliseconds"] for level in state.telemetry[0]["levels"]))  # type: ignore[attr-defined]
             said[name] = state.telemetry[0].get("contact")
-    count = len(state.points[0]) if state.points[0] is not None else 0
+            count = len(state.points[0]) if state.points[0] is not None else 0
     say(f"sheet of {count} fine vertices over a ball of {len(ball.triangles)} triangles, {LANES} threads, cold frames")
     say("\n| case | frame ms | steps alone ms | frame / switched off |\n|---|---|---|---|")
     base = statistics.median(times["switched off"][1:])

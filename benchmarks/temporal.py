@@ -25,6 +25,8 @@ from physgraph_usd.shot import prepare_device
 from physgraph_usd.usd.reader import Shot, open_shot
 
 FRAMES = 24
+LEVELS = {"layers": 1}
+"""Subdivisions of samples that would take long at their own."""
 RUNS = (("off", 0.0), ("warm", 0.0), ("tether", 400.0), ("tether", 2000.0), ("tether", 10000.0))
 
 
@@ -34,7 +36,7 @@ def main() -> None:
     say("| sample | temporal | tether [1/s^2] | jerk [edges] | energy [J] |\n|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for name in sys.argv[1:] or ("sleeve", "skirt", "flag", "layers"):
-            shot = open_shot(write_sample(name, Path(folder)))
+            shot = open_shot(write_sample(name, Path(folder)), level=LEVELS.get(name))
             for temporal, stiffness in RUNS:
                 jerk, energy = measure(shot, temporal, stiffness)
                 say(f"| {name} | {temporal} | {stiffness:g} | {jerk:.3f} | {energy:.5f} |")
@@ -55,7 +57,7 @@ def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
         entry = state.telemetry[0]
         if "energy_joules" in entry:
             energies.append(sum(entry["energy_joules"]["output"].values()))  # type: ignore[index]
-    jerk = np.diff(np.array(details), 3, axis=0)
+    jerk: np.ndarray = np.diff(np.asarray(details, dtype=np.float64), 3, axis=0)
     edges = np.mean([mean_fine_edge(refiner, index) for index in range(len(shot.scene.garments))])
     return float(np.sqrt((jerk**2).sum(axis=-1).mean()) / edges), float(np.mean(energies))
 
