@@ -124,17 +124,12 @@ def _at(found: Nearest, which: Tensor) -> Nearest:
 
 
 class LevelBodies:
-    """One level's view of the bodies.
-
-    Attributes:
-        rounds: How often in the level's steps closest points are found anew.
-    """
+    """One level's view of the bodies."""
 
     def __init__(self, level: Level, tracks: Sequence[_Track], settings: ContactSettings) -> None:
         """Keep what is known of the distances."""
         self._level, self._tracks, self._settings = level, tuple(tracks), settings
         self._reach = float(level.spacing.mean())
-        self.rounds = settings.rounds
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> Contact | None:
         """The contact force near positions x [m], or None where nothing can touch."""

@@ -1,7 +1,8 @@
 """Contact of a group's cloth with itself: the planes that parts see in one another, and the mending of new crossings.
 
-Penalty springs keep parts apart but promise nothing. The promise is `ClothView.mend`: positions are taken back towards
-the last good ones round each edge that newly passes through a face, until no more edges do so than before.
+Penalty springs keep parts apart but promise nothing. `ClothView.mend` takes positions back towards the upsampled cage
+round each edge that newly passes through a face; where that does not bring the number of such edges to what it was, the
+report's measure says so.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ ZONE = 2
 SMOOTHINGS = 4
 """Passes that smooth the move round new crossings before any takes it back: a smooth move crosses nothing."""
 MENDS = 8
-"""Most passes in all; after them the whole group goes back."""
+"""Most passes in all; after them the best positions found are taken."""
 TURNED = 0.5
 """Cosine beyond which the way from one part to another counts as turned round since the input: one passed through."""
 SPHERE = 0.8

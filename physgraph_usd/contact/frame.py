@@ -23,8 +23,6 @@ FINISHES = 3
 """How often cloth is mended and pushed out of bodies in turn, while either undoes the other."""
 Touch = Contact | SelfContact | Spheres | Seam
 """A term that stands for something near."""
-
-
 CHANGED = 0.3
 """Part of the stiffness of what touches that may change before a metric is factorised anew."""
 REFACTORED = 60_000
@@ -39,6 +37,7 @@ class LevelContact:
         bodies: Its view of the bodies, or None when there are none.
         cloth: Its view of the cloth, or None when cloth is not to touch cloth.
         rounds: How often in the level's steps pairs and planes are found anew.
+        seam: Springs that hold seams together, or None without seams.
     """
 
     bodies: LevelBodies | None
