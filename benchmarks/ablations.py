@@ -40,7 +40,7 @@ def candidates(base: TrainConfig) -> dict[str, TrainConfig]:
         "secant and last move": network(vectors=("secant", "move1")),
         "short": network(vectors=("secant", "metric", "move1", "diagonal")),
         "long": network(vectors=(*BASE, "metric2", "move2", "diagonal1")),
-        "normal": network(vectors=(*BASE, "normal")),
+        "normal": network(vectors=(*BASE, "metric.normal")),
         "strain": network(strain=True),
         "means": network(means=True),
         "one round": network(rounds=1, strain=True),

@@ -14,19 +14,23 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import torch
 
-from physgraph_usd.integrate.base import Integrator
+from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.integrate import METHODS
+from physgraph_usd.integrate.base import Integrator, System
 from physgraph_usd.integrate.first_order import Adam, GradientDescent
 from physgraph_usd.integrate.learned import integrator_of
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network
+from physgraph_usd.level import refine_garments
 from physgraph_usd.shot import prepare_device
-from physgraph_usd.train.patches import Patch, PatchConfig, make_patches
+from physgraph_usd.train.patches import PatchConfig, make_patches
 
 from .unseen import cases
 
@@ -52,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     prepare_device(given.device)
     named = [name for name in given.shots.split(",") if name]
-    patches = garments(named, given) if named else make_patches(CONFIG, seed=SEED, device=given.device)
+    patches = garments(named, given) if named else trained_like(given.device)
     for number, patch in enumerate(patches):
         say(f"\npatch {number}: {patch.words}, {patch.group.levels[-1].vertex_count} vertices")
         lines = curves(patch, given.weights, given.physgraph, device=given.device)
@@ -61,15 +65,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
             draw(lines, given.out)
 
 
-def garments(names: Sequence[str], given: argparse.Namespace) -> Iterator[Patch]:
-    """Whole garments with gravity and guide, in jersey, as patches."""
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A cloth in one pose: levels, a system each, recentred cage [m], first and least energy at the finest [J]."""
+
+    words: str
+    group: Group
+    systems: list[System]
+    coarse: torch.Tensor
+    start: float
+    least: float
+
+
+def trained_like(device: str) -> Iterator[Problem]:
+    """Patches like those that the paper's network was trained on, of another seed."""
+    for patch in make_patches(CONFIG, seed=SEED):
+        garment = patch.garment
+        chains, settings = refine_garments([garment], [garment.level]), SolveSettings(METHODS["quasi-newton"])
+        group = Group([garment], chains, patch.gravity, settings, dtype=torch.float32, device=device)
+        systems, coarse = group.systems([patch.frame])
+        yield Problem(patch.words, group, systems, coarse, patch.start[-1], patch.least[-1])
+
+
+def garments(names: Sequence[str], given: argparse.Namespace) -> Iterator[Problem]:
+    """Whole garments with gravity and guide, in jersey."""
     for case in cases(shots=names, fabrics=["jersey"], device=given.device, cache=given.cache):
-        energies = [math.nan] * (len(case.systems) - 1)
-        start, least = [*energies, case.start], [*energies, case.least]
-        yield Patch(case.group, case.frame, case.systems, case.coarse, case.name, start=start, least=least)
+        yield Problem(case.name, case.group, case.systems, case.coarse, case.start, case.least)
 
 
-def curves(patch: Patch, paper: Path, own: Path, *, device: str) -> dict[str, list[float]]:
+def curves(patch: Problem, paper: Path, own: Path, *, device: str) -> dict[str, list[float]]:
     """Gap against steps for every method, by its name."""
     found = {f"Adam {rate:g}": flat(patch, Adam(rate)) for rate in ADAM_RATES}
     found |= best("Adam", {rate: flat(patch, Adam(rate)) for rate in (*ADAM_RATES, *ADAM_SWEEP)})
@@ -94,7 +118,7 @@ def best(name: str, runs: dict[float, list[float]]) -> dict[str, list[float]]:
     return {f"{name}, best of {len(runs)} ({rate:g})": runs[rate]}
 
 
-def flat(patch: Patch, integrator: Integrator) -> list[float]:
+def flat(patch: Problem, integrator: Integrator) -> list[float]:
     """Gap after each force evaluation at the finest level, from the upsampled cage; line searches count in full."""
     system, x = patch.systems[-1], patch.group.levels[-1].base.apply(patch.coarse)
     carry = integrator.start(system, x)
@@ -107,7 +131,7 @@ def flat(patch: Patch, integrator: Integrator) -> list[float]:
     return gaps
 
 
-def nested(patch: Patch, integrator: Integrator) -> list[float]:
+def nested(patch: Problem, integrator: Integrator) -> list[float]:
     """The same through the levels, n steps at each, the evaluations at all levels counted."""
     gaps = [1.0] + [math.nan] * STEPS
     for each in range(1, STEPS // len(patch.systems) + 1):
@@ -121,9 +145,9 @@ def nested(patch: Patch, integrator: Integrator) -> list[float]:
     return gaps
 
 
-def gap(patch: Patch, energy: float) -> float:
+def gap(patch: Problem, energy: float) -> float:
     """(Phi - Phi*) / (Phi0 - Phi*)."""
-    return (energy - patch.least[-1]) / (patch.start[-1] - patch.least[-1])
+    return (energy - patch.least) / (patch.start - patch.least)
 
 
 def table(lines: dict[str, list[float]]) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .level import Level
-from .mesh.stencil import Stencil
+from .mesh.stencil import Stencil, add_at
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class MovingFrames:
         """Orthonormal frames at the cage vertices; columns are tangent, bitangent, normal."""
         corner = coarse[self._triangles]
         area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        normal = torch.zeros_like(coarse).index_add_(0, self._triangles.T.reshape(-1), area.repeat(3, 1))
+        normal = add_at(torch.zeros_like(coarse), self._triangles.T.reshape(-1), area.repeat(3, 1))
         return _orthonormal(normal, self._tangent.apply(coarse))
 
     def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> Carried:

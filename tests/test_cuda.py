@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from cloth import frame_of, settings_of, sheet, wave
+from pxr import Usd, UsdGeom
 from sheets import garment_of
 
+from physgraph_usd.cli import main
 from physgraph_usd.group import Group
+from physgraph_usd.integrate.learned import LearnedMetric
+from physgraph_usd.integrate.metric import Metric
+from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
+from physgraph_usd.integrate.weights import random_network
 from physgraph_usd.level import refine_garments
+from physgraph_usd.samples import write_sample
 from physgraph_usd.scene import GarmentFrame
 
 EDGE = 0.02
@@ -61,3 +70,61 @@ def test_s33_a_solved_frame_agrees_and_repeats() -> None:
     here, there, again = answers
     assert there.tobytes() == again.tobytes()
     assert np.abs(here - there).max() < 1e-4 * EDGE / 4
+
+
+@pytest.mark.parametrize("vectors", [("secant", "metric1", "move1", "diagonal"), VECTORS])
+def test_replayed_steps_are_the_same_steps(vectors: tuple[str, ...]) -> None:
+    """Eight steps of a network: recorded and replayed against one by one."""
+    one, frames = cloth("cuda", torch.float32)
+    systems, coarse = one.systems(frames)
+    system, x = systems[-1], one.levels[-1].base.apply(coarse)
+    network = random_network(PhysgraphConfig(vectors, width=16, means=False), seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    plain, replayed = LearnedMetric(network, record=False), LearnedMetric(network)
+    a, b = plain.start(system, x), replayed.start(system, x)
+    for _ in range(8):
+        a, b = plain.step(system, a), replayed.step(system, b)
+        assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
+        assert b.energy == pytest.approx(a.energy, rel=1e-3)
+
+
+def test_a_metric_with_springs_agrees() -> None:
+    answers = []
+    for device in ("cpu", "cuda"):
+        one, frames = cloth(device, torch.float64)
+        system = one.systems(frames)[0][-1]
+        assert isinstance(system.metric, Metric)
+        held = system.metric.plus(torch.linspace(0.0, 5.0, len(system.spacing), device=device))
+        force = torch.linspace(-1.0, 1.0, 3 * len(system.spacing), dtype=torch.float64, device=device).reshape(-1, 3)
+        answers.append(held.solve(force).cpu().numpy())
+    assert np.abs(answers[1] - answers[0]).max() < 1e-9 * np.abs(answers[0]).max()
+
+
+@pytest.mark.parametrize("integrator", ["quasi-newton", "physgraph"])
+@pytest.mark.parametrize("sample", ["block", "layers", "crossing", "sleeve"])
+def test_samples_are_refined_alike(tmp_path: Path, sample: str, integrator: str) -> None:
+    """Contact, cloth on itself and several garments; twice the same bytes, and the CPU's shape."""
+    stage = write_sample(sample, tmp_path)
+    points = {}
+    for name, device in (("cpu", "cpu"), ("cuda", "cuda"), ("again", "cuda")):
+        out = tmp_path / f"{name}.usda"
+        options = ["--device", device, "--integrator", integrator, "--frames", "1:2", "--level", "1"]
+        result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(out), *options])
+        assert result.exit_code == 0, result.output
+        points[name] = points_of(out)
+    assert points["cuda"].keys() == points["cpu"].keys()
+    for path, found in points["cuda"].items():
+        assert found.tobytes() == points["again"][path].tobytes()
+        size = np.ptp(points["cpu"][path], axis=(0, 1)).max()
+        assert np.median(np.linalg.norm(found - points["cpu"][path], axis=-1)) < 2e-3 * size
+
+
+def points_of(layer: Path) -> dict[str, np.ndarray]:
+    """Points of every mesh at every time sample, by path."""
+    stage = Usd.Stage.Open(str(layer))
+    found = {}
+    for prim in stage.Traverse():
+        mesh = UsdGeom.Mesh(prim)
+        if mesh and (times := mesh.GetPointsAttr().GetTimeSamples()):
+            found[str(prim.GetPath())] = np.array([mesh.GetPointsAttr().Get(t) for t in times], dtype=np.float64)
+    return found

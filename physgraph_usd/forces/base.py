@@ -61,6 +61,18 @@ class ForceModule:
             energy = energy + term.add_force(x, force)
         return energy, force
 
+    def energy_and_force_each(
+        self, x: Float[Tensor, "vertices 3"], garments: int
+    ) -> tuple[Float[Tensor, " garments"], Float[Tensor, "vertices 3"]]:
+        """Energy of each garment [J], float64, and force [N] at positions x [m]; for terms that can be `split`."""
+        force = torch.zeros_like(x)
+        energy = torch.zeros(garments, dtype=torch.float64, device=x.device)
+        for term in self.forces:
+            term.add_force(x, force)
+            values, owner = term.split(x)  # pyright: ignore[reportAttributeAccessIssue]
+            energy.index_add_(0, owner.long(), values.double())
+        return energy, force
+
     def energies(self, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
         """Energy of each term [J] by name."""
         return {term.name: float(term.add_force(x, torch.zeros_like(x))) for term in self.forces}

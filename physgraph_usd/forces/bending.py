@@ -31,6 +31,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
 from .stretch import garment_area
 
@@ -117,13 +118,15 @@ class Bending:
         """Add the force [N] in place and return the energy [J]."""
         return self._elements.evaluate(x, force)
 
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each hinge [J] where the force was added last, and its garment."""
+        return self._elements.energy, self._level.hinge_garment
+
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of w (dtheta/dx)(dtheta/dx)^T at each corner [N/m]."""
         jacobian = hinge_jacobian(x, self._level.hinges)
         value = self.weight.unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
-        return torch.zeros_like(self._level.spacing).index_add_(
-            0, self._level.hinges.long().reshape(-1), value.reshape(-1)
-        )
+        return add_at(torch.zeros_like(self._level.spacing), self._level.hinges.long().reshape(-1), value.reshape(-1))
 
     def rest_matrix(self) -> sp.csr_matrix:
         """The Hessian of the rest shape's pattern, each hinge unfolded flat [N/m]: w row^T row (Bergou et al. 2006).

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -45,7 +45,8 @@ class Gravity:
             gravity: Acceleration [m/s^2], shape (3,).
             potential: "continuum" or "paper".
         """
-        owner = level.vertex_garment.long()
+        self._owner = level.vertex_garment
+        owner = self._owner.long()
         self.density = density.to(level.rest)
         mass = self.density[owner] * level.vertex_area
         if potential == "paper":
@@ -56,6 +57,10 @@ class Gravity:
         """Add the weight [N] in place and return the energy [J]."""
         force += self.weight
         return -(self.weight * x).sum(dtype=torch.float64)
+
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each vertex [J] at positions x [m], and its garment."""
+        return -(self.weight * x).sum(dim=1), self._owner
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """Zero: the energy is linear."""

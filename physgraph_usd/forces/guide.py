@@ -22,7 +22,7 @@ import copy
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import PIN_MARGIN, Level
@@ -49,6 +49,9 @@ class GuideMap:
         )
         self.squares = sp.csr_matrix(matrix.multiply(matrix).T)
         self.shares = sp.csr_matrix(shares.T)
+        # Subdivision keeps every cage vertex, so each row of the transpose has an entry.
+        of_coarse = sp.csc_matrix(level.from_coarse)
+        self.garment = level.vertex_garment[torch.as_tensor(of_coarse.indices[of_coarse.indptr[:-1]]).long()]
 
 
 class Guide:
@@ -102,6 +105,15 @@ class Guide:
             force -= self._pin * stray
             energy = energy + 0.5 * (self._pin * stray * stray).sum(dtype=torch.float64)
         return energy
+
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each tie [J] at positions x [m], and its garment."""
+        lag = self._map.average.apply(x) - self._target
+        energy, owner = 0.5 * (self._weight * lag * lag).sum(dim=1), self._map.garment
+        if not self._has_soft_pins:
+            return energy, owner
+        stray = 0.5 * (self._pin * (x - self._base).square()).sum(dim=1)
+        return torch.cat([energy, stray]), torch.cat([owner, self._level.vertex_garment])
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """sum_c k_g A_c R_cv^2, plus the soft pins [N/m]."""

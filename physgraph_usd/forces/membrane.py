@@ -32,11 +32,12 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..fabric import Fabric
 from ..level import Level
+from ..mesh.stencil import add_at
 from .base import Elements, Force, element_overloads
 from .stretch import Stretch, garment_area
 
@@ -130,6 +131,10 @@ class Membrane:
         """Add the force [N] in place and return the energy [J]."""
         return self._elements.evaluate(x, force)
 
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each triangle [J] where the force was added last, and its garment."""
+        return self._elements.energy, self._level.triangle_garment
+
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each corner's block, geometric part only where it stiffens [N/m].
 
@@ -149,7 +154,7 @@ class Membrane:
         geometric = c11 * (g1**2 * (e11 + POISSON * e22) + g2**2 * (e22 + POISSON * e11)) + 2.0 * c66 * m12 * g1 * g2
         value = material / 3.0 + geometric.clamp_min(0.0)
         total = torch.zeros_like(self._level.spacing)
-        return total.index_add_(0, self._level.triangles.long().reshape(-1), value.reshape(-1))
+        return add_at(total, self._level.triangles.long().reshape(-1), value.reshape(-1))
 
     def rest_matrix(self) -> sp.csr_matrix:
         """The trace of each block of the Hessian at rest: (C11 + C66) times the cotangent Laplacian [N/m].

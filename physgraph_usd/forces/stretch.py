@@ -25,10 +25,11 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
 
 PAPER_SPRING = 2.598
@@ -90,13 +91,17 @@ class Stretch:
         """Add the force [N] in place and return the energy [J]."""
         return self._elements.evaluate(x, force)
 
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each edge [J] where the force was added last, and its garment."""
+        return self._elements.energy, self._level.edge_garment
+
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of k (u u^T + max(0, 1 - l0/l) (I - u u^T)), summed at both ends [N/m]."""
         ends = self._level.edges.long()
         length = (x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1)
         lateral = (1.0 - self._level.rest_length / length.clamp_min(1e-12)).clamp_min(0.0)
         value = self.stiffness * (1.0 + 2.0 * lateral) / 3.0
-        return torch.zeros_like(self._level.spacing).index_add_(0, ends.T.reshape(-1), value.repeat(2))
+        return add_at(torch.zeros_like(self._level.spacing), ends.T.reshape(-1), value.repeat(2))
 
     def rest_matrix(self) -> sp.csr_matrix:
         """Graph Laplacian of the springs [N/m]."""
@@ -111,4 +116,4 @@ class Stretch:
 def garment_area(level: Level) -> Float[Tensor, " garments"]:
     """Rest area of each garment [m^2]."""
     total = torch.zeros(len(level.spans), dtype=level.dtype, device=level.device)
-    return total.index_add_(0, level.vertex_garment.long(), level.vertex_area)
+    return add_at(total, level.vertex_garment.long(), level.vertex_area)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
-from .network import FLOOR, Physgraph, PhysgraphConfig
+from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of
 
 LOG_SCALE = 0.5 / math.log(10.0)
 """The networks see (log10 + 3) / 2 of a length."""
@@ -73,17 +73,20 @@ class FusedPhysgraph:
         self._launch = Launch(kernel, vertices, inputs, device=device, lanes=lanes)
 
     def __call__(
-        self, combined: Sequence[Float[Tensor, "vertices 3"]], spacing: Float[Tensor, " vertices"], step: int
+        self, combined: Sequence[Float[Tensor, "vertices 3"]], spacing: Float[Tensor, " vertices"], step: int | Tensor
     ) -> Float[Tensor, "vertices 3"]:
         """The displacement [m], no longer than allowed; valid until the next call.
 
         Args:
             combined: The configuration's vectors [m].
             spacing: Mean rest edge at each vertex [m].
-            step: Number of steps made before.
+            step: Number of steps made before, a scalar on the device while steps are recorded.
         """
         torch.stack(list(combined), out=self._stack)
-        torch.add(self._bias, self._clock, alpha=math.log1p(step) - 1.5, out=self._first[0])
+        if isinstance(step, Tensor):
+            torch.addcmul(self._bias, self._clock, clock_of(step), out=self._first[0])
+        else:
+            torch.add(self._bias, self._clock, alpha=clock_of(step), out=self._first[0])
         self._launch({2: wp.from_torch(spacing, requires_grad=False)})
         return self._out
 

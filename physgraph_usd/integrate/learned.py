@@ -14,6 +14,7 @@ and a hash of the numbers.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -22,16 +23,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import SolveError
+from .around import Around
 from .base import Carry, Surface, System
 from .fused import can_fuse, fused_physgraph
 from .network import Graph, PaperNetwork, Physgraph
+from .recorded import FORCE, IMAGE, MOST_GARMENTS, SECANTS, Place, Recording
 
 NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
 
 LONGEST = 5.0
 """Most edge lengths that a vertex moves in a step."""
-SECANTS = 5
-"""Secant pairs kept for the L-BFGS direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,22 +62,28 @@ class LearnedMetric:
 
     name = "physgraph"
 
-    def __init__(self, network: Physgraph, *, fuse: bool = True) -> None:
+    def __init__(self, network: Physgraph, *, fuse: bool = True, record: bool = True) -> None:
         """Keep the network.
 
         Args:
             network: The network.
             fuse: Run it as one kernel where there is one for it and no gradient is asked for.
+            record: On CUDA, record a step and replay it.
         """
         self._network = network
         trained = not any(parameter.requires_grad for parameter in network.parameters())
         self._fuse = fuse and trained and can_fuse(network.config, torch.float32)
+        self._record = record and trained
+        self._recording: Recording | None = None
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory."""
         self._network = placed(self._network, system)
         energy, force = system.energy_and_force(x)
         image = system.apply_metric_inverse(force)
+        recording = self._recorded(system)
+        if recording is not None:
+            return recording.begin(x, energy, force, image)
         memory = _Memory((image,), (force,), graph=graph_of(system))
         return Carry(x, energy, force, image, self.name, memory)
 
@@ -84,12 +91,20 @@ class LearnedMetric:
         """Evaluate the carry's positions under forces that changed a little; the last displacements are kept."""
         energy, force = system.energy_and_force(carry.x)
         image = system.apply_metric_inverse(force)
+        if isinstance(carry.memory, Place):
+            old, recording = carry.memory.recording, self._recorded(system)
+            assert recording is not None
+            if recording is not old:
+                recording.take_over(old)
+            return recording.go_on(carry.x, energy, force, image)
         old: _Memory = carry.memory
         memory = replace(old, images=(image, *old.images[1:]), forces=(force, *old.forces[1:]))
         return Carry(carry.x, energy, force, image, self.name, memory)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
+        if isinstance(carry.memory, Place):
+            return carry.memory.recording.advance(carry)
         move = self.propose(system, carry)
         x = carry.x + move
         energy, force = system.energy_and_force(x)
@@ -99,21 +114,60 @@ class LearnedMetric:
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
         memory: _Memory = carry.memory
-        combined = [self._vector(name, system, carry) for name in self._network.config.vectors]
-        if self._fuse and carry.x.dtype == torch.float32:
+        combined = vectors_of(
+            self._network.config.vectors, lambda name: self._vector(name, system, carry), system=system, x=carry.x
+        )
+        assert memory.graph is not None
+        return self._combined(system, carry.x, combined, step=memory.step, graph=memory.graph)
+
+    def _combined(
+        self, system: System, x: Tensor, vectors: list[Tensor], *, step: int | Tensor, graph: Graph
+    ) -> Float[Tensor, "vertices 3"]:
+        """The network's combination of vectors [m]."""
+        if self._fuse and x.dtype == torch.float32:
             lanes = 1 if system.level is None else system.level.lanes
             device = str(system.spacing.device)
             fused = fused_physgraph(self._network, len(system.spacing), LONGEST, device=device, lanes=lanes)
-            return fused(combined, system.spacing, memory.step) * system.free
-        vectors = torch.stack(combined, dim=1)  # V N 3
+            return fused(vectors, system.spacing, step) * system.free
+        stacked = torch.stack(vectors, dim=1)  # V N 3
         needed = self._network.config.strain or self._network.config.rounds > 0
-        strain = edge_strain(system, carry.x).float() if needed else None
-        scaled = vectors / system.spacing.reshape(-1, 1, 1)  # V N 3
-        graph = memory.graph
-        assert graph is not None
-        coefficients = self._network(scaled.float(), strain, memory.step, graph=graph).to(vectors)  # V N
-        move = (coefficients.unsqueeze(2) * vectors).sum(dim=1)  # V 3
+        strain = edge_strain(system, x).float() if needed else None
+        scaled = stacked / system.spacing.reshape(-1, 1, 1)  # V N 3
+        coefficients = self._network(scaled.float(), strain, step, graph=graph).to(stacked)  # V N
+        move = (coefficients.unsqueeze(2) * stacked).sum(dim=1)  # V 3
         return limited(move, system.spacing) * system.free
+
+    def records(self, system: System) -> bool:
+        """Whether a system's steps are recorded: on CUDA, once trained."""
+        few = system.level is None or len(system.level.spans) <= MOST_GARMENTS
+        return self._record and system.spacing.is_cuda and few
+
+    def _recorded(self, system: System) -> Recording | None:
+        """The recording of a system's steps, where they are recorded."""
+        if not self.records(system):
+            return None
+        if self._recording is None or self._recording.system is not system:
+            graph = graph_of(system)
+            self._recording = Recording(system, lambda recording: self._propose_recorded(recording, graph))
+        return self._recording
+
+    def _propose_recorded(self, recording: Recording, graph: Graph) -> Tensor:
+        """The displacement of the next step [m] out of a recording's buffers."""
+        system, rows = recording.system, recording.rows
+        diagonal = system.rest_diagonal.unsqueeze(1)
+        known = {
+            "secant": recording.direction,
+            "metric": lambda: rows[IMAGE],
+            "metric1": lambda: recording.images[0],
+            "metric2": lambda: recording.images[1],
+            "move1": lambda: rows[SECANTS - 1],
+            "move2": lambda: rows[SECANTS - 2],
+            "diagonal": lambda: rows[FORCE] / diagonal,
+            "diagonal1": lambda: recording.force_before / diagonal,
+        }
+        names = self._network.config.vectors
+        vectors = vectors_of(names, lambda name: known[name](), system=system, x=recording.x)
+        return self._combined(system, recording.x, vectors, step=recording.step, graph=graph)
 
     def _vector(self, name: str, system: System, carry: Carry) -> Tensor:
         """One of `network.VECTORS` [m]; zero where the past does not reach so far."""
@@ -121,9 +175,6 @@ class LearnedMetric:
         if name == "secant":
             assert memory.graph is not None
             return secant_direction(carry.force, memory.images[0], memory.pairs, graph=memory.graph)
-        if name == "normal":
-            normal = vertex_normals(system, carry.x)
-            return (memory.images[0] * normal).sum(dim=1, keepdim=True) * normal
         kind, age = name.rstrip("0123456789"), int(name[-1]) if name[-1].isdigit() else 0
         if kind == "move":
             known, age = memory.moves, age - 1
@@ -262,15 +313,36 @@ def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices
     return move * (LONGEST * spacing.unsqueeze(1) / size).clamp_max(1.0)
 
 
+def vectors_of(names: Sequence[str], whole: Callable[[str], Tensor], *, system: System, x: Tensor) -> list[Tensor]:
+    """The vectors of given names [m]; those with a dot are parts of whole ones (`around.PARTS`).
+
+    Args:
+        names: Names out of `network.VECTORS`, parts included.
+        whole: Gives a vector without a dot in its name.
+        system: For the mesh around the vertices.
+        x: Positions [m].
+    """
+    found: dict[str, Tensor] = {}
+    around: Around | None = None
+    for name in names:
+        base, _, part = name.partition(".")
+        if base not in found:
+            found[base] = whole(base)
+        if part:
+            around = around or Around(_level(system), x)
+            found[name] = around.part(found[base], part)
+    return [found[name] for name in names]
+
+
 def graph_of(system: System) -> Graph:
     """Garments and edges of a system; without a level, one garment without edges."""
     level = system.level
     if level is None:
         owner = torch.zeros(len(system.spacing), dtype=torch.int64, device=system.spacing.device)
         edges = owner.new_zeros((0, 2)).int()
-        return Graph(owner, 1, edges, system.spacing.float(), system.spacing.new_zeros(0).float())
+        return Graph(owner, (slice(0, len(owner)),), edges, system.spacing.float(), system.spacing.new_zeros(0).float())
     spacing, rest = system.spacing.float(), level.rest_length.float()
-    return Graph(level.vertex_garment.long(), len(level.spans), level.edges, spacing, rest)
+    return Graph(level.vertex_garment.long(), level.spans, level.edges, spacing, rest)
 
 
 def edge_strain(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:
@@ -279,15 +351,6 @@ def edge_strain(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tensor,
     ends = level.edges.long()
     square = (x[ends[:, 1]] - x[ends[:, 0]]).square().sum(dim=1)
     return square.clamp_min(1e-30).sqrt() / level.rest_length - 1.0
-
-
-def vertex_normals(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-    """Area-weighted unit normals; zero where triangles have no area."""
-    corners = _level(system).triangles.long()
-    corner = x[corners]
-    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    total = torch.zeros_like(x).index_add_(0, corners.T.reshape(-1), area.repeat(3, 1))
-    return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
 
 
 def _level(system: System) -> Surface:

@@ -9,6 +9,8 @@ from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ig
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .dissection import DissectedSolver, Dissection, dissect
+
 REGULARISATION = 1e-7
 """Added to the diagonal, relative to its mean: keeps loose parts without a guide definite."""
 
@@ -37,13 +39,21 @@ def kept_to_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
 class Metric:
     """H0, factorised: the same matrix for x, y and z."""
 
-    def __init__(self, matrix: sp.csr_matrix, *, free: Bool[Tensor, "vertices 1"], dtype: torch.dtype) -> None:
+    def __init__(
+        self,
+        matrix: sp.csr_matrix,
+        *,
+        free: Bool[Tensor, "vertices 1"],
+        dtype: torch.dtype,
+        dissection: Dissection | None = None,
+    ) -> None:
         """Factorise a scalar Hessian at rest.
 
         Args:
             matrix: Symmetric positive semi-definite [N/m], shape (V, V).
             free: False where a vertex may not move: its row becomes the identity's.
             dtype: Scalar type of the right-hand sides.
+            dissection: For CUDA: an order that suits the matrix, where one is known.
         """
         self._plain, self._dtype = matrix, dtype
         mask = free.cpu().numpy().ravel()
@@ -54,18 +64,22 @@ class Metric:
         keep = sp.diags(mask.astype(np.float64))
         shift = sp.diags(np.where(mask, REGULARISATION, 1.0))
         self.matrix = sp.csr_matrix(self._scale * (keep @ matrix @ keep) + shift)
+        self._dissection, self._mask = None, free
+        if free.is_cuda:
+            self._dissection = dissection or dissect(self.matrix)
+            self._solver = DissectedSolver(self.matrix, self._dissection, dtype=dtype, device=str(free.device))
+            return
         coo = self.matrix.tocoo()
         solver = CholeskySolverD if dtype == torch.float64 else CholeskySolverF
-        rows = torch.as_tensor(coo.row.astype(np.int32), device=free.device)
-        columns = torch.as_tensor(coo.col.astype(np.int32), device=free.device)
-        values = torch.as_tensor(coo.data.astype(np.float64), device=free.device)
+        rows, columns = (torch.as_tensor(of.astype(np.int32)) for of in (coo.row, coo.col))
+        values = torch.as_tensor(coo.data.astype(np.float64))
         self._solver = solver(matrix.shape[0], rows, columns, values, MatrixType.COO) if len(mask) else None
-        self._mask = free
 
     def plus(self, diagonal: Float[Tensor, " vertices"]) -> Metric:
         """The metric of the same cloth held by springs of given stiffness [N/m], factorised anew."""
         springs = sp.diags(diagonal.double().cpu().numpy())
-        return Metric(sp.csr_matrix(self._plain + springs), free=self._mask, dtype=self._dtype)
+        matrix = sp.csr_matrix(self._plain + springs)
+        return Metric(matrix, free=self._mask, dtype=self._dtype, dissection=self._dissection)
 
     @property
     def diagonal(self) -> Float[Tensor, " vertices"]:
@@ -75,6 +89,8 @@ class Metric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero where a vertex may not move."""
+        if isinstance(self._solver, DissectedSolver):
+            return self._solver.solve(force * self._mask * self._scale) * self._mask
         out = torch.empty_like(force)
         if self._solver is None:
             return out

@@ -11,17 +11,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-VECTORS = ("metric", "metric1", "metric2", "move1", "move2", "diagonal", "diagonal1", "secant", "normal")
-"""What can be combined: H0^-1 F now and one and two steps ago, the last displacements, the force over H0's diagonal now
-and before, the L-BFGS direction, and the part of H0^-1 F along the surface's normal."""
+from .around import PARTS
+
+WHOLE = ("metric", "metric1", "metric2", "move1", "move2", "diagonal", "diagonal1", "secant")
+"""Vectors of a vertex: H0^-1 F now and one and two steps ago, the last displacements, the force over H0's diagonal now
+and before, the L-BFGS direction."""
+VECTORS = (*WHOLE, *(f"{name}.{part}" for name in WHOLE for part in PARTS))
+"""What can be combined: those and their parts."""
 
 FLOOR = 1e-9
 """Lengths below this many edges count as none."""
+FEW = 8
+"""Garments up to which sums over each are made one by one."""
 
 
 @dataclass(frozen=True)
@@ -30,22 +37,27 @@ class Graph:
 
     Attributes:
         owner: Garment of each vertex, shape (V,).
-        garments: Number of garments.
+        spans: Vertex range of each garment.
         edges: End vertices, shape (E, 2).
         spacing: Mean rest edge at each vertex [m], shape (V,).
         rest_length: Rest length of the edges [m], shape (E,).
     """
 
     owner: Int[Tensor, " vertices"]
-    garments: int
+    spans: tuple[slice, ...]
     edges: Int[Tensor, "edges 2"]
     spacing: Float[Tensor, " vertices"]
     rest_length: Float[Tensor, " edges"]
 
+    @property
+    def garments(self) -> int:
+        """Number of garments."""
+        return len(self.spans)
+
     def total(self, values: Float[Tensor, "vertices width"]) -> Float[Tensor, "garments width"]:
-        """Sums over each garment."""
-        if self.garments == 1:
-            return values.sum(dim=0, keepdim=True)
+        """Sums over each garment; up to `FEW` garments in an order that is the same on every run."""
+        if self.garments <= FEW:
+            return torch.stack([values[span].sum(dim=0) for span in self.spans])
         return values.new_zeros(self.garments, values.shape[1]).index_add_(0, self.owner, values)
 
 
@@ -97,7 +109,7 @@ class Physgraph(nn.Module):
         self,
         vectors: Float[Tensor, "vertices vectors 3"],
         strain: Float[Tensor, " edges"] | None,
-        step: int,
+        step: int | Tensor,
         *,
         graph: Graph,
     ) -> Float[Tensor, "vertices vectors"]:
@@ -106,7 +118,7 @@ class Physgraph(nn.Module):
         Args:
             vectors: The configuration's vectors, in local edge lengths.
             strain: Extension of the edges over their rest length, where the configuration asks for it.
-            step: Number of steps made before.
+            step: Number of steps made before, a scalar on the device while steps are recorded.
             graph: Where numbers flow.
         """
         square = vectors.square().sum(dim=2)  # V N
@@ -127,9 +139,9 @@ class Physgraph(nn.Module):
         start[0] = 1.0
         return coefficients + start
 
-    def _means(self, vectors: Tensor, square: Tensor, step: int, *, graph: Graph) -> Tensor:
+    def _means(self, vectors: Tensor, square: Tensor, step: int | Tensor, *, graph: Graph) -> Tensor:
         """What each garment as a whole shows: root mean squares, cosines of whole fields, the step."""
-        clock = square.new_full((graph.garments, 1), math.log1p(step) - 1.5)  # G 1
+        clock = square.new_ones(graph.garments, 1) * clock_of(step)  # G 1
         if not self.config.means:
             return clock
         size = graph.total(torch.ones_like(square[:, :1])).clamp_min(1.0)  # G 1
@@ -149,6 +161,11 @@ class Physgraph(nn.Module):
         degree = h.new_zeros(len(h), 1).index_add_(0, here, sent[:, :1] * 0 + 1).clamp_min(1.0)
         mean = torch.zeros_like(h).index_add_(0, here, sent) / degree  # V W
         return self.update(torch.cat([torch.relu(h), mean], dim=1))  # V W
+
+
+def clock_of(step: int | Tensor) -> Any:
+    """What the networks see of the number of steps made."""
+    return torch.log1p(step) - 1.5 if isinstance(step, Tensor) else math.log1p(step) - 1.5
 
 
 def _scaled_log(length: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.stencil import add_at
 from .base import System
 
 AMPLITUDE = 0.3
@@ -55,7 +56,7 @@ def _lacking_slope(
     """How much steeper each vertex's edges would have to be, over sqrt(2), and the normals."""
     corner = x[level.triangles.long()]
     area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = torch.zeros_like(x).index_add_(0, level.triangles.long().T.reshape(-1), area.repeat(3, 1))
+    normal = add_at(torch.zeros_like(x), level.triangles.long().T.reshape(-1), area.repeat(3, 1))
     normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
     ends = level.edges.long()
     span = x[ends[:, 1]] - x[ends[:, 0]]
@@ -64,9 +65,9 @@ def _lacking_slope(
     along = span / length.clamp_min(1e-30).unsqueeze(1)
     strain, slope, degree = (torch.zeros_like(level.spacing) for _ in range(3))
     for side in (ends[:, 0], ends[:, 1]):
-        strain.index_add_(0, side, compression)
-        slope.index_add_(0, side, (along * normal[side]).sum(dim=1).square())
-        degree.index_add_(0, side, torch.ones_like(length))
+        add_at(strain, side, compression)
+        add_at(slope, side, (along * normal[side]).sum(dim=1).square())
+        add_at(degree, side, torch.ones_like(length))
     degree = degree.clamp_min(1.0)
     return ((strain / degree).sqrt() - (slope / degree).sqrt()).clamp_min(0.0), normal
 

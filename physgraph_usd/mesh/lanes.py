@@ -35,8 +35,7 @@ class Launch:
             lanes: Most threads to use on the CPU.
         """
         lanes = max(1, min(lanes, size // LEAST_PER_LANE)) if device == "cpu" else 1
-        # On CUDA kernels queue behind torch's own work on the same stream.
-        self._stream = None if device == "cpu" else wp.stream_from_torch(torch.cuda.current_stream(device))
+        self._device = None if device == "cpu" else device
         bounds = np.linspace(0, size, lanes + 1).astype(int).tolist()
         self._commands: list[wp.Launch] = []
         for a, b in pairwise(bounds):
@@ -49,15 +48,27 @@ class Launch:
         for command in self._commands:
             for place, array in changed.items():
                 command.set_param_at_index(place + 1, array)
-        if self._stream is not None:
+        if self._device is not None:
+            stream = current_stream(self._device)
             for command in self._commands:
-                command.launch(stream=self._stream)
+                command.launch(stream=stream)
             return
         others = [_pool(len(self._commands)).submit(command.launch) for command in self._commands[1:]]
         for command in self._commands[:1]:
             command.launch()
         for other in others:
             other.result()
+
+
+def current_stream(device: str) -> wp.Stream:
+    """Torch's current stream on a CUDA device: kernels queue behind torch's work, also while a graph is captured."""
+    stream = torch.cuda.current_stream(device)
+    return _stream(device, stream.cuda_stream)
+
+
+@functools.lru_cache(maxsize=64)
+def _stream(device: str, handle: int) -> wp.Stream:
+    return wp.Stream(device, cuda_stream=handle)
 
 
 @functools.cache

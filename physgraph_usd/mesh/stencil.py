@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .lanes import Launch
@@ -61,6 +61,16 @@ def vectors(tensor: Tensor) -> wp.array:
     if not len(tensor):  # Empty tensors keep strides that Warp refuses.
         return wp.empty(0, dtype=VECTOR[tensor.dtype], device=str(tensor.device))
     return wp.from_torch(tensor, dtype=VECTOR[tensor.dtype], requires_grad=False)
+
+
+def add_at(total: Tensor, places: Int[Tensor, " items"], values: Tensor) -> Tensor:
+    """Add values in place at first indices that may repeat, in the same order on every run; returns ``total``.
+
+    On CUDA the order of `index_add_`, and so its rounding, changes from run to run.
+    """
+    if total.is_cuda:
+        return total.index_put_((places,), values, accumulate=True)
+    return total.index_add_(0, places, values)
 
 
 class Stencil:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -20,8 +21,8 @@ from ..integrate.learned import integrator_of
 from ..integrate.network import PaperConfig, PaperNetwork, Physgraph, PhysgraphConfig
 from ..integrate.quasi_newton import QuasiNewton
 from ..integrate.weights import make_network
+from .bundle import Bundle, deal
 from .patches import Patch, PatchConfig, make_patches
-from .unroll import JointSystem
 
 HARMLESS = 0.02
 """Part of the energy at the start below which the logarithm of the gap stops to reward."""
@@ -40,7 +41,7 @@ class TrainConfig:
         seed: Of patches, weights and order.
         minutes: How long to train, patches not counted.
         iterations: Most iterations, or None.
-        batch: Patches an iteration.
+        batch: Most patches an iteration; they are dealt into batches once, and a batch is stepped as one.
         unroll: Steps that gradients flow through.
         segments: Most unrolls one after another on a patch; later ones start where the last one ended.
         through_forces: Gradients flow through forces too, by differences; else through displacements only (A19).
@@ -103,12 +104,12 @@ class Trainer:
         )
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
         shared = like is not None and (like.config.patches, like.config.seed) == (config.patches, config.seed)
-        self.patches = (
-            like.patches if like and shared else make_patches(config.patches, seed=config.seed, device=device)
-        )
+        self.patches = like.patches if like and shared else _made(config.patches, config.seed)
         self._held_out = like._held_out if like and shared else None
-        for patch in self.patches:
-            patch.kept.clear()
+        self._bundles = [
+            Bundle(batch, device=device, through_forces=config.through_forces)
+            for batch in deal(self.patches, config.batch)
+        ]
         self._rng = np.random.default_rng(config.seed + 1)
         self.iteration, self.seconds = 0, 0.0
         self.curve: list[dict[str, Any]] = []
@@ -166,13 +167,14 @@ class Trainer:
     def _descend(self, steps: int) -> float:
         """Unroll a batch, segment after segment; gradients add up. Returns the mean loss."""
         config = self.config
-        items = [self._draw() for _ in range(config.batch)]
-        system = JointSystem([p.systems[i] for p, i in items], through_forces=config.through_forces)
-        starts = [self._begin(patch, index) for patch, index in items]
-        x = torch.cat([self._turned(start) for start in starts] if config.turn else starts)
+        bundle = self._bundles[int(self._rng.integers(len(self._bundles)))]
+        index = int(self._rng.integers(bundle.levels))
+        system = bundle.systems[index]
+        system.energies.clear()
+        x = bundle.begin(index, lambda: self._dice(len(bundle.patches)), shares=config)
         integrator = integrator_of(self.network)
         segments = int(self._rng.integers(1, config.segments + 1))
-        carry, total = integrator.start(system, x), 0.0
+        carry, total = integrator.start(system, self._turned(x) if config.turn else x), 0.0
         before = system.energies[-1].detach()
         for _ in range(segments):
             before = system.energies[-1].detach()
@@ -180,16 +182,14 @@ class Trainer:
             carry = detached(carry)
             for _ in range(steps):
                 carry = integrator.step(system, carry)
-            reached = torch.stack(system.energies)  # K B
-            for (patch, index), column in zip(items, reached.detach().T.tolist(), strict=True):
-                patch.least[index] = min([patch.least[index], *filter(math.isfinite, column)])
-            least = before.new_tensor([patch.least[index] for patch, index in items])
-            loss = loss_of(reached, before, least, kind=config.loss)
+            reached = torch.stack(system.energies)  # K P
+            bundle.learn(index, reached.detach())
+            loss = loss_of(reached, before, bundle.least[index], kind=config.loss)
             if not bool(loss.isfinite()):
                 break
             (loss / segments).backward()
             total += float(loss.detach()) / segments
-        self._keep(items, system, carry.x.detach(), before)
+        bundle.keep(index, carry.x.detach(), system.energies[-1].detach() <= before)
         return total
 
     def _turned(self, x: Tensor) -> Tensor:
@@ -197,31 +197,8 @@ class Trainer:
         turn = np.linalg.qr(self._rng.normal(size=(3, 3)))[0]
         return x @ torch.as_tensor(turn * np.linalg.det(turn), dtype=x.dtype, device=x.device)
 
-    def _draw(self) -> tuple[Patch, int]:
-        patch = self.patches[int(self._rng.integers(len(self.patches)))]
-        return patch, int(self._rng.integers(len(patch.systems)))
-
-    def _begin(self, patch: Patch, index: int) -> Tensor:
-        """A start at a level: the upsampled cage, or the end of a solve of the level below or of this level."""
-        dice = self._rng.random()
-        if dice < self.config.raw or (index == 0 and 0 not in patch.kept):
-            return patch.begin(index)
-        if dice > 1.0 - self.config.middle and index in patch.kept:
-            return patch.kept[index]
-        if index == 0:
-            return patch.begin(index)
-        prolong = patch.group.levels[index].from_below
-        assert prolong is not None
-        own = self._rng.random() < self.config.own
-        return prolong.apply(patch.kept[index - 1] if own and index - 1 in patch.kept else patch.solved[index - 1])
-
-    def _keep(self, items: Sequence[tuple[Patch, int]], system: JointSystem, x: Tensor, before: Tensor) -> None:
-        """Keep where the network came to, as a start for later; what went uphill is forgotten."""
-        for (patch, index), span, old, new in zip(
-            items, system.spans, before.tolist(), system.energies[-1].tolist(), strict=True
-        ):
-            if new <= old:
-                patch.kept[index] = x[span].clone()
+    def _dice(self, count: int) -> Tensor:
+        return torch.as_tensor(self._rng.random(count), device=self.device)
 
     def averaged(self) -> Physgraph | PaperNetwork:
         """The running mean of the weights, ready for use."""
@@ -233,8 +210,8 @@ class Trainer:
         """Gap over that of quasi-Newton at the same steps, geometric mean over held-out patches."""
         if self._held_out is None:
             config = replace(self.config.patches, count=self.config.held_out)
-            self._held_out = make_patches(config, seed=10_000 + self.config.seed, device=self.device)
-        ours = integrator_of(self.averaged())
+            self._held_out = _made(config, 10_000 + self.config.seed)
+        ours = integrator_of(self.averaged().to("cpu"))
         table = {}
         for schedule in SCHEDULES:
             ratios = []
@@ -255,7 +232,7 @@ class Trainer:
             "iteration": self.iteration,
             "seconds": self.seconds,
             "curve": self.curve,
-            "patches": [(patch.kept, patch.least) for patch in self.patches],
+            "bundles": [bundle.state() for bundle in self._bundles],
         }
         part = file.with_suffix(".part")
         torch.save(state, part)
@@ -270,8 +247,12 @@ class Trainer:
         self._rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch"].cpu())
         self.iteration, self.seconds, self.curve = state["iteration"], state["seconds"], state["curve"]
-        for patch, (kept, least) in zip(self.patches, state["patches"], strict=True):
-            patch.kept, patch.least = kept, least
+        for bundle, kept in zip(self._bundles, state["bundles"], strict=True):
+            bundle.restore(kept)
+
+
+def _made(config: PatchConfig, seed: int) -> list[Patch]:
+    return make_patches(config, seed=seed, workers=min(os.cpu_count() or 1, config.count // 8))
 
 
 def loss_of(

@@ -7,8 +7,12 @@ fixed. No asset is read.
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +29,7 @@ from ..integrate.solve import Budget, solve_level
 from ..level import refine_garments
 from ..mesh.topology import PolygonMesh, edges_of
 from ..scene import Garment, GarmentFrame
+from ..shot import prepare_device
 
 SHAPES = ("sheet", "tube", "dome")
 BORDERS = ("fixed", "one side", "free")
@@ -55,53 +60,61 @@ class PatchConfig:
 
 @dataclass(eq=False)
 class Patch:
-    """One patch in one pose.
+    """One patch in one pose, on the CPU.
 
     Attributes:
-        group: The solver's levels.
-        frame: Its pose and fabric.
-        systems: One system a level, cage first.
-        coarse: Recentred cage positions [m].
-        start: Energy of the linearly upsampled cage at each level [J].
-        least: Least energy known at each level [J].
+        garment: Its cage.
+        frame: Its pose, about the origin, and fabric.
+        gravity: [m/s^2], shape (3,).
         words: What it is.
-        solved: Positions after some steps of nested quasi-Newton at each level [m].
-        kept: Positions where the network in training last came to, by level [m].
+        raw: Upsampled cage at each level [m], float32, off the saddle where it is flat.
+        start: Its energy without leaving the saddle [J].
+        least: Least energy known at each level [J].
+        solved: Positions after some steps of nested quasi-Newton at each level [m], float32.
     """
 
-    group: Group
+    garment: Garment
     frame: GarmentFrame
-    systems: list[System]
-    coarse: Tensor
+    gravity: np.ndarray
     words: str
+    raw: list[np.ndarray] = field(default_factory=list)
     start: list[float] = field(default_factory=list)
     least: list[float] = field(default_factory=list)
-    solved: list[Tensor] = field(default_factory=list)
-    kept: dict[int, Tensor] = field(default_factory=dict)
+    solved: list[np.ndarray] = field(default_factory=list)
+
+    @cached_property
+    def group(self) -> Group:
+        """The solver's levels."""
+        return _group(self.garment, self.gravity, self.garment.level)
+
+    @cached_property
+    def systems(self) -> list[System]:
+        """One system a level, cage first."""
+        return self.group.systems([self.frame])[0]
 
     def begin(self, index: int) -> Tensor:
         """The upsampled cage at a level [m], off the saddle where it is flat."""
-        level, outward = self.group.levels[index], torch.ones(1, device=self.coarse.device)
-        return leave_saddle(self.systems[index], level, level.base.apply(self.coarse), outward=outward)
+        return torch.as_tensor(self.raw[index])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is made on demand: that holds kernels."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("group", "systems")}
 
 
-def make_patches(config: PatchConfig, *, seed: int, device: str) -> list[Patch]:
+def make_patches(config: PatchConfig, *, seed: int, workers: int = 1) -> list[Patch]:
     """Make patches; those whose pose is all but at rest are made again.
 
     Args:
         config: What patches.
-        seed: The same seed makes the same patches.
-        device: "cpu" or a CUDA device.
+        seed: The same seed makes the same patches, however many workers there are.
+        workers: Processes that share the work.
     """
-    patches: list[Patch] = []
-    rng = np.random.default_rng(seed)
-    while len(patches) < config.count:
-        patch = _patch(config, rng, device)
-        measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
-        drop = [a - b for a, b in zip(patch.start, patch.least, strict=True)]
-        if all(np.isfinite(drop)) and min(drop) > 1e-3 * abs(patch.start[-1]) + 1e-12:
-            patches.append(patch)
-    return patches
+    jobs = [(config, seed, number) for number in range(config.count)]
+    if workers <= 1 or len(jobs) < 2 * workers:
+        return [_numbered(*job) for job in jobs]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_device, initargs=("cpu",)) as pool:
+        return list(pool.map(_numbered, *zip(*jobs, strict=True), chunksize=4))
 
 
 def measure(patch: Patch, steps: int, *, presolve: int) -> None:
@@ -112,18 +125,39 @@ def measure(patch: Patch, steps: int, *, presolve: int) -> None:
         steps: Steps a level behind the least energy known.
         presolve: Steps a level of a second, shorter solve whose positions are kept.
     """
-    patch.start, patch.least, patch.solved = [], [], []
-    x = short = patch.begin(0)
+    patch.raw, patch.start, patch.least, patch.solved = [], [], [], []
+    coarse = patch.group.systems([patch.frame])[1]
+    x = short = coarse
     for index, (level, system) in enumerate(zip(patch.group.levels, patch.systems, strict=True)):
-        x, short = (x, short) if level.from_below is None else map(level.from_below.apply, (x, short))
+        upsampled = level.base.apply(coarse)
+        raw = leave_saddle(system, level, upsampled, outward=torch.ones(1))
+        x, short = (raw, raw) if level.from_below is None else map(level.from_below.apply, (x, short))
         x, report = solve_level(system, QuasiNewton(), x, level=index, budget=Budget(steps))
         short, _ = solve_level(system, QuasiNewton(), short, level=index, budget=Budget(presolve))
-        patch.start.append(system.energy_and_force(level.base.apply(patch.coarse))[0])
+        patch.raw.append(raw.numpy())
+        patch.start.append(system.energy_and_force(upsampled)[0])
         patch.least.append(report.energy_after)
-        patch.solved.append(short)
+        patch.solved.append(short.numpy())
 
 
-def _patch(config: PatchConfig, rng: np.random.Generator, device: str) -> Patch:
+def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
+    """The patch of a number, whoever makes it."""
+    rng = np.random.default_rng([seed, number])
+    while True:
+        patch = _patch(config, rng)
+        measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
+        drop = [a - b for a, b in zip(patch.start, patch.least, strict=True)]
+        if all(np.isfinite(drop)) and min(drop) > 1e-3 * abs(patch.start[-1]) + 1e-12:
+            patch.__dict__ = patch.__getstate__()
+            return patch
+
+
+def _group(garment: Garment, gravity: np.ndarray, level: int) -> Group:
+    chains = refine_garments([garment], [level])
+    return Group([garment], chains, gravity, SolveSettings(METHODS["quasi-newton"]), dtype=torch.float32, device="cpu")
+
+
+def _patch(config: PatchConfig, rng: np.random.Generator) -> Patch:
     mesh, flat, closed = _mesh(config, rng)
     shape = "tube" if closed else str(rng.choice([s for s in SHAPES if s != "tube"]))
     edge = 10 ** rng.uniform(-2.3, -1.3)
@@ -137,15 +171,11 @@ def _patch(config: PatchConfig, rng: np.random.Generator, device: str) -> Patch:
         levels -= 1
     garment = Garment("/Patch", mesh, rest, levels, False, bool(rng.random() < 0.3), one, one, one, one, pin)
     points = _posed(rest, rng)
-    settings = SolveSettings(METHODS["quasi-newton"])
-    build = {"dtype": torch.float32, "device": device}
     if rng.random() < 0.5 and pin.any():
-        points = _draped(Group([garment], [()], gravity, settings, **build), points, fabric, guide=guide, rng=rng)
-    group = Group([garment], refine_garments([garment], [levels]), gravity, settings, **build)
-    frame = GarmentFrame(points, fabric, guide)
-    systems, coarse = group.systems([frame])
+        points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)
+    frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
     words = f"{shape}, {'quads' if not mesh.is_triangles else 'triangles'}, border {border}, levels {levels}"
-    return Patch(group, frame, systems, coarse, words)
+    return Patch(garment, frame, gravity, words)
 
 
 def _mesh(config: PatchConfig, rng: np.random.Generator) -> tuple[PolygonMesh, np.ndarray, bool]:
@@ -241,8 +271,8 @@ def _material(config: PatchConfig, rng: np.random.Generator, *, free: bool) -> t
     stretch, bend = (
         middle * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for middle in (100.0, 5e-6)
     )
-    direction = rng.normal(size=3)
-    down = 9.81 * direction / np.linalg.norm(direction) * (0.0 if config.elastic else float(rng.random() < 0.7))
+    # Poses are turned anywhere, so one direction of gravity is enough.
+    down = np.array([0.0, 0.0, -9.81]) * (0.0 if config.elastic else float(rng.random() < 0.7))
     guide = 2000.0 * 10 ** rng.uniform(-0.7, 0.7) if free or rng.random() < 0.8 else 0.0
     return Fabric(stretch, bend, rng.uniform(0.08, 0.6)), 0.0 if config.elastic else guide, down
 
@@ -252,7 +282,7 @@ def _draped(group: Group, points: np.ndarray, fabric: Fabric, *, guide: float, r
     soft = Fabric(fabric.stretch, 100.0 * fabric.bend, fabric.density)
     systems, x = group.systems([GarmentFrame(points, soft, 0.1 * guide)])
     x, _ = solve_level(systems[0], QuasiNewton(), x, level=0, budget=Budget(int(rng.integers(2, 20))))
-    return x.double().cpu().numpy()
+    return x.double().numpy()
 
 
 def describe(patches: Sequence[Patch]) -> list[str]:

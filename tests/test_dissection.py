@@ -1,0 +1,73 @@
+"""The dissected factor: its solve against a direct one, on meshes of every kind of connectedness."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+import torch
+from meshes import grid
+
+from physgraph_usd.integrate.dissection import DissectedSolver, dissect
+from physgraph_usd.mesh.topology import edges_of
+
+
+def laplacian(columns: int, rows: int, rng: np.random.Generator) -> sp.csr_matrix:
+    """Springs of random stiffness along a grid's edges, held a little everywhere."""
+    mesh, points = grid(columns, rows, "triangles")
+    edges = edges_of(mesh.triangulate(points).triangles, len(points)).vertices
+    k = 10.0 ** rng.uniform(-1, 1, len(edges))
+    i, j = edges.T
+    count = len(points)
+    off = sp.coo_matrix((k, (i, j)), shape=(count, count))
+    off = off + off.T
+    return sp.csr_matrix(sp.diags(np.asarray(off.sum(axis=1)).ravel() + 1e-3) - off)
+
+
+def several(rng: np.random.Generator) -> sp.csr_matrix:
+    """Pieces of different sizes, and vertices that touch nothing."""
+    parts = [laplacian(*size, rng) for size in ((3, 3), (30, 4), (12, 13))] + [sp.identity(700, format="csr")]
+    return sp.csr_matrix(sp.block_diag(parts))
+
+
+@pytest.mark.parametrize("leaf", [4, 30, 10_000])
+@pytest.mark.parametrize("which", ["one sheet", "several pieces", "one vertex"])
+def test_the_solve_is_the_direct_one(which: str, leaf: int):
+    rng = np.random.default_rng(3)
+    matrix = {"one sheet": lambda: laplacian(31, 23, rng), "several pieces": lambda: several(rng)}.get(
+        which, lambda: sp.csr_matrix([[2.0]])
+    )()
+    solver = DissectedSolver(matrix, dissect(matrix, leaf=leaf), dtype=torch.float64, device="cpu")
+    for _ in range(2):
+        force = rng.normal(size=(matrix.shape[0], 3))
+        expected = spl.spsolve(sp.csc_matrix(matrix), force).reshape(force.shape)
+        found = solver.solve(torch.as_tensor(force)).numpy()
+        assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+def test_every_vertex_is_eliminated_once_and_before_what_it_waits_for():
+    matrix = several(np.random.default_rng(1))
+    cut = dissect(matrix, leaf=16)
+    count = matrix.shape[0]
+    assert sorted(cut.order) == list(range(count))
+    node = np.repeat(np.arange(len(cut.parent)), np.diff(cut.starts))
+    place = np.empty(count, int)
+    place[cut.order] = node
+    above = [{n} for n in range(len(cut.parent))]
+    for n in reversed(range(len(cut.parent))):
+        if cut.parent[n] >= 0:
+            above[n] |= above[cut.parent[n]]
+    rows, columns = matrix.nonzero()
+    for a, b in zip(place[rows], place[columns], strict=True):
+        assert a in above[b] or b in above[a]
+
+
+def test_leaves_are_small_and_cuts_are_lines():
+    """A square of n vertices is cut by lines of about its width."""
+    matrix = laplacian(60, 60, np.random.default_rng(2))
+    cut = dissect(matrix, leaf=50)
+    sizes = np.diff(cut.starts)
+    assert sizes[: cut.stages[1]].max() <= 60
+    assert sizes[-1] <= 2 * 61
+    assert sizes[cut.stages[1] :].sum() < 0.5 * matrix.shape[0]

@@ -1,0 +1,70 @@
+"""Recorded steps of `physgraph`: the same numbers as step by step. Replaying on CUDA is tested in `test_cuda.py`."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from cloth import finest_system, group_of, sheet, wave
+
+from physgraph_usd.integrate.base import System
+from physgraph_usd.integrate.learned import LearnedMetric
+from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
+from physgraph_usd.integrate.recorded import Place
+from physgraph_usd.integrate.weights import random_network
+
+LOCAL = PhysgraphConfig(("secant", "metric1", "move1", "diagonal"), width=16, means=False)
+ALL = PhysgraphConfig(VECTORS, width=8, rounds=1, strain=True)
+
+
+def problem() -> tuple[System, torch.Tensor]:
+    mesh, rest = sheet(6, 5)
+    return finest_system(group_of(mesh, rest, level=2, dtype=torch.float32), wave(rest))
+
+
+def recorded(network: Physgraph, system: System) -> LearnedMetric:
+    """An integrator that records although it is not on CUDA: it then runs a step's kernels one by one."""
+    integrator = LearnedMetric(network)
+    integrator.records = lambda _: True
+    return integrator
+
+
+@pytest.mark.parametrize("config", [LOCAL, ALL])
+def test_recorded_steps_are_the_same_steps(config: PhysgraphConfig):
+    system, x = problem()
+    network = random_network(config, seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    one, other = LearnedMetric(network), recorded(network, system)
+    a, b = one.start(system, x), other.start(system, x)
+    assert isinstance(b.memory, Place)
+    before = (system.evaluations, system.metric_solves)
+    for _ in range(8):
+        a, b = one.step(system, a), other.step(system, b)
+        assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
+        assert b.energy == pytest.approx(a.energy, rel=1e-4)
+    assert (system.evaluations - before[0], system.metric_solves - before[1]) == (16, 16)
+
+
+def test_a_carry_of_the_past_is_stepped_from_where_it_was():
+    system, x = problem()
+    network = random_network(LOCAL, seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    integrator = recorded(network, system)
+    start = integrator.start(system, x)
+    first = integrator.step(system, start)
+    kept = first.x.clone()
+    integrator.step(system, integrator.step(system, first))
+    assert torch.equal(first.x, kept)
+    again = integrator.step(system, start)
+    assert torch.allclose(again.x, first.x, atol=1e-6 * float(system.spacing.mean()))
+
+
+def test_resuming_keeps_the_memory():
+    system, x = problem()
+    network = random_network(LOCAL, seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    one, other = LearnedMetric(network), recorded(network, system)
+    a, b = one.start(system, x), other.start(system, x)
+    for _ in range(3):
+        a, b = one.step(system, a), other.step(system, b)
+    a, b = one.step(system, one.resume(system, a)), other.step(system, other.resume(system, b))
+    assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
