@@ -5,19 +5,28 @@ A vector v of a vertex gives others that turn with the cloth as v does, and that
 | name | vector | what for |
 |---|---|---|
 | ``v.normal`` | (v . n) n | cloth is soft across itself and stiff along itself |
-| ``v.strain`` | E v, E = mean of e u u^T over the edges, over `STRAIN` | it folds along what is compressed |
+| ``v.strain`` | E v, E = mean of asinh(e / `STRAIN`) u u^T over the edges | it folds along what is compressed |
 | ``v.smooth`` | mean of v over the neighbours | coarse and fine waves want steps of different lengths |
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
+from weakref import WeakKeyDictionary
 
+import numpy as np
+import scipy.sparse as sp
 import torch
+import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mesh.stencil import add_at
+from ..mesh.lanes import Launch
+from ..mesh.stencil import SCALAR, VECTOR, Stencil, vectors
+from ..mesh.topology import incidence
 from .base import Surface
 
 PARTS = ("normal", "strain", "smooth")
@@ -30,8 +39,10 @@ class Around:
 
     def __init__(self, level: Surface, x: Float[Tensor, "vertices 3"]) -> None:
         """Look from positions x [m]; no gradients flow through what is seen."""
-        self._level, self._x = level, x.detach()
-        self._ends = level.edges.long()
+        self._x = x.detach()
+        if level not in _KNOWN:
+            _KNOWN[level] = _Tables(level)
+        self._tables = _KNOWN[level]
 
     def part(self, vector: Float[Tensor, "vertices 3"], name: str) -> Float[Tensor, "vertices 3"]:
         """One of `PARTS` of a vector."""
@@ -39,34 +50,128 @@ class Around:
             return (vector * self.normal).sum(dim=1, keepdim=True) * self.normal
         if name == "strain":
             return (self.strain @ vector.unsqueeze(2)).squeeze(2)
-        return self._over_neighbours(vector) / self._degree
+        return self._tables.smooth(vector)
 
     @cached_property
     def normal(self) -> Float[Tensor, "vertices 3"]:
         """Area-weighted unit normals; zero where triangles have no area."""
-        corners = self._level.triangles.long()
-        corner = self._x[corners]
-        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        total = add_at(torch.zeros_like(self._x), corners.T.reshape(-1), area.repeat(3, 1))
-        return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
+        out = torch.empty_like(self._x)
+        self._tables.normals({2: vectors(self._x), 3: vectors(out)})
+        return out
 
     @cached_property
     def strain(self) -> Float[Tensor, "vertices 3 3"]:
-        """Mean of e u u^T over each vertex's edges, e their strain over `STRAIN` and u their directions."""
-        span = self._x[self._ends[:, 1]] - self._x[self._ends[:, 0]]
-        length = span.square().sum(dim=1).clamp_min(1e-30).sqrt()
-        along = span / length.unsqueeze(1)
-        amount = torch.asinh((length / self._level.rest_length - 1.0) / STRAIN)
-        tensor = amount.reshape(-1, 1, 1) * along.unsqueeze(2) * along.unsqueeze(1)  # E 3 3
-        total = add_at(tensor.new_zeros(len(self._x), 9), self._ends.T.reshape(-1), tensor.reshape(-1, 9).repeat(2, 1))
-        return (total / self._degree).reshape(-1, 3, 3)
+        """E of each vertex."""
+        out = self._x.new_empty(len(self._x), 3, 3)
+        wide = wp.types.matrix(shape=(3, 3), dtype=SCALAR[self._x.dtype])
+        self._tables.strains({3: vectors(self._x), 4: wp.from_torch(out, dtype=wide)})
+        return out
 
-    @cached_property
-    def _degree(self) -> Tensor:
-        ones = torch.ones_like(self._level.rest_length)
-        return add_at(torch.zeros_like(self._x[:, 0]), self._ends.T.reshape(-1), ones.repeat(2)).clamp_min(1.0)[:, None]
 
-    def _over_neighbours(self, vector: Tensor) -> Tensor:
-        """Sum of a vector over the neighbours; gradients flow through the vector."""
-        swapped = torch.cat([self._ends[:, 1], self._ends[:, 0]])
-        return torch.zeros_like(vector).index_add(0, self._ends.T.reshape(-1), vector[swapped])
+class _Tables:
+    """What lies around each vertex of a level, ready for the kernels."""
+
+    def __init__(self, level: Surface) -> None:
+        count, device, dtype = len(level.rest), str(level.rest.device), level.rest.dtype
+        triangles, edges = level.triangles.cpu().numpy(), level.edges.cpu().numpy()
+        corner, end = incidence(triangles, count), incidence(edges, count)
+        others = triangles[corner.element]
+        turned = np.take_along_axis(others, (corner.corner[:, None] + [1, 2]) % 3, axis=1).astype(np.int32)
+        far = edges[end.element, 1 - end.corner].astype(np.int32)
+        lengths = level.rest_length.double().cpu().numpy()[end.element]
+        x = vectors(torch.zeros_like(level.rest))
+        wide = wp.zeros(count, dtype=wp.types.matrix(shape=(3, 3), dtype=SCALAR[dtype]), device=device)
+
+        def ints(values: np.ndarray, kind: Any = wp.int32) -> wp.array:
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=device)
+
+        given = {"device": device, "lanes": level.lanes}
+        self.normals = Launch(_NORMALS[dtype], count, [ints(corner.starts), ints(turned, wp.vec2i), x, x], **given)
+        rest = wp.array(lengths, dtype=SCALAR[dtype], device=device)
+        self.strains = Launch(_STRAINS[dtype], count, [ints(end.starts), ints(far), rest, x, wide], **given)
+        degree = np.diff(end.starts)
+        weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
+        mean = sp.csr_matrix((weights, far, end.starts), shape=(count, count))
+        self._mean = Stencil(mean, dtype=dtype, device=device, lanes=level.lanes)
+        self._back = Stencil(sp.csr_matrix(mean.T), dtype=dtype, device=device, lanes=level.lanes)
+
+    def smooth(self, vector: Tensor) -> Tensor:
+        """Mean over the neighbours; gradients flow through."""
+        return _Smooth.apply(vector, self) if vector.requires_grad else self._mean.apply(vector.contiguous())
+
+
+class _Smooth(torch.autograd.Function):
+    """The mean over the neighbours and its transpose."""
+
+    @staticmethod
+    def forward(ctx: Any, vector: Tensor, tables: _Tables) -> Tensor:
+        ctx.tables = tables
+        return tables._mean.apply(vector.contiguous())
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:  # type: ignore[override]
+        return ctx.tables._back.apply(gradients[0].contiguous()), None
+
+
+_KNOWN: WeakKeyDictionary[Surface, _Tables] = WeakKeyDictionary()
+
+
+@wp.kernel
+def _normals(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    others: wp.array(dtype=wp.vec2i),
+    x: wp.array(dtype=Any),
+    out: wp.array(dtype=Any),
+):
+    i = first + wp.tid()
+    total = x[i] - x[i]
+    for k in range(starts[i], starts[i + 1]):
+        total += wp.cross(x[others[k][0]] - x[i], x[others[k][1]] - x[i])
+    out[i] = wp.normalize(total)
+
+
+@wp.kernel
+def _strains(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    far: wp.array(dtype=wp.int32),
+    rest: wp.array(dtype=Any),
+    x: wp.array(dtype=Any),
+    out: wp.array(dtype=Any),
+):
+    i = first + wp.tid()
+    zero = x[i] - x[i]
+    total = wp.outer(zero, zero)
+    for k in range(starts[i], starts[i + 1]):
+        span = x[far[k]] - x[i]
+        length = wp.max(wp.length(span), rest[k] * rest.dtype(1.0e-6))
+        e = (length / rest[k] - rest.dtype(1.0)) / rest.dtype(wp.static(STRAIN))
+        size = wp.abs(e)
+        amount = wp.sign(e) * wp.log(size + wp.sqrt(size * size + rest.dtype(1.0)))
+        u = span / length
+        total += amount * wp.outer(u, u)
+    out[i] = total / rest.dtype(wp.max(starts[i + 1] - starts[i], 1))
+
+
+_NORMALS = {
+    t: wp.overload(
+        _normals,
+        [wp.int32, wp.array(dtype=wp.int32), wp.array(dtype=wp.vec2i), wp.array(dtype=v), wp.array(dtype=v)],
+    )
+    for t, v in VECTOR.items()
+}
+_STRAINS = {
+    t: wp.overload(
+        _strains,
+        [
+            wp.int32,
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=SCALAR[t]),
+            wp.array(dtype=v),
+            wp.array(dtype=wp.types.matrix(shape=(3, 3), dtype=SCALAR[t])),
+        ],
+    )
+    for t, v in VECTOR.items()
+}

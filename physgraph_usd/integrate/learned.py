@@ -14,9 +14,11 @@ and a hash of the numbers.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
@@ -26,7 +28,7 @@ from ..errors import SolveError
 from .around import Around
 from .base import Carry, Surface, System
 from .fused import can_fuse, fused_physgraph
-from .network import Graph, PaperNetwork, Physgraph
+from .network import Graph, PaperNetwork, Physgraph, Ways
 from .recorded import FORCE, IMAGE, MOST_GARMENTS, SECANTS, Place, Recording
 
 NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
@@ -231,7 +233,8 @@ class LearnedPaper:
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
         memory: _Memory = carry.memory
-        graph, config = graph_of(system), self._network.config
+        config, level = self._network.config, _level(system)
+        ways = ways_of(level)
         scaled = config.features == "scaled"
         length = system.spacing.unsqueeze(1)  # V 1
         unit, force_unit = (length, memory.images[0] * length) if scaled else (1.0, 1.0)
@@ -239,14 +242,13 @@ class LearnedPaper:
         moves = [-move / unit for move in (*memory.moves, *none)[: config.history]]
         forces = [force / force_unit for force in (*memory.forces, *none)[: config.history]]
         vertex = torch.cat([*moves, *forces], dim=1)  # V 6H
-        ends = graph.edges.long()
-        sender, receiver = torch.cat([ends[:, 0], ends[:, 1]]), torch.cat([ends[:, 1], ends[:, 0]])
-        rest = _level(system).rest
+        sender, receiver = ways.sender, ways.receiver
         size = 0.5 * (length[sender] + length[receiver]) if scaled else 1.0
-        spans = [(x[receiver] - x[sender]) / size for x in (carry.x, rest)]
+        spans = [(x[receiver] - x[sender]) / size for x in (carry.x, level.rest)]
         edge = torch.cat([part for s in spans for part in (s, s.norm(dim=1, keepdim=True))], dim=1)  # 2E 8
         fixed = (~system.free).to(torch.float32)
-        out = self._network(vertex.float(), edge.float(), fixed, sender=sender, receiver=receiver)
+        with fast_products(carry.x.is_cuda and not self._network.training):
+            out = self._network(vertex.float(), edge.float(), fixed, ways=ways)
         return limited(out.to(carry.x) * length, system.spacing) * system.free
 
 
@@ -343,6 +345,27 @@ def graph_of(system: System) -> Graph:
         return Graph(owner, (slice(0, len(owner)),), edges, system.spacing.float(), system.spacing.new_zeros(0).float())
     spacing, rest = system.spacing.float(), level.rest_length.float()
     return Graph(level.vertex_garment.long(), level.spans, level.edges, spacing, rest)
+
+
+_WAYS: WeakKeyDictionary[Surface, Ways] = WeakKeyDictionary()
+
+
+def ways_of(level: Surface) -> Ways:
+    """The edges of a level in both directions, found once."""
+    if level not in _WAYS:
+        _WAYS[level] = Ways.of(level.edges, len(level.rest))
+    return _WAYS[level]
+
+
+@contextmanager
+def fast_products(wanted: bool) -> Iterator[None]:
+    """Let float32 products of matrices on CUDA use tensor cores, whose factors have 10 bits: enough for a proposal."""
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = wanted or before
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = before
 
 
 def edge_strain(system: System, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -182,6 +182,28 @@ def _strain_features(strain: Tensor, graph: Graph) -> Tensor:
     return torch.asinh(30.0 * mean)
 
 
+@dataclass(frozen=True, eq=False)
+class Ways:
+    """The edges in both directions, sorted by their receiver.
+
+    Attributes:
+        sender: Vertex that each starts from, shape (2E,).
+        receiver: Vertex that it ends at, shape (2E,).
+        degree: How many end at each vertex, shape (V,).
+    """
+
+    sender: Int[Tensor, " directed"]
+    receiver: Int[Tensor, " directed"]
+    degree: Int[Tensor, " vertices"]
+
+    @staticmethod
+    def of(edges: Int[Tensor, "edges 2"], vertices: int) -> Ways:
+        """Both ways of each edge."""
+        sender, receiver = torch.cat([edges, edges.flip(1)]).long().T
+        order = receiver.argsort(stable=True)
+        return Ways(sender[order], receiver[order], torch.bincount(receiver, minlength=vertices))
+
+
 @dataclass(frozen=True)
 class PaperConfig:
     """Size of a `PaperNetwork`.
@@ -225,8 +247,7 @@ class PaperNetwork(nn.Module):
         edge: Float[Tensor, "directed 8"],
         fixed: Float[Tensor, "vertices 1"],
         *,
-        sender: Int[Tensor, " directed"],
-        receiver: Int[Tensor, " directed"],
+        ways: Ways,
     ) -> Float[Tensor, "vertices 3"]:
         """Displacement in local edge lengths.
 
@@ -234,17 +255,26 @@ class PaperNetwork(nn.Module):
             vertex: Past displacements and forces (P3).
             edge: Present and rest spans and their lengths (P4), of each edge in both directions (A3).
             fixed: 1 where a vertex may not move (A17).
-            sender: Vertex that each directed edge starts from.
-            receiver: Vertex that it ends at.
+            ways: The edges in both directions.
         """
         v = self.encode_vertex(torch.cat([self.vertex_scale(vertex), fixed], dim=1))  # V L
         e = self.encode_edge(self.edge_scale(edge))  # 2E L
         for k in range(self.config.rounds):
             own = 0 if self.config.shared else k
-            e = e + self.update_edge[own](torch.cat([v[receiver], v[sender], e], dim=1))  # 2E L
-            gathered = torch.zeros_like(v).index_add_(0, receiver, e)  # V L
+            e = e + self._edge_update(self.update_edge[own], v, e, ways)  # 2E L
+            gathered = torch.segment_reduce(e, "sum", lengths=ways.degree, axis=0, unsafe=True)  # V L
             v = v + self.update_vertex[own](torch.cat([v, gathered], dim=1))  # V L
         return self.step_length * self.decode(v)  # V 3
+
+    def _edge_update(self, perceptron: nn.Module, v: Tensor, e: Tensor, ways: Ways) -> Tensor:
+        """The perceptron of (receiver, sender, edge); its first layer meets each vertex once, not once an edge."""
+        first, *others = cast(nn.Sequential, perceptron)
+        at_receiver, at_sender, at_edge = cast(nn.Linear, first).weight.chunk(3, dim=1)
+        h = nn.functional.linear(e, at_edge, cast(nn.Linear, first).bias)
+        h = h + (v @ at_receiver.T)[ways.receiver] + (v @ at_sender.T)[ways.sender]
+        for layer in others:
+            h = layer(h)
+        return h
 
 
 class Normaliser(nn.Module):
