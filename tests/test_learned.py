@@ -62,7 +62,7 @@ def test_untrained_the_papers_network_stays():
     assert torch.equal(carry.x, x)
 
 
-@pytest.mark.parametrize("vectors", [("metric", "move1", "diagonal"), ("secant", "metric", "metric1", "move1")])
+@pytest.mark.parametrize("vectors", [("metric", "move1", "diagonal"), ("secant", "metric", "metric1", "move1"), ("secant", "secant.normal", "metric.strain", "diagonal.smooth")])
 def test_one_kernel_does_what_torch_does(vectors: tuple[str, ...]):
     system, x = problem(torch.float32, level=2)
     network = random_network(PhysgraphConfig(vectors=vectors, width=16, means=False), seed=7, scale=0.3)

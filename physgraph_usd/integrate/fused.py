@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -21,8 +21,11 @@ from torch import Tensor
 
 from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
+from .around import Around
 from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of
 
+NORMAL, STRAIN = 1, 2
+"""Parts of a vector that the kernel takes itself; 0 is the vector, and means over neighbours are given."""
 LOG_SCALE = 0.5 / math.log(10.0)
 """The networks see (log10 + 3) / 2 of a length."""
 
@@ -39,6 +42,7 @@ class FusedPhysgraph:
     Attributes:
         vertices: That number.
         count: Number of vectors.
+        bases: Names of the vectors that are handed over; the others are parts that the kernel takes of them.
     """
 
     def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, lanes: int) -> None:
@@ -53,7 +57,9 @@ class FusedPhysgraph:
         """
         config = network.config
         self.vertices, self.count, width = vertices, len(config.vectors), config.width
-        self._stack = torch.zeros((self.count, vertices, 3), device=device)
+        self.bases, source, kind = in_bases(config.vectors)
+        self._kinds = set(kind)
+        self._stack = torch.zeros((len(self.bases), vertices, 3), device=device)
         self._out = torch.zeros((vertices, 3), device=device)
         self._bias, self._clock = network.encode.bias.detach(), network.encode_means.weight.detach()[:, 0]
         self._first = self._bias.clone().reshape(1, width)
@@ -69,25 +75,39 @@ class FusedPhysgraph:
         ]
         kernel = fused_kernel(self.count, width)
         flat, spacing = vectors(self._stack.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
-        inputs = [vertices, flat, spacing, longest, *packed, vectors(self._out)]
+        which = [wp.array(values, dtype=wp.int32, device=device) for values in (source, kind)]
+        normal, strain = (wp.zeros(1, dtype=t, device=device) for t in (wp.vec3f, wp.mat33f))
+        inputs = [vertices, flat, *which, spacing, longest, normal, strain, *packed, vectors(self._out)]
         self._launch = Launch(kernel, vertices, inputs, device=device, lanes=lanes)
 
     def __call__(
-        self, combined: Sequence[Float[Tensor, "vertices 3"]], spacing: Float[Tensor, " vertices"], step: int | Tensor
+        self,
+        bases: Sequence[Float[Tensor, "vertices 3"]],
+        spacing: Float[Tensor, " vertices"],
+        step: int | Tensor,
+        *,
+        around: Callable[[], Around],
     ) -> Float[Tensor, "vertices 3"]:
         """The displacement [m], no longer than allowed; valid until the next call.
 
         Args:
-            combined: The configuration's vectors [m].
+            bases: The vectors that `bases` names [m].
             spacing: Mean rest edge at each vertex [m].
             step: Number of steps made before, a scalar on the device while steps are recorded.
+            around: Gives the surroundings of the vertices; called where parts need them.
         """
-        torch.stack(list(combined), out=self._stack)
+        torch.stack(list(bases), out=self._stack)
         if isinstance(step, Tensor):
             torch.addcmul(self._bias, self._clock, clock_of(step), out=self._first[0])
         else:
             torch.add(self._bias, self._clock, alpha=clock_of(step), out=self._first[0])
-        self._launch({2: wp.from_torch(spacing, requires_grad=False)})
+        changed = {4: wp.from_torch(spacing, requires_grad=False)}
+        seen = around() if self._kinds & {NORMAL, STRAIN} else None
+        if seen is not None and NORMAL in self._kinds:
+            changed[6] = vectors(seen.normal)
+        if seen is not None and STRAIN in self._kinds:
+            changed[7] = wp.from_torch(seen.strain, dtype=wp.mat33f)
+        self._launch(changed)
         return self._out
 
 
@@ -97,17 +117,34 @@ def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device
     return FusedPhysgraph(network, vertices, longest, device=device, lanes=lanes)
 
 
+def in_bases(names: Sequence[str]) -> tuple[tuple[str, ...], list[int], list[int]]:
+    """The vectors that a kernel must be given for vectors of these names, and for each the base and the part of it."""
+    whole = [name if name.endswith(".smooth") else name.partition(".")[0] for name in names]
+    bases = tuple(dict.fromkeys(whole))
+    kinds = [{"normal": NORMAL, "strain": STRAIN}.get(name.partition(".")[2], 0) for name in names]
+    return bases, [bases.index(name) for name in whole], kinds
+
+
+@wp.func
+def part_of(s: wp.vec3f, kind: wp.int32, i: wp.int32, normal: wp.array(dtype=wp.vec3f), strain: wp.array(dtype=Any)):
+    """A vector or its part."""
+    if kind == wp.static(NORMAL):
+        s = normal[i] * wp.dot(s, normal[i])
+    if kind == wp.static(STRAIN):
+        s = strain[i] * s
+    return s
+
+
 def _encoder(count: int) -> Any:
     """Adds the features' part to the first layer: lengths as logarithms, then cosines of all pairs."""
-    directions = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
     floor, log_scale = FLOOR**2, 0.5 * LOG_SCALE
 
     @wp.func
-    def encoded(v: wp.array(dtype=wp.vec3f), i: wp.int32, vertices: wp.int32, scale: wp.float32, w: Any, start: Any):
-        unit = directions()
+    def encoded(all: Any, scale: wp.float32, w: Any, start: Any):
+        unit = all
         h = start
         for a in range(wp.static(count)):
-            s = v[a * vertices + i] * scale
+            s = wp.vec3f(all[a, 0], all[a, 1], all[a, 2]) * scale
             square = wp.dot(s, s) + wp.float32(wp.static(floor))
             h = h + w[a] * (wp.static(log_scale) * wp.log(square) + wp.float32(1.5))
             inverse = wp.float32(1.0) / wp.sqrt(square)
@@ -142,14 +179,19 @@ def _layer(width: int) -> Any:
 def fused_kernel(count: int, width: int) -> wp.Kernel:
     """The kernel for so many vectors and so wide a network; vectors are stored one after another."""
     encoded, layer = _encoder(count), _layer(width)
+    rows = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
 
     @wp.kernel(module="unique")
     def fused(
         first: wp.int32,
         vertices: wp.int32,
         v: wp.array(dtype=Any),
+        source: wp.array(dtype=wp.int32),
+        kind: wp.array(dtype=wp.int32),
         spacing: wp.array(dtype=wp.float32),
         longest: wp.float32,
+        normal: wp.array(dtype=wp.vec3f),
+        strain: wp.array(dtype=wp.mat33f),
         w1: wp.array(dtype=Any),
         b1: wp.array(dtype=Any),
         w2: wp.array(dtype=Any),
@@ -159,11 +201,17 @@ def fused_kernel(count: int, width: int) -> wp.Kernel:
         out: wp.array(dtype=Any),
     ):
         i = first + wp.tid()
-        h = encoded(v, i, vertices, wp.float32(1.0) / spacing[i], w1, b1[0])
+        all = rows()
+        for a in range(wp.static(count)):
+            s = part_of(v[source[a] * vertices + i], kind[a], i, normal, strain)
+            all[a, 0] = s[0]
+            all[a, 1] = s[1]
+            all[a, 2] = s[2]
+        h = encoded(all, wp.float32(1.0) / spacing[i], w1, b1[0])
         c = layer(layer(h, w2, b2[0]), w3, b3[0])
-        move = v[i] * c[0]
-        for a in range(1, wp.static(count)):
-            move = move + v[a * vertices + i] * c[a]
+        move = wp.vec3f()
+        for a in range(wp.static(count)):
+            move = move + wp.vec3f(all[a, 0], all[a, 1], all[a, 2]) * c[a]
         far, most = wp.length(move), longest * spacing[i]
         if far > most:
             move = move * (most / far)
@@ -171,5 +219,7 @@ def fused_kernel(count: int, width: int) -> wp.Kernel:
 
     wide, narrow = (wp.array(dtype=wp.types.vector(length=n, dtype=wp.float32)) for n in (width, count))
     space, numbers = wp.array(dtype=wp.vec3f), wp.array(dtype=wp.float32)
-    types = [wp.int32, wp.int32, space, numbers, wp.float32, wide, wide, wide, wide, narrow, narrow, space]
+    which, tensors = wp.array(dtype=wp.int32), wp.array(dtype=wp.mat33f)
+    types = [wp.int32, wp.int32, space, which, which, numbers, wp.float32, space, tensors]
+    types += [wide, wide, wide, wide, narrow, narrow, space]
     return wp.overload(fused, types)

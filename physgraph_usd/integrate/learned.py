@@ -17,6 +17,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
@@ -116,22 +117,23 @@ class LearnedMetric:
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
         memory: _Memory = carry.memory
-        combined = vectors_of(
-            self._network.config.vectors, lambda name: self._vector(name, system, carry), system=system, x=carry.x
-        )
         assert memory.graph is not None
-        return self._combined(system, carry.x, combined, step=memory.step, graph=memory.graph)
+        whole = partial(self._vector, system=system, carry=carry)
+        return self._combined(system, carry.x, whole, step=memory.step, graph=memory.graph)
 
     def _combined(
-        self, system: System, x: Tensor, vectors: list[Tensor], *, step: int | Tensor, graph: Graph
+        self, system: System, x: Tensor, whole: Callable[[str], Tensor], *, step: int | Tensor, graph: Graph
     ) -> Float[Tensor, "vertices 3"]:
-        """The network's combination of vectors [m]."""
+        """The network's combination of vectors [m]; ``whole`` gives those without a dot in their name."""
+        names = self._network.config.vectors
         if self._fuse and x.dtype == torch.float32:
             lanes = 1 if system.level is None else system.level.lanes
             device = str(system.spacing.device)
             fused = fused_physgraph(self._network, len(system.spacing), LONGEST, device=device, lanes=lanes)
-            return fused(vectors, system.spacing, step) * system.free
-        stacked = torch.stack(vectors, dim=1)  # V N 3
+            around = cache(lambda: Around(_level(system), x))
+            bases = vectors_of(fused.bases, whole, around=around)
+            return fused(bases, system.spacing, step, around=around) * system.free
+        stacked = torch.stack(vectors_of(names, whole, around=cache(lambda: Around(_level(system), x))), dim=1)  # V N 3
         needed = self._network.config.strain or self._network.config.rounds > 0
         strain = edge_strain(system, x).float() if needed else None
         scaled = stacked / system.spacing.reshape(-1, 1, 1)  # V N 3
@@ -167,11 +169,9 @@ class LearnedMetric:
             "diagonal": lambda: rows[FORCE] / diagonal,
             "diagonal1": lambda: recording.force_before / diagonal,
         }
-        names = self._network.config.vectors
-        vectors = vectors_of(names, lambda name: known[name](), system=system, x=recording.x)
-        return self._combined(system, recording.x, vectors, step=recording.step, graph=graph)
+        return self._combined(system, recording.x, lambda name: known[name](), step=recording.step, graph=graph)
 
-    def _vector(self, name: str, system: System, carry: Carry) -> Tensor:
+    def _vector(self, name: str, *, system: System, carry: Carry) -> Tensor:
         """One of `network.VECTORS` [m]; zero where the past does not reach so far."""
         memory: _Memory = carry.memory
         if name == "secant":
@@ -315,24 +315,21 @@ def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices
     return move * (LONGEST * spacing.unsqueeze(1) / size).clamp_max(1.0)
 
 
-def vectors_of(names: Sequence[str], whole: Callable[[str], Tensor], *, system: System, x: Tensor) -> list[Tensor]:
+def vectors_of(names: Sequence[str], whole: Callable[[str], Tensor], *, around: Callable[[], Around]) -> list[Tensor]:
     """The vectors of given names [m]; those with a dot are parts of whole ones (`around.PARTS`).
 
     Args:
-        names: Names out of `network.VECTORS`, parts included.
+        names: Names out of `network.VECTORS`.
         whole: Gives a vector without a dot in its name.
-        system: For the mesh around the vertices.
-        x: Positions [m].
+        around: Gives the surroundings of the vertices.
     """
     found: dict[str, Tensor] = {}
-    around: Around | None = None
     for name in names:
         base, _, part = name.partition(".")
         if base not in found:
             found[base] = whole(base)
         if part:
-            around = around or Around(_level(system), x)
-            found[name] = around.part(found[base], part)
+            found[name] = around().part(found[base], part)
     return [found[name] for name in names]
 
 
