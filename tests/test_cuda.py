@@ -69,7 +69,7 @@ def test_s33_a_solved_frame_agrees_and_repeats() -> None:
         answers.append(one.solve(frames, None, at=None).points[0])
     here, there, again = answers
     assert there.tobytes() == again.tobytes()
-    assert np.abs(here - there).max() < 1e-4 * EDGE / 4
+    assert np.abs(here - there).max() < 1e-3 * EDGE / 4
 
 
 @pytest.mark.parametrize("vectors", [("secant", "metric1", "move1", "diagonal"), VECTORS])

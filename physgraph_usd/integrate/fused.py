@@ -1,8 +1,8 @@
-"""`Physgraph` without messages as one kernel: features, layers and combination of a vertex never leave the registers.
+"""`Physgraph` without messages as two kernels around a few products of matrices.
 
-In torch a step at 26,000 vertices writes some forty arrays; on a CPU that costs several force evaluations. The kernel
-does the same arithmetic (`tests/test_learned.py` holds one against the other) and, as every kernel here, runs on CUDA
-as it is.
+In torch a step at 26,000 vertices writes some forty arrays; on a CPU that costs several force evaluations. One kernel
+takes the parts of the vectors and writes the features, the layers are products of matrices, and a second kernel
+combines; `tests/test_learned.py` holds them against `network.Physgraph`. The same code runs on CUDA.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -25,15 +25,15 @@ from .around import Around
 from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of
 
 NORMAL, STRAIN = 1, 2
-"""Parts of a vector that the kernel takes itself; 0 is the vector, and means over neighbours are given."""
+"""Parts of a vector that the kernels take themselves; 0 is the vector, and means over neighbours are given."""
 LOG_SCALE = 0.5 / math.log(10.0)
+LOG_OFFSET = 1.5
 """The networks see (log10 + 3) / 2 of a length."""
 
 
 def can_fuse(config: PhysgraphConfig, dtype: torch.dtype) -> bool:
-    """Whether the kernel covers a network: no messages, no strain, no means, two hidden layers, float32."""
-    plain = not (config.rounds or config.strain or config.means)
-    return plain and config.depth == 2 and dtype == torch.float32
+    """Whether the kernels cover a network: no messages, no strain, no means, float32."""
+    return not (config.rounds or config.strain or config.means) and dtype == torch.float32
 
 
 class FusedPhysgraph:
@@ -42,7 +42,7 @@ class FusedPhysgraph:
     Attributes:
         vertices: That number.
         count: Number of vectors.
-        bases: Names of the vectors that are handed over; the others are parts that the kernel takes of them.
+        bases: Names of the vectors that are handed over; the others are parts that the kernels take of them.
     """
 
     def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, lanes: int) -> None:
@@ -53,32 +53,37 @@ class FusedPhysgraph:
             vertices: Number of vertices.
             longest: Longest displacement in local edge lengths.
             device: "cpu" or a CUDA device.
-            lanes: Most threads that the kernel uses on the CPU.
+            lanes: Most threads that a kernel uses on the CPU.
         """
         config = network.config
-        self.vertices, self.count, width = vertices, len(config.vectors), config.width
+        self.vertices, self.count = vertices, len(config.vectors)
         self.bases, source, kind = in_bases(config.vectors)
         self._kinds = set(kind)
+        pairs = self.count * (self.count - 1) // 2
         self._stack = torch.zeros((len(self.bases), vertices, 3), device=device)
-        self._out = torch.zeros((vertices, 3), device=device)
+        self._squares = torch.zeros((self.count, vertices), device=device)
+        self._cosines, self._out = (torch.zeros((vertices, n), device=device) for n in (pairs, 3))
         self._bias, self._clock = network.encode.bias.detach(), network.encode_means.weight.detach()[:, 0]
-        self._first = self._bias.clone().reshape(1, width)
-        hidden, last = network.hidden[0], network.decode
-        start = torch.zeros(self.count, device=device)
-        start[0] = 1.0
-        tables = [network.encode.weight.T, self._first, hidden.weight.T, hidden.bias, last.weight.T, last.bias + start]
-        self._kept = [self._first if t is self._first else t.detach().contiguous().clone() for t in tables]
-        kinds = [width, width, width, width, self.count, self.count]
-        packed = [
-            wp.from_torch(t.reshape(-1, n), dtype=wp.types.vector(length=n, dtype=wp.float32), requires_grad=False)
-            for t, n in zip(self._kept, kinds, strict=True)
-        ]
-        kernel = fused_kernel(self.count, width)
-        flat, spacing = vectors(self._stack.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
+        layers = [network.encode, *network.hidden, network.decode]
+        self._weights = [layer.weight.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
+        self._biases = [layer.bias.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
+        self._biases[-1][0] += 1.0
+        # The features are logarithms of squares as they are: the first layer takes their scale and offset.
+        lengths, cosines = self._weights.pop(0).split([self.count, pairs], dim=1)
+        self._bias = self._bias + LOG_OFFSET * lengths.sum(dim=1)
+        self._at_lengths, self._at_cosines = 0.5 * LOG_SCALE * lengths, cosines.contiguous()
+        self._layers = [torch.zeros((bias.numel(), vertices), device=device) for bias in self._biases]
         which = [wp.array(values, dtype=wp.int32, device=device) for values in (source, kind)]
+        flat, spacing = vectors(self._stack.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
         normal, strain = (wp.zeros(1, dtype=t, device=device) for t in (wp.vec3f, wp.mat33f))
-        inputs = [vertices, flat, *which, spacing, longest, normal, strain, *packed, vectors(self._out)]
-        self._launch = Launch(kernel, vertices, inputs, device=device, lanes=lanes)
+        shared = [vertices, flat, *which, spacing, normal, strain]
+        given = {"device": device, "lanes": lanes}
+        see, combine = kernels(self.count)
+        self._see = Launch(
+            see, vertices, [*shared, wp.from_torch(self._squares), wp.from_torch(self._cosines)], **given
+        )
+        ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
+        self._combine = Launch(combine, vertices, [*shared, *ends], **given)
 
     def __call__(
         self,
@@ -97,17 +102,20 @@ class FusedPhysgraph:
             around: Gives the surroundings of the vertices; called where parts need them.
         """
         torch.stack(list(bases), out=self._stack)
-        if isinstance(step, Tensor):
-            torch.addcmul(self._bias, self._clock, clock_of(step), out=self._first[0])
-        else:
-            torch.add(self._bias, self._clock, alpha=clock_of(step), out=self._first[0])
         changed = {4: wp.from_torch(spacing, requires_grad=False)}
         seen = around() if self._kinds & {NORMAL, STRAIN} else None
         if seen is not None and NORMAL in self._kinds:
-            changed[6] = vectors(seen.normal)
+            changed[5] = vectors(seen.normal)
         if seen is not None and STRAIN in self._kinds:
-            changed[7] = wp.from_torch(seen.strain, dtype=wp.mat33f)
-        self._launch(changed)
+            changed[6] = wp.from_torch(seen.strain, dtype=wp.mat33f)
+        self._see(changed)
+        h = self._layers[0]
+        bias = self._bias + self._clock * clock_of(step)
+        torch.addmm(bias.unsqueeze(1), self._at_cosines, self._cosines.T, out=h)
+        h.addmm_(self._at_lengths, self._squares.log_())
+        for bias, weight, out in zip(self._biases[1:], self._weights, self._layers[1:], strict=True):
+            h = torch.addmm(bias.unsqueeze(1), weight, h.relu_(), out=out)
+        self._combine(changed)
         return self._out
 
 
@@ -135,91 +143,63 @@ def part_of(s: wp.vec3f, kind: wp.int32, i: wp.int32, normal: wp.array(dtype=wp.
     return s
 
 
-def _encoder(count: int) -> Any:
-    """Adds the features' part to the first layer: lengths as logarithms, then cosines of all pairs."""
-    floor, log_scale = FLOOR**2, 0.5 * LOG_SCALE
-
-    @wp.func
-    def encoded(all: Any, scale: wp.float32, w: Any, start: Any):
-        unit = all
-        h = start
-        for a in range(wp.static(count)):
-            s = wp.vec3f(all[a, 0], all[a, 1], all[a, 2]) * scale
-            square = wp.dot(s, s) + wp.float32(wp.static(floor))
-            h = h + w[a] * (wp.static(log_scale) * wp.log(square) + wp.float32(1.5))
-            inverse = wp.float32(1.0) / wp.sqrt(square)
-            unit[a, 0] = s[0] * inverse
-            unit[a, 1] = s[1] * inverse
-            unit[a, 2] = s[2] * inverse
-        row = wp.int32(wp.static(count))
-        for a in range(wp.static(count)):
-            for b in range(a + 1, wp.static(count)):
-                cosine = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
-                h = h + w[row] * cosine
-                row = row + 1
-        return h
-
-    return encoded
-
-
-def _layer(width: int) -> Any:
-    """A layer after a rectifier."""
-
-    @wp.func
-    def layer(h: Any, w: Any, start: Any):
-        out = start
-        for k in range(wp.static(width)):
-            out = out + w[k] * wp.max(h[k], wp.float32(0.0))
-        return out
-
-    return layer
-
-
 @functools.cache
-def fused_kernel(count: int, width: int) -> wp.Kernel:
-    """The kernel for so many vectors and so wide a network; vectors are stored one after another."""
-    encoded, layer = _encoder(count), _layer(width)
+def kernels(count: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """The kernels for so many vectors: features of each vertex, and the vectors' combination."""
     rows = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
+    floor = FLOOR**2
 
     @wp.kernel(module="unique")
-    def fused(
+    def see(
         first: wp.int32,
         vertices: wp.int32,
-        v: wp.array(dtype=Any),
+        v: wp.array(dtype=wp.vec3f),
         source: wp.array(dtype=wp.int32),
         kind: wp.array(dtype=wp.int32),
         spacing: wp.array(dtype=wp.float32),
-        longest: wp.float32,
         normal: wp.array(dtype=wp.vec3f),
         strain: wp.array(dtype=wp.mat33f),
-        w1: wp.array(dtype=Any),
-        b1: wp.array(dtype=Any),
-        w2: wp.array(dtype=Any),
-        b2: wp.array(dtype=Any),
-        w3: wp.array(dtype=Any),
-        b3: wp.array(dtype=Any),
-        out: wp.array(dtype=Any),
+        squares: wp.array(dtype=wp.float32, ndim=2),
+        cosines: wp.array(dtype=wp.float32, ndim=2),
     ):
         i = first + wp.tid()
-        all = rows()
+        unit = rows()
+        scale = wp.float32(1.0) / spacing[i]
         for a in range(wp.static(count)):
-            s = part_of(v[source[a] * vertices + i], kind[a], i, normal, strain)
-            all[a, 0] = s[0]
-            all[a, 1] = s[1]
-            all[a, 2] = s[2]
-        h = encoded(all, wp.float32(1.0) / spacing[i], w1, b1[0])
-        c = layer(layer(h, w2, b2[0]), w3, b3[0])
+            s = part_of(v[source[a] * vertices + i], kind[a], i, normal, strain) * scale
+            square = wp.dot(s, s) + wp.float32(wp.static(floor))
+            squares[a, i] = square
+            s = s * (wp.float32(1.0) / wp.sqrt(square))
+            unit[a, 0] = s[0]
+            unit[a, 1] = s[1]
+            unit[a, 2] = s[2]
+        row = wp.int32(0)
+        for a in range(wp.static(count)):
+            for b in range(a + 1, wp.static(count)):
+                cosines[i, row] = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
+                row = row + 1
+
+    @wp.kernel(module="unique")
+    def combine(
+        first: wp.int32,
+        vertices: wp.int32,
+        v: wp.array(dtype=wp.vec3f),
+        source: wp.array(dtype=wp.int32),
+        kind: wp.array(dtype=wp.int32),
+        spacing: wp.array(dtype=wp.float32),
+        normal: wp.array(dtype=wp.vec3f),
+        strain: wp.array(dtype=wp.mat33f),
+        coefficients: wp.array(dtype=wp.float32, ndim=2),
+        longest: wp.float32,
+        out: wp.array(dtype=wp.vec3f),
+    ):
+        i = first + wp.tid()
         move = wp.vec3f()
         for a in range(wp.static(count)):
-            move = move + wp.vec3f(all[a, 0], all[a, 1], all[a, 2]) * c[a]
+            move += coefficients[a, i] * part_of(v[source[a] * vertices + i], kind[a], i, normal, strain)
         far, most = wp.length(move), longest * spacing[i]
         if far > most:
             move = move * (most / far)
         out[i] = move
 
-    wide, narrow = (wp.array(dtype=wp.types.vector(length=n, dtype=wp.float32)) for n in (width, count))
-    space, numbers = wp.array(dtype=wp.vec3f), wp.array(dtype=wp.float32)
-    which, tensors = wp.array(dtype=wp.int32), wp.array(dtype=wp.mat33f)
-    types = [wp.int32, wp.int32, space, which, which, numbers, wp.float32, space, tensors]
-    types += [wide, wide, wide, wide, narrow, narrow, space]
-    return wp.overload(fused, types)
+    return see, combine

@@ -136,7 +136,7 @@ class Physgraph(nn.Module):
             h = h + self._round(h, strain, graph)  # V W
         coefficients = self.decode(torch.relu(h))  # V N
         start = torch.zeros_like(coefficients[0])
-        start[0] = 1.0
+        start[:1].fill_(1.0)
         return coefficients + start
 
     def _means(self, vectors: Tensor, square: Tensor, step: int | Tensor, *, graph: Graph) -> Tensor:
@@ -261,7 +261,7 @@ class PaperNetwork(nn.Module):
         e = self.encode_edge(self.edge_scale(edge))  # 2E L
         for k in range(self.config.rounds):
             own = 0 if self.config.shared else k
-            e = e + self._edge_update(self.update_edge[own], v, e, ways)  # 2E L
+            e = self._edge_update(self.update_edge[own], v, e, ways)  # 2E L
             gathered = torch.segment_reduce(e, "sum", lengths=ways.degree, axis=0, unsafe=True)  # V L
             v = v + self.update_vertex[own](torch.cat([v, gathered], dim=1))  # V L
         return self.step_length * self.decode(v)  # V 3
@@ -270,11 +270,14 @@ class PaperNetwork(nn.Module):
         """The perceptron of (receiver, sender, edge); its first layer meets each vertex once, not once an edge."""
         first, *others = cast(nn.Sequential, perceptron)
         at_receiver, at_sender, at_edge = cast(nn.Linear, first).weight.chunk(3, dim=1)
-        h = nn.functional.linear(e, at_edge, cast(nn.Linear, first).bias)
-        h = h + (v @ at_receiver.T)[ways.receiver] + (v @ at_sender.T)[ways.sender]
+        from_receiver, from_sender = v @ at_receiver.T, v @ at_sender.T
+        bias = cast(nn.Linear, first).bias
+
+        h = nn.functional.linear(e, at_edge, bias)
+        h = h + from_receiver[ways.receiver] + from_sender[ways.sender]
         for layer in others:
             h = layer(h)
-        return h
+        return e + h
 
 
 class Normaliser(nn.Module):

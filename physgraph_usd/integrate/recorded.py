@@ -15,7 +15,9 @@ a garment and one more product replace the two loops of `learned.secant_directio
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,8 +140,8 @@ class Recording:
         if self._graph is None:
             graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(side):
-                graph.capture_begin()
+            with torch.cuda.stream(side), uncollected():
+                graph.capture_begin(capture_error_mode="relaxed")
                 self._step()
                 graph.capture_end()
             torch.cuda.current_stream().wait_stream(side)
@@ -164,6 +166,18 @@ class Recording:
         self.x.copy_(x)
         self.energy.copy_(energy)
         self.step += 1.0
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Hold back the garbage collector: it may free an earlier frame's device memory, which no recording allows."""
+    running = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if running:
+            gc.enable()
 
 
 @wp.func
