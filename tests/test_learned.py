@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,10 +63,18 @@ def test_untrained_the_papers_network_stays():
     assert torch.equal(carry.x, x)
 
 
-@pytest.mark.parametrize("vectors", [("metric", "move1", "diagonal"), ("secant", "metric", "metric1", "move1"), ("secant", "secant.normal", "metric.strain", "diagonal.smooth")])
-def test_one_kernel_does_what_torch_does(vectors: tuple[str, ...]):
+@pytest.mark.parametrize("more", [{"means": False}, {"means": False, "strain": True}, {"strain": True, "depth": 3}])
+@pytest.mark.parametrize(
+    "vectors",
+    [
+        ("metric", "move1", "diagonal"),
+        ("secant", "metric", "metric1", "move1"),
+        ("secant", "secant.normal", "metric.strain", "diagonal.smooth"),
+    ],
+)
+def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str, Any]):
     system, x = problem(torch.float32, level=2)
-    network = random_network(PhysgraphConfig(vectors=vectors, width=16, means=False), seed=7, scale=0.3)
+    network = random_network(PhysgraphConfig(vectors=vectors, width=16, **more), seed=7, scale=0.3)
     assert isinstance(network, Physgraph)
     one, other = LearnedMetric(network), LearnedMetric(network, fuse=False)
     carry = one.start(system, x)

@@ -91,7 +91,11 @@ def calm(patches: list[Patch]) -> list[Patch]:
 
 
 @pytest.mark.parametrize(
-    "config", [PhysgraphConfig(width=8), PhysgraphConfig(("secant", "metric", "metric.normal", "move1.strain", "diagonal.smooth"), 8, 2, 1, True)]
+    "config",
+    [
+        PhysgraphConfig(width=8),
+        PhysgraphConfig(("secant", "metric", "metric.normal", "move1.strain", "diagonal.smooth"), 8, 2, 1, True),
+    ],
 )
 def test_patches_side_by_side_move_as_they_do_alone(patches: list[Patch], config: PhysgraphConfig):
     integrator = integrator_of(random_network(config, seed=1, scale=0.1))

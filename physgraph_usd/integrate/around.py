@@ -30,6 +30,8 @@ from ..mesh.topology import incidence
 from .base import Surface
 
 PARTS = ("normal", "strain", "smooth")
+FLOOR = 1e-9
+"""Added to mean squares before their root."""
 STRAIN = 0.03
 """Strain that counts as one: cloth that folds is compressed by some per cent."""
 
@@ -67,6 +69,13 @@ class Around:
         self._tables.strains({3: vectors(self._x), 4: wp.from_torch(out, dtype=wide)})
         return out
 
+    @cached_property
+    def stretch(self) -> Float[Tensor, "vertices 3"]:
+        """Mean, mean compression and root mean square of the strain of each vertex's edges, as networks see them."""
+        out = torch.empty_like(self._x)
+        self._tables.stretches({3: vectors(self._x), 4: vectors(out)})
+        return out
+
 
 class _Tables:
     """What lies around each vertex of a level, ready for the kernels."""
@@ -89,6 +98,7 @@ class _Tables:
         self.normals = Launch(_NORMALS[dtype], count, [ints(corner.starts), ints(turned, wp.vec2i), x, x], **given)
         rest = wp.array(lengths, dtype=SCALAR[dtype], device=device)
         self.strains = Launch(_STRAINS[dtype], count, [ints(end.starts), ints(far), rest, x, wide], **given)
+        self.stretches = Launch(_STRETCHES[dtype], count, [ints(end.starts), ints(far), rest, x, x], **given)
         degree = np.diff(end.starts)
         weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
         mean = sp.csr_matrix((weights, far, end.starts), shape=(count, count))
@@ -154,10 +164,57 @@ def _strains(
     out[i] = total / rest.dtype(wp.max(starts[i + 1] - starts[i], 1))
 
 
+@wp.func
+def shown(value: Any):
+    """asinh of thirty times a strain."""
+    size = type(value)(30.0) * wp.abs(value)
+    return wp.sign(value) * wp.log(size + wp.sqrt(size * size + type(value)(1.0)))
+
+
+@wp.kernel
+def _stretches(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    far: wp.array(dtype=wp.int32),
+    rest: wp.array(dtype=Any),
+    x: wp.array(dtype=Any),
+    out: wp.array(dtype=Any),
+):
+    i = first + wp.tid()
+    mean = rest.dtype(0.0)
+    below = rest.dtype(0.0)
+    square = rest.dtype(0.0)
+    for k in range(starts[i], starts[i + 1]):
+        e = wp.length(x[far[k]] - x[i]) / rest[k] - rest.dtype(1.0)
+        mean += e
+        below += wp.min(e, rest.dtype(0.0))
+        square += e * e
+    share = rest.dtype(1.0) / rest.dtype(wp.max(starts[i + 1] - starts[i], 1))
+    v = x[i]
+    v[0] = shown(mean * share)
+    v[1] = shown(below * share)
+    v[2] = shown(wp.sqrt(square * share + rest.dtype(wp.static(FLOOR))))
+    out[i] = v
+
+
 _NORMALS = {
     t: wp.overload(
         _normals,
         [wp.int32, wp.array(dtype=wp.int32), wp.array(dtype=wp.vec2i), wp.array(dtype=v), wp.array(dtype=v)],
+    )
+    for t, v in VECTOR.items()
+}
+_STRETCHES = {
+    t: wp.overload(
+        _stretches,
+        [
+            wp.int32,
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=wp.int32),
+            wp.array(dtype=SCALAR[t]),
+            wp.array(dtype=v),
+            wp.array(dtype=v),
+        ],
     )
     for t, v in VECTOR.items()
 }

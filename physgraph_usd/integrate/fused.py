@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -32,8 +33,8 @@ LOG_OFFSET = 1.5
 
 
 def can_fuse(config: PhysgraphConfig, dtype: torch.dtype) -> bool:
-    """Whether the kernels cover a network: no messages, no strain, no means, float32."""
-    return not (config.rounds or config.strain or config.means) and dtype == torch.float32
+    """Whether the kernels cover a network: no messages, float32."""
+    return not config.rounds and dtype == torch.float32
 
 
 class FusedPhysgraph:
@@ -45,31 +46,37 @@ class FusedPhysgraph:
         bases: Names of the vectors that are handed over; the others are parts that the kernels take of them.
     """
 
-    def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, lanes: int) -> None:
+    def __init__(self, network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, lanes: int) -> None:
         """Lay out the weights.
 
         Args:
             network: A network that `can_fuse` covers.
-            vertices: Number of vertices.
+            starts: First vertex of each garment, and the number of vertices.
             longest: Longest displacement in local edge lengths.
             device: "cpu" or a CUDA device.
             lanes: Most threads that a kernel uses on the CPU.
         """
-        config = network.config
-        self.vertices, self.count = vertices, len(config.vectors)
+        self._config = config = network.config
+        self.vertices = vertices = starts[-1]
+        self.count = len(config.vectors)
+        self._spans = [slice(a, b) for a, b in pairwise(starts)]
         self.bases, source, kind = in_bases(config.vectors)
         self._kinds = set(kind)
         pairs = self.count * (self.count - 1) // 2
         self._stack = torch.zeros((len(self.bases), vertices, 3), device=device)
         self._squares = torch.zeros((self.count, vertices), device=device)
         self._cosines, self._out = (torch.zeros((vertices, n), device=device) for n in (pairs, 3))
-        self._bias, self._clock = network.encode.bias.detach(), network.encode_means.weight.detach()[:, 0]
+        self._scaled = torch.zeros((self.count, vertices if config.means else 1, 3), device=device)
+        self._bias, means = network.encode.bias.detach(), network.encode_means.weight.detach()
+        self._clock, self._at_means = means[:, 0], means[:, 1:]
+        self._pairs = torch.triu_indices(self.count, self.count, 1, device=device)
         layers = [network.encode, *network.hidden, network.decode]
         self._weights = [layer.weight.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
         self._biases = [layer.bias.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
         self._biases[-1][0] += 1.0
         # The features are logarithms of squares as they are: the first layer takes their scale and offset.
-        lengths, cosines = self._weights.pop(0).split([self.count, pairs], dim=1)
+        sizes = [self.count, pairs, 3 * config.strain]
+        lengths, cosines, self._at_stretch = self._weights.pop(0).split(sizes, dim=1)
         self._bias = self._bias + LOG_OFFSET * lengths.sum(dim=1)
         self._at_lengths, self._at_cosines = 0.5 * LOG_SCALE * lengths, cosines.contiguous()
         self._layers = [torch.zeros((bias.numel(), vertices), device=device) for bias in self._biases]
@@ -78,10 +85,9 @@ class FusedPhysgraph:
         normal, strain = (wp.zeros(1, dtype=t, device=device) for t in (wp.vec3f, wp.mat33f))
         shared = [vertices, flat, *which, spacing, normal, strain]
         given = {"device": device, "lanes": lanes}
-        see, combine = kernels(self.count)
-        self._see = Launch(
-            see, vertices, [*shared, wp.from_torch(self._squares), wp.from_torch(self._cosines)], **given
-        )
+        see, combine = kernels(self.count, config.means)
+        seen = [wp.from_torch(self._squares), wp.from_torch(self._cosines), vectors(self._scaled.reshape(-1, 3))]
+        self._see = Launch(see, vertices, [*shared, *seen], **given)
         ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
         self._combine = Launch(combine, vertices, [*shared, *ends], **given)
 
@@ -103,7 +109,7 @@ class FusedPhysgraph:
         """
         torch.stack(list(bases), out=self._stack)
         changed = {4: wp.from_torch(spacing, requires_grad=False)}
-        seen = around() if self._kinds & {NORMAL, STRAIN} else None
+        seen = around() if self._kinds & {NORMAL, STRAIN} or self._config.strain else None
         if seen is not None and NORMAL in self._kinds:
             changed[5] = vectors(seen.normal)
         if seen is not None and STRAIN in self._kinds:
@@ -113,16 +119,32 @@ class FusedPhysgraph:
         bias = self._bias + self._clock * clock_of(step)
         torch.addmm(bias.unsqueeze(1), self._at_cosines, self._cosines.T, out=h)
         h.addmm_(self._at_lengths, self._squares.log_())
+        if seen is not None and self._config.strain:
+            h.addmm_(self._at_stretch, seen.stretch.T)
+        if self._config.means:
+            for span in self._spans:
+                h[:, span] += self._from_means(span).unsqueeze(1)
         for bias, weight, out in zip(self._biases[1:], self._weights, self._layers[1:], strict=True):
             h = torch.addmm(bias.unsqueeze(1), weight, h.relu_(), out=out)
         self._combine(changed)
         return self._out
 
+    def _from_means(self, span: slice) -> Float[Tensor, " width"]:
+        """What the first layer takes from a garment's means."""
+        flat = self._scaled[:, span].reshape(self.count, -1)
+        products = flat @ flat.T / max(span.stop - span.start, 1)
+        root = (products.diagonal() + FLOOR**2).sqrt()
+        first, second = self._pairs
+        cosine = products[first, second] / (root[first] * root[second])
+        return self._at_means @ torch.cat([LOG_SCALE * root.log() + LOG_OFFSET, cosine])
+
 
 @functools.lru_cache(maxsize=8)
-def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device: str, lanes: int) -> FusedPhysgraph:
+def fused_physgraph(
+    network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, lanes: int
+) -> FusedPhysgraph:
     """The same, kept for the next frame; the network's weights must not change any more."""
-    return FusedPhysgraph(network, vertices, longest, device=device, lanes=lanes)
+    return FusedPhysgraph(network, starts, longest, device=device, lanes=lanes)
 
 
 def in_bases(names: Sequence[str]) -> tuple[tuple[str, ...], list[int], list[int]]:
@@ -144,8 +166,13 @@ def part_of(s: wp.vec3f, kind: wp.int32, i: wp.int32, normal: wp.array(dtype=wp.
 
 
 @functools.cache
-def kernels(count: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """The kernels for so many vectors: features of each vertex, and the vectors' combination."""
+def kernels(count: int, means: bool) -> tuple[wp.Kernel, wp.Kernel]:
+    """The kernels for so many vectors: features of each vertex, and the vectors' combination.
+
+    Args:
+        count: Number of vectors.
+        means: Whether the first keeps the vectors in local edge lengths, for the garments' means.
+    """
     rows = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
     floor = FLOOR**2
 
@@ -161,12 +188,15 @@ def kernels(count: int) -> tuple[wp.Kernel, wp.Kernel]:
         strain: wp.array(dtype=wp.mat33f),
         squares: wp.array(dtype=wp.float32, ndim=2),
         cosines: wp.array(dtype=wp.float32, ndim=2),
+        scaled: wp.array(dtype=wp.vec3f),
     ):
         i = first + wp.tid()
         unit = rows()
         scale = wp.float32(1.0) / spacing[i]
         for a in range(wp.static(count)):
             s = part_of(v[source[a] * vertices + i], kind[a], i, normal, strain) * scale
+            if wp.static(means):
+                scaled[a * vertices + i] = s
             square = wp.dot(s, s) + wp.float32(wp.static(floor))
             squares[a, i] = square
             s = s * (wp.float32(1.0) / wp.sqrt(square))

@@ -129,7 +129,8 @@ class LearnedMetric:
         if self._fuse and x.dtype == torch.float32:
             lanes = 1 if system.level is None else system.level.lanes
             device = str(system.spacing.device)
-            fused = fused_physgraph(self._network, len(system.spacing), LONGEST, device=device, lanes=lanes)
+            starts = (*(span.start for span in graph.spans), len(system.spacing))
+            fused = fused_physgraph(self._network, starts, LONGEST, device=device, lanes=lanes)
             around = cache(lambda: Around(_level(system), x))
             bases = vectors_of(fused.bases, whole, around=around)
             return fused(bases, system.spacing, step, around=around) * system.free
