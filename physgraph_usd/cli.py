@@ -78,6 +78,9 @@ scene_options = _together(
 )
 solve_options = _together(
     click.option("--integrator", metavar="NAME", help="How forces become displacements."),
+    click.option(
+        "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights for a learned integrator."
+    ),
     click.option("--steps", type=click.IntRange(min=0), metavar="N", help="Most steps at the finest level."),
     click.option("--tolerance", type=float, metavar="T", help="Stop when the cloth moves less, in edge lengths."),
     click.option("--budget-ms", type=float, metavar="MS", help="Stop after this time per frame."),

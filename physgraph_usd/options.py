@@ -12,6 +12,7 @@ from .contact.settings import ContactSettings
 from .errors import UsageError
 from .group import SolveSettings
 from .integrate import method_named
+from .integrate.weights import weights_hash
 
 TEMPORAL = ("tether", "warm", "off")
 POTENTIALS = ("continuum", "paper")
@@ -35,6 +36,7 @@ class RefineOptions:
         colliders: Prim paths, globs or collections; empty finds applied schemas.
         level: Subdivisions; -1 chooses, None takes the stage's.
         integrator: A name of `integrate.METHODS`.
+        weights: Weights for a learned integrator in place of those that ship, or None.
         steps: Most steps at the finest level.
         tolerance: Stop when the cloth would move less than this, RMS, in local edge lengths.
         budget_ms: Milliseconds a frame, or None.
@@ -61,6 +63,7 @@ class RefineOptions:
     colliders: Sequence[str] = ()
     level: int | None = None
     integrator: str = "quasi-newton"
+    weights: Path | None = None
     steps: int = 12
     tolerance: float = 2e-3
     budget_ms: float | None = None
@@ -84,8 +87,11 @@ class RefineOptions:
     def plain(self) -> dict[str, Any]:
         """The options that decide the result, ready for JSON."""
         names = {f.name for f in dataclasses.fields(self)} - _NOT_OF_THE_RESULT
-        names -= set() if self.heat_map else {"heat_map"}  # a layer without one is as it was before there were any
+        # A layer without these is as it was before there were any.
+        names -= {name for name in ("heat_map", "weights") if not getattr(self, name)}
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
+        if self.weights:
+            values["weights"] = {"file": str(self.weights), "sha256": weights_hash(self.weights)}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def contact_settings(self) -> ContactSettings:
@@ -95,7 +101,7 @@ class RefineOptions:
     def solve_settings(self) -> SolveSettings:
         """The part that concerns the solver."""
         return SolveSettings(
-            method=method_named(self.integrator),
+            method=method_named(self.integrator, self.weights),
             steps=self.steps,
             tolerance=self.tolerance,
             budget_ms=self.budget_ms,
@@ -110,7 +116,7 @@ class RefineOptions:
         Raises:
             UsageError: An option is wrong.
         """
-        method_named(self.integrator)
+        method_named(self.integrator, self.weights)
         for name, value, known in (
             ("temporal", self.temporal, TEMPORAL),
             ("potential", self.potential, POTENTIALS),

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from cloth import DOWN, FABRIC, GUIDE, finest_system, group_of, sheet, wave
 from safetensors import safe_open
 from safetensors.torch import save_file
 from sheets import rotation
 
+from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.group import Group
@@ -25,6 +27,7 @@ from physgraph_usd.integrate.network import VECTORS, PaperConfig, Physgraph, Phy
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
 from physgraph_usd.level import refine_garments
+from physgraph_usd.samples import write_sample
 from physgraph_usd.scene import GarmentFrame
 
 ALL = PhysgraphConfig(vectors=VECTORS, width=16, rounds=1, strain=True)
@@ -276,3 +279,28 @@ def test_shipped_weights_solve_and_have_a_card(kind: str):
     _, report = solve_level(system, METHODS[kind].build(), x, level=2, budget=Budget(8))
     assert report.energy_after < report.energy_before
     assert report.movers[kind] >= 6
+
+
+def test_a_user_brings_weights_of_their_own(tmp_path: Path):
+    """`refine --weights`: other numbers give another layer, which names them; what does not fit is refused."""
+    stage = write_sample("swatch", tmp_path)
+    own = tmp_path / "own.safetensors"
+    digest = save_network(random_network(LOCAL, seed=5, scale=0.05), own)
+    written = {}
+    for name, options in (("shipped", []), ("own", ["--weights", str(own)])):
+        out = tmp_path / f"{name}.usda"
+        small = ["--integrator", "physgraph", "--level", "1", "--frames", "1:1"]
+        result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(out), *small, *options])
+        assert result.exit_code == 0, result.output
+        written[name] = out.read_text()
+    assert digest in written["own"]
+    assert "weights" not in written["shipped"]
+    for options, word in (
+        (["--integrator", "newton", "--weights", str(own)], "has no weights"),
+        (["--integrator", "physgraph-paper", "--weights", str(own)], "not of 'physgraph-paper'"),
+        (["--integrator", "physgraph", "--weights", str(tmp_path / "none")], "no weights at"),
+    ):
+        result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(tmp_path / "x.usda"), *options])
+        assert result.exit_code != 0
+        assert word in result.stderr
+        assert not (tmp_path / "x.usda").exists()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from ..errors import UsageError
 from .base import Integrator
@@ -15,7 +16,7 @@ from .guard import Guard
 from .learned import integrator_of
 from .newton import Newton
 from .quasi_newton import QuasiNewton
-from .weights import shipped_network
+from .weights import load_network, shipped_network
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,26 @@ METHODS: dict[str, Method] = {
     "physgraph-paper": Method(lambda: Guard(integrator_of(shipped_network("physgraph-paper"))), nested=False),
 }
 """Every method by its name on the command line."""
+LEARNED = ("physgraph", "physgraph-paper")
+"""Those that have weights."""
 
 
-def method_named(name: str) -> Method:
+def method_named(name: str, weights: Path | None = None) -> Method:
     """The method of that name.
 
+    Args:
+        name: A name out of `METHODS`.
+        weights: A file for a learned one, in place of what ships.
+
     Raises:
-        UsageError: No method has that name.
+        UsageError: No method has that name, or it has no weights.
+        WeightsError: The file is missing, damaged or of another kind.
     """
     if name not in METHODS:
         raise UsageError(f"unknown integrator '{name}'; known integrators: {', '.join(METHODS)}")
-    return METHODS[name]
+    if weights is None:
+        return METHODS[name]
+    if name not in LEARNED:
+        raise UsageError(f"integrator '{name}' has no weights; name one that has: {', '.join(LEARNED)}")
+    network = load_network(weights, kind=name)
+    return Method(lambda: Guard(integrator_of(network)), nested=METHODS[name].nested)

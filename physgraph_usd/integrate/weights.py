@@ -105,6 +105,11 @@ def shipped_network(kind: str) -> Network:
     return load_network(FOLDER / f"{kind}.safetensors", kind=kind)
 
 
+def weights_hash(file: Path) -> str:
+    """The hash that a file of weights names, "" where it names none."""
+    return _read(Path(file))[1].get("sha256", "")
+
+
 def hash_of(tensors: dict[str, Tensor]) -> str:
     """SHA-256 of names, types, shapes and numbers, in hexadecimal."""
     digest = hashlib.sha256()
