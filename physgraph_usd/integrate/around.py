@@ -30,6 +30,8 @@ from ..mesh.topology import incidence
 from .base import Surface
 
 PARTS = ("normal", "strain", "smooth")
+SHOWN = 30.0
+"""What strains are multiplied by before a network sees their asinh."""
 FLOOR = 1e-9
 """Added to mean squares before their root."""
 STRAIN = 0.03
@@ -64,17 +66,27 @@ class Around:
     @cached_property
     def strain(self) -> Float[Tensor, "vertices 3 3"]:
         """E of each vertex."""
+        along, amount = self._edges
         out = self._x.new_empty(len(self._x), 3, 3)
         wide = wp.types.matrix(shape=(3, 3), dtype=SCALAR[self._x.dtype])
-        self._tables.strains({3: vectors(self._x), 4: wp.from_torch(out, dtype=wide)})
+        shown = torch.asinh(amount / STRAIN)
+        self._tables.strains({3: vectors(along), 4: wp.from_torch(shown), 5: wp.from_torch(out, dtype=wide)})
         return out
 
     @cached_property
     def stretch(self) -> Float[Tensor, "vertices 3"]:
         """Mean, mean compression and root mean square of the strain of each vertex's edges, as networks see them."""
         out = torch.empty_like(self._x)
-        self._tables.stretches({3: vectors(self._x), 4: vectors(out)})
-        return out
+        self._tables.stretches({3: wp.from_torch(self._edges[1]), 4: vectors(out)})
+        return torch.asinh(SHOWN * out)
+
+    @cached_property
+    def _edges(self) -> tuple[Float[Tensor, "edges 3"], Float[Tensor, " edges"]]:
+        """Direction and strain of each edge."""
+        along = self._x.new_empty(self._tables.edges, 3)
+        amount = self._x.new_empty(self._tables.edges)
+        self._tables.spans({2: vectors(self._x), 3: vectors(along), 4: wp.from_torch(amount)})
+        return along, amount
 
 
 class _Tables:
@@ -87,7 +99,7 @@ class _Tables:
         others = triangles[corner.element]
         turned = np.take_along_axis(others, (corner.corner[:, None] + [1, 2]) % 3, axis=1).astype(np.int32)
         far = edges[end.element, 1 - end.corner].astype(np.int32)
-        lengths = level.rest_length.double().cpu().numpy()[end.element]
+        self.edges = len(edges)
         x = vectors(torch.zeros_like(level.rest))
         wide = wp.zeros(count, dtype=wp.types.matrix(shape=(3, 3), dtype=SCALAR[dtype]), device=device)
 
@@ -96,9 +108,13 @@ class _Tables:
 
         given = {"device": device, "lanes": level.lanes}
         self.normals = Launch(_NORMALS[dtype], count, [ints(corner.starts), ints(turned, wp.vec2i), x, x], **given)
-        rest = wp.array(lengths, dtype=SCALAR[dtype], device=device)
-        self.strains = Launch(_STRAINS[dtype], count, [ints(end.starts), ints(far), rest, x, wide], **given)
-        self.stretches = Launch(_STRETCHES[dtype], count, [ints(end.starts), ints(far), rest, x, x], **given)
+        rest = wp.array(level.rest_length.double().cpu().numpy(), dtype=SCALAR[dtype], device=device)
+        along, amount = vectors(level.rest.new_zeros(self.edges, 3)), wp.from_torch(level.rest.new_zeros(self.edges))
+        pairs = ints(edges, wp.vec2i)
+        self.spans = Launch(_SPANS[dtype], self.edges, [pairs, rest, x, along, amount], **given)
+        around = [ints(end.starts), ints(end.element)]
+        self.strains = Launch(_STRAINS[dtype], count, [*around, rest, along, amount, wide], **given)
+        self.stretches = Launch(_STRETCHES[dtype], count, [*around, rest, amount, x], **given)
         degree = np.diff(end.starts)
         weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
         mean = sp.csr_matrix((weights, far, end.starts), shape=(count, count))
@@ -142,42 +158,47 @@ def _normals(
 
 
 @wp.kernel
+def _spans(
+    first: wp.int32,
+    ends: wp.array(dtype=wp.vec2i),
+    rest: wp.array(dtype=Any),
+    x: wp.array(dtype=Any),
+    along: wp.array(dtype=Any),
+    amount: wp.array(dtype=Any),
+):
+    e = first + wp.tid()
+    span = x[ends[e][1]] - x[ends[e][0]]
+    length = wp.max(wp.length(span), rest[e] * rest.dtype(1.0e-6))
+    along[e] = span / length
+    amount[e] = length / rest[e] - rest.dtype(1.0)
+
+
+@wp.kernel
 def _strains(
     first: wp.int32,
     starts: wp.array(dtype=wp.int32),
-    far: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=wp.int32),
     rest: wp.array(dtype=Any),
-    x: wp.array(dtype=Any),
+    along: wp.array(dtype=Any),
+    amount: wp.array(dtype=Any),
     out: wp.array(dtype=Any),
 ):
     i = first + wp.tid()
-    zero = x[i] - x[i]
+    zero = along[0] - along[0]
     total = wp.outer(zero, zero)
     for k in range(starts[i], starts[i + 1]):
-        span = x[far[k]] - x[i]
-        length = wp.max(wp.length(span), rest[k] * rest.dtype(1.0e-6))
-        e = (length / rest[k] - rest.dtype(1.0)) / rest.dtype(wp.static(STRAIN))
-        size = wp.abs(e)
-        amount = wp.sign(e) * wp.log(size + wp.sqrt(size * size + rest.dtype(1.0)))
-        u = span / length
-        total += amount * wp.outer(u, u)
+        e = edges[k]
+        total += amount[e] * wp.outer(along[e], along[e])
     out[i] = total / rest.dtype(wp.max(starts[i + 1] - starts[i], 1))
-
-
-@wp.func
-def shown(value: Any):
-    """asinh of thirty times a strain."""
-    size = type(value)(30.0) * wp.abs(value)
-    return wp.sign(value) * wp.log(size + wp.sqrt(size * size + type(value)(1.0)))
 
 
 @wp.kernel
 def _stretches(
     first: wp.int32,
     starts: wp.array(dtype=wp.int32),
-    far: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=wp.int32),
     rest: wp.array(dtype=Any),
-    x: wp.array(dtype=Any),
+    amount: wp.array(dtype=Any),
     out: wp.array(dtype=Any),
 ):
     i = first + wp.tid()
@@ -185,50 +206,26 @@ def _stretches(
     below = rest.dtype(0.0)
     square = rest.dtype(0.0)
     for k in range(starts[i], starts[i + 1]):
-        e = wp.length(x[far[k]] - x[i]) / rest[k] - rest.dtype(1.0)
+        e = amount[edges[k]]
         mean += e
         below += wp.min(e, rest.dtype(0.0))
         square += e * e
     share = rest.dtype(1.0) / rest.dtype(wp.max(starts[i + 1] - starts[i], 1))
-    v = x[i]
-    v[0] = shown(mean * share)
-    v[1] = shown(below * share)
-    v[2] = shown(wp.sqrt(square * share + rest.dtype(wp.static(FLOOR))))
+    v = out[i]
+    v[0] = mean * share
+    v[1] = below * share
+    v[2] = wp.sqrt(square * share + rest.dtype(wp.static(FLOOR)))
     out[i] = v
 
 
-_NORMALS = {
-    t: wp.overload(
-        _normals,
-        [wp.int32, wp.array(dtype=wp.int32), wp.array(dtype=wp.vec2i), wp.array(dtype=v), wp.array(dtype=v)],
-    )
-    for t, v in VECTOR.items()
-}
-_STRETCHES = {
-    t: wp.overload(
-        _stretches,
-        [
-            wp.int32,
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=SCALAR[t]),
-            wp.array(dtype=v),
-            wp.array(dtype=v),
-        ],
-    )
-    for t, v in VECTOR.items()
-}
-_STRAINS = {
-    t: wp.overload(
-        _strains,
-        [
-            wp.int32,
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=SCALAR[t]),
-            wp.array(dtype=v),
-            wp.array(dtype=wp.types.matrix(shape=(3, 3), dtype=SCALAR[t])),
-        ],
-    )
-    for t, v in VECTOR.items()
-}
+def _arrays(t: torch.dtype, kinds: str) -> list[Any]:
+    """Types of a kernel's parameters: i integers, p pairs of them, s scalars, v vectors, m matrices."""
+    known = {"i": wp.int32, "p": wp.vec2i, "s": SCALAR[t], "v": VECTOR[t]}
+    known["m"] = wp.types.matrix(shape=(3, 3), dtype=SCALAR[t])
+    return [wp.int32, *(wp.array(dtype=known[kind]) for kind in kinds)]
+
+
+_NORMALS, _SPANS, _STRAINS, _STRETCHES = (
+    {t: wp.overload(kernel, _arrays(t, kinds)) for t in VECTOR}
+    for kernel, kinds in ((_normals, "ipvv"), (_spans, "psvvs"), (_strains, "iisvsm"), (_stretches, "iissv"))
+)
