@@ -2,7 +2,7 @@
 
     python -m benchmarks.loose_garment [--long]
 
-Both results are refined from one coarse frame by one potential; the paper compares with a simulation of other materials.
+Both are refined from one coarse frame by one potential; the paper compares with a simulation of other materials.
 Detail is what a result adds to the smoothly upsampled cage; its energy in a band of wavelengths is the area-weighted
 square of what two low-pass filters 1 / (1 + (k / k_c)^2) on the cloth leave between them. Cloth on cloth is left out:
 the sample's coarse skirt crosses itself, and with it longer solves end in other folds, some of them worse.
@@ -10,6 +10,7 @@ the sample's coarse skirt crosses itself, and with it longer solves end in other
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -80,28 +81,38 @@ def band_energy(level: Level, field: np.ndarray, band: tuple[float, float] = BAN
         field: One vector a vertex [m], shape (V, 3).
         band: The wavelengths, in mean edges.
     """
-    mass, stiffness = laplacian(level)
     h = float(level.spacing.mean())
-    short, long = (lowpass(mass, stiffness, field, each * h) for each in band)
-    return float((mass[:, None] * (short - long) ** 2).sum())
+    short, long = (smoothed(field) for smoothed in lowpass(level, [each * h for each in band]))
+    return float((vertex_area(level)[:, None] * (short - long) ** 2).sum())
 
 
-def lowpass(mass: np.ndarray, stiffness: sp.csr_matrix, field: np.ndarray, wave: float) -> np.ndarray:
-    """A field without what is shorter than a wavelength [m]."""
-    solve = factorized(sp.csc_matrix(sp.diags(mass) + (wave / (2.0 * np.pi)) ** 2 * stiffness))
-    return np.stack([solve(mass * column) for column in field.T], axis=1)
+def lowpass(level: Level, waves: Sequence[float]) -> list[Callable[[np.ndarray], np.ndarray]]:
+    """Maps from a vector field on a mesh to the same without what is shorter than each of some wavelengths [m]."""
+    mass, stiffness = vertex_area(level), laplacian(level)
+
+    def one(wave: float) -> Callable[[np.ndarray], np.ndarray]:
+        solve = factorized(sp.csc_matrix(sp.diags(mass) + (wave / (2.0 * np.pi)) ** 2 * stiffness))
+        return lambda field: np.stack([solve(mass * column) for column in field.T], axis=1)
+
+    return [one(wave) for wave in waves]
 
 
-def laplacian(level: Level) -> tuple[np.ndarray, sp.csr_matrix]:
-    """Vertex areas [m^2] and the stiffness of springs 2 a_e / l^2, the Laplacian of an equilateral mesh."""
+def vertex_area(level: Level) -> np.ndarray:
+    """Area of each vertex [m^2]."""
+    return np.maximum(level.vertex_area.double().cpu().numpy(), 1e-12)
+
+
+def laplacian(level: Level) -> sp.csr_matrix:
+    """The matrix of springs 2 a_e / l^2: the Laplacian of an equilateral mesh, times the areas."""
     ends, length = level.edges.cpu().numpy(), level.rest_length.double().cpu().numpy()
     weight = 2.0 * level.edge_area.double().cpu().numpy() / length**2
     i, j = ends.T
     count = level.vertex_count
-    off = sp.coo_matrix((np.concatenate([weight] * 2), (np.concatenate([i, j]), np.concatenate([j, i]))), (count,) * 2)
+    off = sp.coo_matrix(
+        (np.concatenate([weight] * 2), (np.concatenate([i, j]), np.concatenate([j, i]))), (count, count)
+    )
     graph = sp.csr_matrix(off)
-    stiffness = sp.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph
-    return np.maximum(level.vertex_area.double().cpu().numpy(), 1e-12), sp.csr_matrix(stiffness)
+    return sp.csr_matrix(sp.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph)
 
 
 if __name__ == "__main__":

@@ -3,12 +3,12 @@
     python -m benchmarks.potentials [--long]
 
 The paper's shirt, poses and body are not free. In their place stand three samples, x16, in some poses each: a T-shirt
-moved as skinning moves it (`armpit`), a shirt on a walking body (`layers`) and a T-shirt by linear-blend skinning whose
-sleeves go deep into the body (`tshirt`). Fabric: k_s = 1e4 erg/cm^2, k_b = 10 erg, 0.0187 g/cm^2. What is solved is our
-potential with these constants; what is told is the paper's area-mean one, of springs, hinges and weight. That falls with
-the square of the edges' length: totals of different meshes do not compare, their ratios do. Gravity counts from the mean
-height of the input. Gaps are of all that is minimised, guide and contact included. A vertex collides where it is less
-than 2 mm outside the body.
+moved as skinning moves it (`armpit`), a shirt on a walking body (`layers`) and a T-shirt by linear-blend skinning
+whose sleeves go deep into the body (`tshirt`). Fabric: k_s = 1e4 erg/cm^2, k_b = 10 erg, 0.0187 g/cm^2. What is solved
+is our potential with these constants; what is told is the paper's area-mean one, of springs, hinges and weight. That
+falls with the square of the edges' length: totals of different meshes do not compare, their ratios do. Gravity counts
+from the mean height of the input. Gaps are of all that is minimised, guide and contact included. A vertex collides
+where it is less than 2 mm outside the body.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ K, STEPS = 5, 12
 """Steps of the paper's network and of refine's default."""
 CONVERGED, LONG = 60, 500
 """Steps of the converged solve at the finest level, short and long form; four times as many below."""
-TERMS = ("stretch", "bending", "gravity")
+TERMS: tuple[str, ...] = ("stretch", "bending", "gravity")
 INPUT, LOOP, LEAST = "skinned input, upsampled", "Loop subdivision", "converged"
 RAW, GUARDED = "physgraph-paper, K = 5, raw", "physgraph-paper, K = 5, guarded"
 OURS, OUTSIDE = "quasi-newton, refine's default", "the same, offset 3 mm"
@@ -92,6 +92,10 @@ class Sums:
         """The total and its terms, means over the poses [erg]."""
         return [f"{self.erg:.2f}", *(f"{ERG * value / self.poses:.2f}" for value in self.paper.values())]
 
+    def contact(self) -> list[str]:
+        """Share of colliding vertices and number of those inside."""
+        return [f"{self.percent:.2f} %", f"{self.inside}"]
+
     @property
     def percent(self) -> float:
         """Share of colliding vertices [%]."""
@@ -109,7 +113,13 @@ def measure(short: bool) -> Found:
         rows += figures(name, sums, gap)
         head = [f"{name}, mean of {sums[INPUT].poses} [erg]", "potential", *TERMS, "gap", "within 2 mm", "inside"]
         lines = [
-            [each, *found.cells(), "" if each == OUTSIDE else f"{gap[each]:.1f} %", f"{found.percent:.2f} %", found.inside]
+            [
+                each,
+                *found.cells(),
+                "" if each == OUTSIDE else f"{gap[each]:.1f} %",
+                f"{found.percent:.2f} %",
+                found.inside,
+            ]
             for each, found in sums.items()
         ]
         notes.append(table(head, lines))
