@@ -1,6 +1,6 @@
 """What contact leaves on blocks, tori, cloth and several garments, in our form and in the paper's, as rows.
 
-    python -m benchmarks.contact_rows [--long]
+    python -m benchmarks.contact_rows colliders|itself|several [--long]
 
 Frames in a row of the samples about contact; the figures are those of `benchmarks.contact_shots`, which has them all.
 Shape and energy are of the last of these frames, solved from cold, beside Loop subdivision of the same cage.
@@ -8,6 +8,7 @@ Shape and energy are of the last of these frames, solved from cold, beside Loop 
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -131,5 +132,5 @@ def bending(problem: Problem, frame: Frame, points: tuple[np.ndarray, ...]) -> f
 
 
 if __name__ == "__main__":
-    for each in (colliders, itself, several):
-        run_alone(each)
+    PARTS = {"colliders": colliders, "itself": itself, "several": several}
+    run_alone(PARTS[sys.argv.pop(1)])
