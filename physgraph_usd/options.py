@@ -60,7 +60,7 @@ class RefineOptions:
     garments: Sequence[str] = ()
     colliders: Sequence[str] = ()
     level: int | None = None
-    integrator: str = "quasi-newton"
+    integrator: str = "auto"
     steps: int = 12
     tolerance: float = 2e-3
     budget_ms: float | None = None

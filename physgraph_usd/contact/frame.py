@@ -110,6 +110,12 @@ class FrameContact:
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
         return self._views[level.index]
 
+    @property
+    def crosses(self) -> bool:
+        """Whether cloth crosses cloth in the upsampled cage, at the finest level."""
+        cloth = self.at(self._levels[-1]).cloth
+        return cloth is not None and cloth.before.crossings.count > 0
+
     def finish(
         self, x: Float[Tensor, "vertices 3"]
     ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"], dict[str, object]]:
