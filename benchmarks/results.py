@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -56,13 +57,16 @@ PARTS = (
 )
 """The page, from top to bottom."""
 
+LONG_MINUTES = 40.0
+"""Processor minutes of the long form, about."""
 TEXT = """# The paper's results
 
-Written by `python -m benchmarks.results{form}` in {minutes:.0f} minutes of processor time on one machine ({machine},
-version {version}); the long form takes about {long:.0f}. The paper is "PhysGraph: Physics-Based Cloth Enhancement Using
-Graph Neural Networks". Its shirt, its body and its motions are not free: the first lines of each command's file say what
-stands in their place. "-" is where the paper gives no figure or nothing was aimed at.
-**{met} of {counted} figures with a target meet it.** The learned integrators' weights: {weights}.
+Written by `python -m benchmarks.results{form}` in {minutes:.0f} minutes of processor time ({machine}, version
+{version}). {long} The paper is "PhysGraph: Physics-Based Cloth Enhancement Using Graph Neural Networks". Its shirt, its
+body and its motions are not free: each part says what stands in their place. "-" is where the paper gives no figure, or
+nothing was aimed at.
+
+**{met} of {counted} figures with a target meet it.** Weights of the learned integrators: {weights}.
 """
 
 
@@ -117,7 +121,7 @@ def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool
     head = TEXT.format(
         form=" --short" if short else "",
         minutes=seconds / 60.0,
-        long=LONG_MINUTES,
+        long=f"The long form, without --short, takes about {LONG_MINUTES:.0f}." if short else "This is the long form.",
         machine=f"{platform.machine()}, CPU",
         version=__version__,
         met=sum(bool(row.met) for row in rows),
@@ -127,15 +131,12 @@ def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool
     return "\n".join([head, *(line for part, each in shown for line in section(part, each, short=short))])
 
 
-LONG_MINUTES = 60.0
-"""Processor minutes of the long form, measured once."""
-
-
 def section(part: Part, known: dict[str, Any], *, short: bool) -> Iterator[str]:
-    """The lines of a part: its heading, its command, what the command's file says of it, its rows."""
+    """The lines of a part: its heading, its command, what the command's file says, its rows and notes."""
     found = Found.of(known["found"])
     yield f"## {part.title}\n"
     yield f"`python -m {part.command}{'' if short else ' --long'}` ({known['seconds']:.0f} s)\n"
+    yield from about(part)
     yield from HEAD
     yield from (row.line() for row in found.rows)
     yield ""
@@ -143,6 +144,12 @@ def section(part: Part, known: dict[str, Any], *, short: bool) -> Iterator[str]:
         yield f"{note}\n"
     if found.picture:
         yield f"![{part.title}]({found.picture})\n"
+
+
+def about(part: Part) -> Iterator[str]:
+    """What the docstring of a part's file says below its title and its commands."""
+    paragraphs = (sys.modules[part.measure.__module__].__doc__ or "").split("\n\n")[1:]
+    yield from (f"{each.strip()}\n" for each in paragraphs if not each.startswith("    "))
 
 
 def hashes() -> Iterator[str]:

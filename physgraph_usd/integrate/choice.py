@@ -1,8 +1,8 @@
 """Whether a cold frame goes through its coarse levels: what ``auto``, refine's default, decides frame by frame.
 
 Coarse levels are cheap and carry folds far, but each has a start of its own. Under one subdivision lies one coarse
-level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where the input crosses
-itself: what crosses is drawn apart at the cage. `python -m benchmarks.front` measures it, and docs/chart.md has the
+level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where cloth lies near
+cloth: who lies above whom is settled at the cage. `python -m benchmarks.front` measures it, and docs/chart.md has the
 table. What starts from the last frame's detail starts at the finest level in any case.
 """
 
@@ -30,16 +30,16 @@ class Choice:
     reason: str = ""
 
 
-class Crossed(Protocol):
+class Crowd(Protocol):
     """What is asked of contact."""
 
     @property
-    def crosses(self) -> bool:
-        """Whether cloth crosses cloth in the upsampled cage."""
+    def crowded(self) -> bool:
+        """Whether cloth is near cloth in the upsampled cage."""
         ...
 
 
-def choose(nested: bool | None, subdivisions: int, contact: Crossed | None, *, warm: bool = False) -> Choice:
+def choose(nested: bool | None, subdivisions: int, contact: Crowd | None, *, warm: bool = False) -> Choice:
     """Choose for one frame.
 
     Args:
@@ -52,6 +52,6 @@ def choose(nested: bool | None, subdivisions: int, contact: Crossed | None, *, w
         return Choice(bool(nested) and not warm)
     if subdivisions != 1:
         return Choice(True, reason=f"level by level: {subdivisions} subdivisions")
-    if contact is not None and contact.crosses:
-        return Choice(True, reason="level by level: the input crosses itself")
-    return Choice(False, LONGER, "the finest level alone: one subdivision, and the input does not cross itself")
+    if contact is not None and contact.crowded:
+        return Choice(True, reason="level by level: cloth lies near cloth")
+    return Choice(False, LONGER, "the finest level alone: one subdivision, and no cloth lies near cloth")
