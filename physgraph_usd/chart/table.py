@@ -186,6 +186,9 @@ class Chart:
             )
         if self.busy:
             yield self.busy
+        plan, longer = self.about.get("plan"), self.about.get("long_minutes")
+        if plan and longer and longer > 1.1 * plan["minutes"]:
+            yield f"planned for {plan['minutes']:.0f} minutes; the long form would take about {longer:.0f}"
 
 
 def quickest(points: Sequence[tuple[float, float]], gap: float) -> float | None:
