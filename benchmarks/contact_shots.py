@@ -71,6 +71,11 @@ class Sums:
     strain: float = 0.0
     seconds: float = 0.0
 
+    @property
+    def percent(self) -> float:
+        """Share of the vertices that are inside, after [%]."""
+        return 100.0 * self.inside[1] / max(self.vertices, 1)
+
     def add(self, entry: dict[str, Any]) -> None:
         """Take one group's frame."""
         contact = entry.get("contact", {})
@@ -112,20 +117,30 @@ def main(folder: Path | None, frames: int, level: int, forms: Sequence[str], sho
         for name in [*SAMPLES, *(REAL if folder else ())]:
             if shots and not any(each in name for each in shots):
                 continue
-            shot, first = _open(name, Path(place), folder)
+            shot, first = open_one(name, Path(place), folder)
             for form in forms:
-                sums = _run(shot, first, frames, level=level, settings=FORMS[form])
+                sums = run(shot, first, frames, level=level, settings=FORMS[form])
                 say(_row(name, form, sums))
 
 
-def _open(name: str, place: Path, folder: Path | None) -> tuple[Shot, int]:
+def open_one(name: str, place: Path, folder: Path | None) -> tuple[Shot, int]:
+    """A shot and the number of its first frame here."""
     if name in SAMPLES:
         return open_shot(str(write_sample(name, place))), SAMPLES[name]
     garments, colliders, first = REAL[name]
     return open_shot(str(Path(folder or "") / name), garments=garments, colliders=colliders), first
 
 
-def _run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSettings) -> Sums:
+def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSettings) -> Sums:
+    """Refine some frames in a row.
+
+    Args:
+        shot: The shot.
+        first: Number of the first frame.
+        count: Number of frames.
+        level: Subdivisions.
+        settings: How contact is solved.
+    """
     from physgraph_usd.options import RefineOptions  # noqa: PLC0415
 
     solve = replace(RefineOptions().solve_settings(), contact=settings)
@@ -147,10 +162,9 @@ def _run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSet
 
 
 def _row(name: str, form: str, sums: Sums) -> str:
-    percent = 100.0 * sums.inside[1] / max(sums.vertices, 1)
     arrows = [f"{a} -> {b}" for a, b in (sums.inside, sums.body, sums.cloth, sums.between)]
     return (
-        f"| {Path(name).parts[0].split(chr(46))[0]} | {form} | {sums.vertices} | {arrows[0]} | {percent:.3f} "
+        f"| {Path(name).parts[0].split(chr(46))[0]} | {form} | {sums.vertices} | {arrows[0]} | {sums.percent:.3f} "
         f"| {sums.deepest:.2f} | {sums.pinched} | {arrows[1]} | {arrows[2]} | {arrows[3]} | {sums.worse} "
         f"| {sums.strain:.3f} | {sums.seconds:.2f} |"
     )

@@ -1,5 +1,6 @@
 """The paper's convergence figure: energy against steps on a patch, for every integrator.
 
+    python -m benchmarks.convergence --rows [--long]     the page of results' figures
     python -m benchmarks.convergence [--weights FILE] [--out docs/pictures/convergence.png] [--shots swatch,flag]
 
 Patches of another seed than those trained on, stretch and bending only, their border fixed, subdivided twice (x16).
@@ -14,7 +15,7 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,10 +33,13 @@ from physgraph_usd.level import refine_garments
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.train.patches import PatchConfig, make_patches
 
+from .rows import Found, Row, run_alone, say, table
 from .unseen import cases
 
 STEPS = 30
 PAPER_STEPS = 5
+CHOSEN = ("physgraph-paper", "physgraph, finest level", "quasi-Newton, finest level", "L-BFGS")
+"""Methods of the page of results."""
 ADAM_RATES = (1e-2, 1e-3, 1e-4)
 ADAM_SWEEP = (3e-3, 6e-3, 2e-2, 4e-2, 8e-2, 0.16)
 GRADIENT_RATES = (0.1, 1.0, 10.0)
@@ -60,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for number, patch in enumerate(patches):
         say(f"\npatch {number}: {patch.words}, {patch.group.levels[-1].vertex_count} vertices")
         lines = curves(patch, given.weights, given.physgraph, device=given.device)
-        table(lines)
+        show_table(lines)
         if given.out and number == 0:
             draw(lines, given.out)
 
@@ -77,14 +81,42 @@ class Problem:
     least: float
 
 
-def trained_like(device: str) -> Iterator[Problem]:
+def trained_like(device: str, config: PatchConfig = CONFIG) -> Iterator[Problem]:
     """Patches like those that the paper's network was trained on, of another seed."""
-    for patch in make_patches(CONFIG, seed=SEED):
+    for patch in make_patches(config, seed=SEED):
         garment = patch.garment
         chains, settings = refine_garments([garment], [garment.level]), SolveSettings(METHODS["quasi-newton"])
         group = Group([garment], chains, patch.gravity, settings, dtype=torch.float32, device=device)
         systems, coarse = group.systems([patch.frame])
         yield Problem(patch.words, group, systems, coarse, patch.start[-1], patch.least[-1])
+
+
+def rows(short: bool) -> Found:
+    """On how many patches the paper's network lies below Adam and gradient descent, and gaps after K evaluations."""
+    config = CONFIG if short else replace(CONFIG, count=2 * CONFIG.count)
+    patches = list(trained_like("cpu", config))
+    found, lines, below = [], [], 0
+    for number, patch in enumerate(patches):
+        gaps = curves(patch, FOLDER / "physgraph-paper.safetensors", FOLDER / "physgraph.safetensors", device="cpu")
+        lost = overtaken(gaps)
+        below += not lost
+        best = min(gaps[name][PAPER_STEPS] for name in gaps if name.startswith(("Adam", "gradient")))
+        shown = [f"{in_words(gaps[name], PAPER_STEPS)}" for name in CHOSEN]
+        lines.append([f"{number}", f"{patch.group.levels[-1].vertex_count}", f"{best:.1%}", *shown])
+        for name, k in lost:
+            lines.append([f"{number}", "", f"not below {name} at k = {k}", *[""] * len(CHOSEN)])
+    said = f"{below} of {len(patches)} patches"
+    title = "the paper's network below Adam and gradient descent of every rate at every k <= 5"
+    found.append(Row(title, said, "every k", f"{len(patches)} patches", below == len(patches)))
+    head = ["patch", "vertices", "best of Adam and gradient descent", *CHOSEN]
+    return Found(found, [f"Gap after {PAPER_STEPS} force evaluations:", table(head, lines)], "pictures/convergence.png")
+
+
+def overtaken(lines: dict[str, list[float]]) -> list[tuple[str, int]]:
+    """Names and numbers of evaluations at which the paper's network is not below Adam or gradient descent."""
+    ours = lines["physgraph-paper"]
+    others = [name for name in lines if name.startswith(("Adam", "gradient"))]
+    return [(name, k) for name in others for k in range(1, PAPER_STEPS + 1) if not ours[k] < lines[name][k]]
 
 
 def garments(names: Sequence[str], given: argparse.Namespace) -> Iterator[Problem]:
@@ -150,16 +182,14 @@ def gap(patch: Problem, energy: float) -> float:
     return (energy - patch.least) / (patch.start - patch.least)
 
 
-def table(lines: dict[str, list[float]]) -> None:
+def show_table(lines: dict[str, list[float]]) -> None:
     """Print gaps at the first steps and at the last."""
     shown = (*range(1, PAPER_STEPS + 1), 10, STEPS)
     say("\n| force evaluations | " + " | ".join(str(k) for k in shown) + " |\n|---|" + "---|" * len(shown))
     for name, gaps in lines.items():
         say(f"| {name} | " + " | ".join(in_words(gaps, k) for k in shown) + " |")
-    ours = lines.get("physgraph-paper")
-    if ours:
-        others = [name for name in lines if name.startswith(("Adam", "gradient"))]
-        lost = [(n, k) for n in others for k in range(1, PAPER_STEPS + 1) if not ours[k] < lines[n][k]]
+    if "physgraph-paper" in lines:
+        lost = overtaken(lines)
         say("\nphysgraph-paper lies below Adam and gradient descent at every k <= 5: " + ("yes" if not lost else "no"))
         for name, k in lost:
             say(f"not below {name} at k = {k}")
@@ -215,12 +245,10 @@ COLOURS = (
 )
 
 
-def say(line: str) -> None:
-    """Write a line to standard output."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
 if __name__ == "__main__":
-    with torch.no_grad():
-        main()
+    if "--rows" in sys.argv:
+        sys.argv.remove("--rows")
+        run_alone(rows)
+    else:
+        with torch.no_grad():
+            main()

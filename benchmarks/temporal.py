@@ -1,6 +1,7 @@
 """How still the detail is from frame to frame, and what stillness costs in energy.
 
     python -m benchmarks.temporal [SAMPLE...]
+    python -m benchmarks.temporal --rows [--long]        the page of results' figures
 
 The detail is the fine cloth minus the upsampled cage; its jerk is the RMS of its third difference over 24 frames, in
 mean fine edges. Energies are means over the frames, without the tether's own.
@@ -16,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.sleeve import CORES, say
+from benchmarks.rows import Found, Row, run_alone, say, table, under
+from benchmarks.shots import CORES, opened
 from physgraph_usd.mesh.subdivide import Refinement
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
@@ -40,6 +42,31 @@ def main() -> None:
             for temporal, stiffness in RUNS:
                 jerk, energy = measure(shot, temporal, stiffness)
                 say(f"| {name} | {temporal} | {stiffness:g} | {jerk:.3f} | {energy:.5f} |")
+
+
+def rows(short: bool) -> Found:
+    """Jerk with what a frame takes over from the last one against each by itself; and equal frames."""
+    found, lines = [], []
+    for name, garments, level in (("sleeve", (), 2), ("layers", ("*/Trousers",) if short else (), 1)):
+        shot = opened(name, level, garments)
+        runs = {each: measure(shot, each, 2000.0) for each in ("off", "tether")}
+        ratio = runs["tether"][0] / runs["off"][0]
+        paper = "mostly coherent"
+        found.append(under(f"{name}: jerk of the detail over that of frames by themselves", ratio, 0.5, paper=paper))
+        lines += [[name, f"{level}", each, f"{jerk:.3f}", f"{energy:.5f}"] for each, (jerk, energy) in runs.items()]
+    equal, every = frozen()
+    found.append(
+        Row("frozen: frames equal to the first, to the bit", f"{equal} of {every}", "-", "all", equal == every)
+    )
+    return Found(found, [table(["sample", "level", "temporal", "jerk [edges]", "energy [J]"], lines)])
+
+
+def frozen() -> tuple[int, int]:
+    """Frames of a still shot that are the first one's bytes, and all of its frames."""
+    shot = opened("frozen", 1)
+    refiner = Refiner(shot.scene, RefineOptions().solve_settings(), lanes=CORES)
+    states = [np.asarray(refiner.solve(shot.frame(time)).points[0]).tobytes() for time in shot.scene.times]
+    return sum(state == states[0] for state in states), len(states)
 
 
 def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
@@ -75,4 +102,8 @@ def mean_fine_edge(refiner: Refiner, index: int) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    if "--rows" in sys.argv:
+        sys.argv.remove("--rows")
+        run_alone(rows)
+    else:
+        main()

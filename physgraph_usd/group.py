@@ -25,6 +25,7 @@ from .forces.guide import GuideMap
 from .forces.self_contact import SelfContact
 from .integrate import Method
 from .integrate.base import System
+from .integrate.choice import choose
 from .integrate.metric import Metric
 from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
@@ -158,7 +159,7 @@ class Group:
         contact = self._contact(touching, coarse, origin, frames)
         prepared = time.perf_counter()
         try:
-            x, reports, module = self._descend(forces, coarse, predicted, clock, contact=contact)
+            x, reports, module, chosen = self._descend(forces, coarse, predicted, clock, contact=contact)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
@@ -172,7 +173,7 @@ class Group:
         carried = self._frames.store(coarse, x)
         carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
         strain = edge_strain(self.levels[-1], result)
-        telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start}
+        telemetry = self._telemetry(module, result, coarse, reports) | chosen | {"strain": strain, "start": start}
         crossing = torch.zeros_like(self.levels[-1].free[:, 0])
         if contact is not None:
             measured, crossing = contact.measure(result)
@@ -304,9 +305,11 @@ class Group:
         clock: float,
         *,
         contact: FrameContact | None,
-    ) -> tuple[Tensor, list[LevelReport], ForceModule]:
-        """Walk the levels; a warm start goes straight to the finest."""
-        first = 0 if predicted is None and self._settings.method.nested else len(self.levels) - 1
+    ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
+        """Walk the levels; a warm start goes straight to the finest. Also says why, where there was a choice."""
+        subdivisions, warm = len(self.levels) - 1, predicted is not None
+        choice = choose(self._settings.method.nested, subdivisions, contact, warm=warm)
+        first = 0 if choice.nested else subdivisions
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
         module = ForceModule(())
@@ -318,7 +321,7 @@ class Group:
             terms = module
             if predicted is not None and self._settings.temporal == "tether":
                 terms = ForceModule((*module.forces, lasting.tether(self._settings.tether, predicted)))
-            budget = self._budget(index, len(self.levels), clock)
+            budget = self._budget(index, clock, more=choice.steps)
             view = None if contact is None else contact.at(level)
             cold = predicted is None
             x, made, touched = self._solve_level(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
@@ -326,7 +329,7 @@ class Group:
                 made[-1].energies = module.energies(x)
             reports += made
             module = ForceModule((*module.forces, *touched))
-        return x, reports, module
+        return x, reports, module, {"chosen": choice.reason} if choice.reason else {}
 
     def _solve_level(
         self,
@@ -370,15 +373,15 @@ class Group:
             made.append(report)
         return x, made, touched
 
-    def _budget(self, index: int, count: int, clock: float) -> Budget:
-        """Steps and deadline of one level."""
+    def _budget(self, index: int, clock: float, *, more: int) -> Budget:
+        """Steps and deadline of one level, the finest with so many times its steps."""
         settings = self._settings
-        below = count - 1 - index
+        below = len(self.levels) - 1 - index
         deadline = None
         if settings.budget_ms is not None:
             deadline = clock + 1e-3 * settings.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
         if not below:
-            return Budget(settings.steps, settings.tolerance, deadline)
+            return Budget(more * settings.steps, settings.tolerance, deadline)
         return Budget(COARSE_STEPS * settings.steps, COARSE_TOLERANCE * settings.tolerance, deadline)
 
     def _telemetry(

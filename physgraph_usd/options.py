@@ -62,7 +62,7 @@ class RefineOptions:
     garments: Sequence[str] = ()
     colliders: Sequence[str] = ()
     level: int | None = None
-    integrator: str = "quasi-newton"
+    integrator: str = "auto"
     weights: Path | None = None
     steps: int = 12
     tolerance: float = 2e-3

@@ -62,8 +62,8 @@ def measure_curves(
 
 
 def rungs(growth: float) -> Iterator[int]:
-    """Numbers of steps: powers of two and, where the growth is under two, those between them."""
-    for power in range(MOST_RUNGS):
+    """Numbers of steps: powers of two, every other where they grow by four; those between where by under two."""
+    for power in range(0, MOST_RUNGS, 2 if growth >= 4.0 else 1):
         yield 2**power
         if growth < 2.0 and power:
             yield 3 * 2 ** (power - 1)

@@ -31,6 +31,8 @@ class Curve:
 def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
     """Every integrator as it is and, where that is not another's, with nesting switched over.
 
+    What chooses between others frame by frame is none of them: it is refine's default.
+
     Args:
         names: Names of `METHODS` to keep; all when empty.
 
@@ -40,7 +42,8 @@ def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
     unknown = [name for name in names if name not in METHODS]
     if unknown:
         raise UsageError(f"unknown integrator '{unknown[0]}'; known integrators: {', '.join(METHODS)}")
-    kept = {name: method for name, method in METHODS.items() if not names or name in names}
+    fixed = {name: method for name, method in METHODS.items() if method.nested is not None}
+    kept = {name: method for name, method in fixed.items() if not names or name in names}
     known = {(method.build, method.nested) for method in METHODS.values()}
     curves = [Curve(name, name, method) for name, method in kept.items()]
     for name, method in kept.items():

@@ -8,8 +8,8 @@ from typing import Any
 
 from ..errors import UsageError
 
-SHORT_MINUTES = 12.0
-"""Time that the short form plans with."""
+SHORT_MINUTES = 9.0
+"""Time that the short form plans with: on a busy machine a plan takes a third longer."""
 LONGEST_SHORT = 15.0
 """Minutes up to which a chart has the short form's size."""
 
@@ -38,7 +38,7 @@ class Size:
     frames: int
 
 
-SHORT = Size(SHORT_MINUTES, repeats=3, more=9, growth=2.0, reach=4.0, frames=2)
+SHORT = Size(SHORT_MINUTES, repeats=3, more=6, growth=2.0, reach=4.0, frames=2)
 LONG = Size(None, repeats=5, more=5, growth=1.5, reach=8.0, frames=3)
 
 

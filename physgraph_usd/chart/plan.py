@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -19,7 +20,9 @@ REFERENCE_SECONDS = 300.0
 TERM_SOLVES = 30
 """Solves at refine's default that the terms take, about."""
 RUNGS = 10
-"""Budgets of a method, about."""
+"""Budgets of a method that double, about."""
+SPARSE = 4.0
+"""Growth of the budgets where even short curves would take too long."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,10 @@ class Plan:
         return asdict(self)
 
 
-def make_plan(size: Size, *, curves: int, default_ms: float, elapsed_ms: float, judge_ms: float) -> Plan:
-    """Fit a size into its time: fewer frames first, then shorter curves.
+def make_plan(
+    size: Size, *, curves: int, default_ms: float, elapsed_ms: float, judge_ms: float, least_ms: float = 0.0
+) -> Plan:
+    """Fit a size into its time: fewer frames first, then shorter curves, then fewer budgets.
 
     Args:
         size: What is wanted.
@@ -56,13 +61,15 @@ def make_plan(size: Size, *, curves: int, default_ms: float, elapsed_ms: float, 
         default_ms: Time of a frame by refine's default, as the chart counts it [ms].
         elapsed_ms: Wall time of the same and of what goes with it [ms].
         judge_ms: Time of judging a result [ms].
+        least_ms: Wall time of a solve of a single step: what no fewer steps save [ms].
     """
-    frames, reach, repeats = size.frames, size.reach, size.repeats
+    frames, reach, repeats, growth = size.frames, size.reach, size.repeats, size.growth
 
     def seconds() -> float:
         """Time of all curves: each is a geometric series that ends at the reach; every result is judged once."""
-        series = size.growth / (size.growth - 1.0) * reach * elapsed_ms
-        return 1e-3 * frames * curves * (repeats * series + RUNGS * judge_ms)
+        rungs = RUNGS / math.log2(growth)
+        series = growth / (growth - 1.0) * max(reach * elapsed_ms - least_ms, 0.0) + rungs * least_ms
+        return 1e-3 * frames * curves * (repeats * series + rungs * judge_ms)
 
     if size.minutes is not None:
         room = 60.0 * FOR_CURVES * size.minutes
@@ -70,11 +77,12 @@ def make_plan(size: Size, *, curves: int, default_ms: float, elapsed_ms: float, 
             frames -= 1
         while reach > LEAST_REACH and seconds() > room:
             reach /= 1.25
+        growth = SPARSE if seconds() > room else growth
         while repeats < size.more and seconds() < room * repeats / (repeats + 1):
             repeats += 1
     reference = REFERENCE_SECONDS if size.minutes is None else 60.0 * FOR_REFERENCE * size.minutes / frames
     total = seconds() + frames * reference + TERM_SOLVES * 1e-3 * (elapsed_ms + judge_ms)
-    return Plan(frames, repeats, size.growth, reach * default_ms, reference, round(total / 60.0, 1))
+    return Plan(frames, repeats, growth, reach * default_ms, reference, round(total / 60.0, 1))
 
 
 class Clock:

@@ -7,6 +7,7 @@ import platform
 import statistics
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,7 @@ def _plan(
         "default_ms": statistics.median(each.milliseconds for each in spent[1:]),
         "elapsed_ms": statistics.median(each.elapsed for each in spent[1:]),
         "judge_ms": 1e3 * (time.perf_counter() - began),
+        "least_ms": timed.solve(frame, replace(COLD, steps=1, tolerance=0.0)).elapsed,
     }
     plan = make_plan(options.size(), **costs)
     journal.add("plan", plan=plan.plain(), long_minutes=make_plan(LONG, **costs).minutes)

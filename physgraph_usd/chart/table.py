@@ -128,17 +128,7 @@ class Chart:
 
     def time_to(self, method: str, gap: float) -> float | None:
         """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there."""
-        best: list[Point] = []
-        for point in self.curve(method):
-            if not best or point.gap < best[-1].gap:
-                best.append(point)
-        if best and best[0].gap <= gap:
-            return best[0].ms
-        for a, b in pairwise(best):
-            if b.gap <= gap:
-                part = math.log(a.gap / gap) / math.log(a.gap / max(b.gap, TINY))
-                return a.ms * (b.ms / a.ms) ** part
-        return None
+        return quickest([(point.ms, point.gap) for point in self.curve(method)], gap)
 
     def times_to(self, gap: float) -> dict[str, float]:
         """Milliseconds to a gap of the methods that get there, the fastest first."""
@@ -196,6 +186,29 @@ class Chart:
             )
         if self.busy:
             yield self.busy
+        plan, longer = self.about.get("plan"), self.about.get("long_minutes")
+        if plan and longer and longer > 1.1 * plan["minutes"]:
+            yield f"planned for {plan['minutes']:.0f} minutes; the long form would take about {longer:.0f}"
+
+
+def quickest(points: Sequence[tuple[float, float]], gap: float) -> float | None:
+    """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there.
+
+    Args:
+        points: Milliseconds and gap of its budgets, the smallest first.
+        gap: The gap.
+    """
+    best: list[tuple[float, float]] = []
+    for point in points:
+        if not best or point[1] < best[-1][1]:
+            best.append(point)
+    if best and best[0][1] <= gap:
+        return best[0][0]
+    for (ms, above), (more, below) in pairwise(best):
+        if below <= gap:
+            part = math.log(above / gap) / math.log(above / max(below, TINY))
+            return ms * (more / ms) ** part
+    return None
 
 
 def typical(times: Sequence[float]) -> float:

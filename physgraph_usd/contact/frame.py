@@ -102,13 +102,27 @@ class FrameContact:
         """The view of one level, the same at each call."""
         if level.index not in self._views:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
-            cloth = None
-            if self._cloth is not None:
-                base = level.base.apply(self._coarse)
-                cloth = ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings)
-            seam = None if self._seams is None else self._seams.term(level, level.base.apply(self._coarse))
+            base = level.base.apply(self._coarse)
+            cloth = self._cloth_at(level, base)
+            seam = None if self._seams is None else self._seams.term(level, base)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
         return self._views[level.index]
+
+    @property
+    def crowded(self) -> bool:
+        """Whether cloth is near cloth in the upsampled cage, at the finest level."""
+        finest = self._levels[-1]
+        view, base = self.at(finest), finest.base.apply(self._coarse)
+        if view.cloth is None or view.cloth.term(base) is None:
+            return False
+        view.cloth = self._cloth_at(finest, base)  # One that has seen nothing yet: it keeps the sides it sees first.
+        return True
+
+    def _cloth_at(self, level: Level, base: Float[Tensor, "vertices 3"]) -> ClothView | None:
+        """A new view of one level's cloth, upsampled to given positions [m]."""
+        if self._cloth is None:
+            return None
+        return ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings)
 
     def finish(
         self, x: Float[Tensor, "vertices 3"]

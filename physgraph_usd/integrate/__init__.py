@@ -25,14 +25,15 @@ class Method:
 
     Attributes:
         build: Makes the integrator.
-        nested: Solve coarse levels first; otherwise the finest level only.
+        nested: Solve coarse levels first; otherwise the finest level only. None chooses frame by frame: `choice`.
     """
 
     build: Callable[[], Integrator]
-    nested: bool
+    nested: bool | None
 
 
 METHODS: dict[str, Method] = {
+    "auto": Method(QuasiNewton, nested=None),
     "quasi-newton": Method(QuasiNewton, nested=True),
     "quasi-newton-flat": Method(QuasiNewton, nested=False),
     "lbfgs": Method(lambda: QuasiNewton(use_metric=False), nested=False),

@@ -6,18 +6,21 @@ A cell says whether the case passed and what was measured. Cases that no integra
 from __future__ import annotations
 
 import contextlib
+import json
 import platform
 import sys
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import click
+import report_contact as contact
 import report_solver as solver
 import report_stages as stages
 import warp as wp
@@ -27,9 +30,6 @@ from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.integrate import METHODS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "stability.md"
-LATER = "not yet measured: "
-BODIES = LATER + "needs contact with bodies by method"
-SELF = LATER + "needs self contact"
 
 
 @dataclass(frozen=True)
@@ -73,19 +73,30 @@ CASES = (
     Case(15, "crumpled ball, noise of three edges", "energy / 10 in 200 steps", solver.s15_crumpled),
     Case(16, "rest edges without length, rest points not finite", "refused by name", once=stages.s16_rest_shapes),
     Case(17, "one pin, all pinned", "to the bit", solver.s17_pins),
-    Case(18, "open and flipped colliders", "", left_out=BODIES),
-    Case(19, "thin collider between two layers", "", left_out=BODIES),
-    Case(20, "deep start", "", left_out=BODIES),
-    Case(21, "cloth pinched between body parts", "", left_out=BODIES),
-    Case(22, "collider that swallows the cloth", "", left_out=BODIES),
-    Case(23, "vertex on the surface, or where its gradient vanishes", "", left_out=BODIES),
-    Case(24, "two sheets crossing", "", left_out=SELF),
-    Case(25, "closed contours of crossings", "", left_out=SELF),
-    Case(26, "ten stacked layers", "", left_out=SELF),
-    Case(27, "torus, funnel, spinning sphere, needles", "", left_out=SELF),
-    Case(28, "two garments with a shared seam", "", left_out=SELF),
+    Case(18, "open colliders, wound either way and both", "none pushed through", contact.s18_open),
+    Case(19, "card of 0.2 mm or pane between two layers", "none changes sides", contact.s19_thin),
+    Case(20, "15 cm deep in a ball; past the middle of a torso", "none left inside", contact.s20_deep),
+    Case(
+        21,
+        "pinched in half a millimetre; by parts that overlap",
+        "to 1 mm; to a cage edge; 0.2 mm in eight frames",
+        contact.s21_pinched,
+    ),
+    Case(22, "collider that swallows the cloth", "what stays in is told; filtered to the bit", contact.s22_swallowed),
+    Case(23, "vertices exactly on a surface", "all rise, none slides 0.1 mm", contact.s23_on_the_surface),
+    Case(24, "two sheets crossing: dented, cornered, tilted", "all apart", contact.s24_crossed),
+    Case(25, "a sleeve through the cloth of a torso", "never more, under 2 edges", contact.s25_contours),
+    Case(26, "ten layers at half their thickness", "drift under a tenth of it", contact.s26_stacked),
+    Case(27, "pulled through a torus, laid on needles", "no new crossings, none inside", contact.s27_scenes),
+    Case(28, "two garments with a shared seam", "opens under 0.1 mm", contact.s28_seams),
     Case(29, "the cage jumps 2 m or turns by half", "cold start of that frame to 1e-6 edges", solver.s29_teleport),
-    Case(30, "collider that moves five edges a frame", "", left_out=BODIES),
+    Case(
+        30,
+        "collider that moves five edges a frame",
+        "none inside or under; a sphere told",
+        contact.s30_fast,
+        contact.s30_sphere,
+    ),
     Case(31, "gaps and odd sample times", "samples at the authored times", stages.s31_times),
     Case(32, "topology that changes", "named, other frames written", once=stages.s32_topology),
     Case(33, "single against double precision", "1e-4 edges; CUDA in tests/test_cuda.py", solver.s33_precision),
@@ -99,6 +110,37 @@ CASES = (
 )
 
 
+class Cells:
+    """Measured cells in a file that grows: a run that was stopped goes on where it was."""
+
+    def __init__(self, file: Path | None) -> None:
+        """Open it; None keeps nothing."""
+        self._file = file
+        self._known: dict[str, tuple[bool, str, float]] = {}
+        if file is not None and file.exists():
+            for line in file.read_text(encoding="utf-8").splitlines(keepends=True):
+                if line.endswith("\n"):
+                    self._known |= {key: (held, text, spent) for key, held, text, spent in [json.loads(line)]}
+
+    @property
+    def seconds(self) -> float:
+        """Processor time of all that is known [s]."""
+        return sum(spent for *_, spent in self._known.values())
+
+    def get(self, number: int, column: str, measure: Callable[[], Result]) -> tuple[bool, str]:
+        """A cell, measured where it is not known."""
+        key = f"S{number} {column}"
+        if key not in self._known:
+            began = time.process_time()
+            held, text = cell(measure)
+            self._known[key] = held, text, round(time.process_time() - began, 2)
+            if self._file is not None:
+                self._file.parent.mkdir(parents=True, exist_ok=True)
+                with self._file.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps([key, *self._known[key]]) + "\n")
+        return self._known[key][:2]
+
+
 def cell(measure: Callable[[], Result]) -> tuple[bool, str]:
     """Whether a measurement passed, and its cell."""
     try:
@@ -110,57 +152,73 @@ def cell(measure: Callable[[], Result]) -> tuple[bool, str]:
     return bool(result.held), f"pass {result.figure}" if result.held else f"**fail** {result.figure}"
 
 
-def row(case: Case, names: list[str]) -> tuple[list[bool], str]:
+def row(case: Case, names: list[str], cells: Cells | None = None) -> tuple[list[bool], str]:
     """Which cells of a case passed, and its row."""
-    head = f"| S{case.number} | {case.title} | {case.bound} |"
+    head, known = f"| S{case.number} | {case.title} | {case.bound} |", cells or Cells(None)
     if case.left_out:
         return [], f"{head} {case.left_out} |" + " |" * len(names)
-    found = [cell(case.once)] if case.once else []
+    found = [known.get(case.number, "all", case.once)] if case.once else []
     once = found[0][1] if found else "n/a"
-    cells = [cell(lambda name=name: case.by_method(name)) for name in names] if case.by_method else []  # type: ignore[misc]
-    shown = [text for _, text in cells] or ["n/a"] * len(names)
-    return [held for held, _ in found + cells], f"{head} {once} | {' | '.join(shown)} |"
+    columns = []
+    if case.by_method:
+        columns = [known.get(case.number, name, partial(case.by_method, name)) for name in names]
+    shown = [text for _, text in columns] or ["n/a"] * len(names)
+    return [held for held, _ in found + columns], f"{head} {once} | {' | '.join(shown)} |"
 
 
 TEXT = """# Stability
 
-Where methods fail, case by case. Written by `python -m tests.stability.report` in {minutes:.1f} minutes ({machine};
-float64 unless a case says otherwise). The measurements are in `report_solver.py` and `report_stages.py` beside it; the
-tests in that folder hold our default, `quasi-newton`, to bounds.
+Where methods fail, case by case. Written by `python -m tests.stability.report{form}` in {minutes:.0f} minutes of
+processor time ({machine}; float64 unless a case says otherwise, float32 where something is touched). {long} The
+measurements are in `report_solver.py`, `report_contact.py` and `report_stages.py` beside it; the tests in that folder
+hold `quasi-newton` to bounds. What a test there expects to fail fails here too, with its figure.
 
 A cell says whether the case passed and what was measured. "all" is for what no method decides; n/a means that the case
-does not concern the column. `gd` and `adam` are guarded; `quasi-newton` and `newton` are nested, the others start at
-the finest level. {passed} of {measured} measured cells pass; {later} of 40 cases are not yet measured.
+does not concern the column. `adam`, `gd` and the learned `physgraph` and `physgraph-paper` are guarded; `quasi-newton`,
+`newton` and `physgraph` are nested, the others start at the finest level, where nothing that starts crossed is drawn
+apart. `auto`, refine's default, is one of the first two, frame by frame, and has no column of its own.
+{passed} of {measured} measured cells pass; of `quasi-newton`'s and of those under "all" {own} of {all_own}.
 
 {table}
 """
+SLOW = "physgraph-paper"
+"""The column that takes as long as all others; the short form leaves it out."""
+LONG_MINUTES = 30
+CELLS = Path("build") / "stability.jsonl"
 
 
 @click.command()
-@click.option("--case", "chosen", type=int, multiple=True, help="Only this case; prints, writes no page.")
+@click.option("--case", "chosen", type=int, multiple=True, help="Only this case: prints it, writes and keeps nothing.")
+@click.option("--short", is_flag=True, help=f"Leave out {SLOW}; less than 15 minutes on two cores.")
+@click.option("--fresh", is_flag=True, help="Measure every cell anew.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), default=PAGE, help="Page to write.")
-def main(chosen: tuple[int, ...], out: Path) -> None:
+def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
     """Measure the cases S1 to S40 by method and write the table."""
     wp.config.log_level = wp.LOG_WARNING
-    names, began = list(METHODS), time.monotonic()
+    names = [name for name in METHODS if name != "auto" and not (short and name == SLOW)]
+    if fresh:
+        CELLS.unlink(missing_ok=True)
+    cells = Cells(None if chosen else CELLS)
     lines = [f"| case | what | passes | all | {' | '.join(names)} |", "|---" * (4 + len(names)) + "|"]
     every: list[bool] = []
+    own: list[bool] = []
     for case in CASES:
         if chosen and case.number not in chosen:
             continue
-        start = time.monotonic()
         with contextlib.redirect_stdout(sys.stderr):
-            held, line = row(case, names)
+            held, line = row(case, names, cells)
         every += held
+        own += held[: bool(case.once) + bool(case.by_method)]
         lines.append(line)
-        click.echo(f"{line}  {time.monotonic() - start:.1f} s", err=True)
+        click.echo(line, err=True)
     table = "\n".join(lines)
     if chosen:
         click.echo(table)
         return
-    figures = {"passed": sum(every), "measured": len(every), "later": sum(bool(case.left_out) for case in CASES)}
-    minutes, machine = (time.monotonic() - began) / 60.0, f"{platform.machine()}, CPU"
-    out.write_text(TEXT.format(table=table, minutes=minutes, machine=machine, **figures), encoding="utf-8")
+    figures = {"passed": sum(every), "measured": len(every), "own": sum(own), "all_own": len(own)}
+    form, long = (" --short", f"With `{SLOW}`, without --short, it takes about {LONG_MINUTES}.") if short else ("", "")
+    words = {"form": form, "long": long, "minutes": cells.seconds / 60.0, "machine": f"{platform.machine()}, CPU"}
+    out.write_text(TEXT.format(table=table, **words, **figures), encoding="utf-8")
     click.echo(out)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import report
+import report_contact as contact
 import report_solver as solver
 from report_solver import Result, under
 
@@ -37,6 +40,21 @@ def test_an_error_is_a_failure(error: Exception):
     assert report.cell(measure) == (False, f"**fail** {type(error).__name__}")
 
 
+def test_a_cell_that_is_known_is_not_measured_again(tmp_path: Path):
+    file, calls = tmp_path / "cells.jsonl", []
+
+    def measure() -> Result:
+        calls.append(1)
+        return Result(False, "bad")
+
+    first = report.Cells(file).get(7, "one", measure)
+    file.write_text(file.read_text() + '["S8 one", tr', encoding="utf-8")  # cut off
+    assert report.Cells(file).get(7, "one", measure) == first == (False, "**fail** bad")
+    assert len(calls) == 1
+    report.Cells(file).get(7, "two", measure)
+    assert len(calls) == 2
+
+
 def test_nan_is_no_pass():
     assert not under(float("nan"), 1.0).held
     assert under(0.5, 1.0).held
@@ -44,7 +62,17 @@ def test_nan_is_no_pass():
 
 
 @pytest.mark.parametrize(
-    "measure", [solver.s1_almost_nothing, solver.s3_needles, solver.s4_fins, solver.s17_pins, solver.s37_guard]
+    "measure",
+    [
+        solver.s1_almost_nothing,
+        solver.s3_needles,
+        solver.s4_fins,
+        solver.s17_pins,
+        solver.s37_guard,
+        contact.s23_on_the_surface,
+        contact.s26_stacked,
+        contact.s28_seams,
+    ],
 )
 def test_the_default_passes(measure):
     result = measure("quasi-newton")

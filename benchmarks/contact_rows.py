@@ -1,0 +1,136 @@
+"""What contact leaves on blocks, tori, cloth and several garments, in our form and in the paper's, as rows.
+
+    python -m benchmarks.contact_rows colliders|itself|several [--long]
+
+Frames in a row of the samples about contact; the figures are those of `benchmarks.contact_shots`, which has them all.
+Shape and energy are of the last of these frames, solved from cold, beside Loop subdivision of the same cage.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.contact_shots import FORMS, SAMPLES, Sums, open_one, run
+from benchmarks.rows import Found, Row, run_alone, table, under
+from benchmarks.shots import frames_of, opened, problem_of
+from physgraph_usd.chart.problem import COLD, Problem
+from physgraph_usd.scene import Frame
+
+FRAMES = {True: 2, False: 5}
+"""Frames in a row, by whether the form is the short one."""
+OBJECTS = ("block", "torus")
+ITSELF = ("hood", "armpit")
+SEVERAL = ("layers", "crossing")
+HEAD = ("sample", "form", "inside", "%", "deepest [mm]", "body crossings", "cloth crossings", "of garments", "strain")
+
+
+def colliders(short: bool) -> Found:
+    """The block and the torus: penetration, Loop's potential, and the shape."""
+    rows, lines = [], []
+    for name in OBJECTS:
+        sums = runs(name, short)
+        lines += described(name, sums)
+        ours = sums["ours"]
+        rows += [
+            under(f"{name}: deepest vertex", ours.deepest, 0.5, unit=" mm"),
+            under(f"{name}: vertices over 0.1 mm inside", ours.percent, 0.0, unit=" %", paper="correct results"),
+            fewer(f"{name}: crossings of cloth and body", ours.body, 0),
+            *beside_loop(name, short),
+        ]
+    return Found(rows, [table(HEAD, lines)])
+
+
+def itself(short: bool) -> Found:
+    """Cloth that touches itself: no new crossings."""
+    return crossings(ITSELF, short)
+
+
+def several(short: bool) -> Found:
+    """Garments that touch one another: no new crossings."""
+    return crossings(SEVERAL, short)
+
+
+def crossings(names: tuple[str, ...], short: bool) -> Found:
+    """Crossings of cloth and cloth in some samples."""
+    rows, lines = [], []
+    for name in names:
+        sums = runs(name, short)
+        lines += described(name, sums)
+        ours = sums["ours"]
+        rows.append(fewer(f"{name}: crossings of cloth and cloth", ours.cloth, ours.cloth[0]))
+        if names is SEVERAL:
+            rows.append(fewer(f"{name}: those of different garments", ours.between, ours.between[0]))
+        rows.append(
+            under(f"{name}: frames with more crossings than the input", ours.worse, 0, paper="no intersections")
+        )
+    return Found(rows, [table(HEAD, lines)])
+
+
+def runs(name: str, short: bool) -> dict[str, Sums]:
+    """Our form and the paper's on a sample."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        shot, first = open_one(name, Path(folder), None)
+        for form in ("ours", "paper"):
+            first_here = min(first, len(shot.scene.times) - FRAMES[short])
+            found[form] = run(shot, first_here, FRAMES[short], level=level_of(name, short), settings=FORMS[form])
+    return found
+
+
+def level_of(name: str, short: bool) -> int:
+    """Subdivisions: one where several garments would take long."""
+    return 1 if short and name in SEVERAL else 2
+
+
+def described(name: str, sums: dict[str, Sums]) -> list[list[str]]:
+    """The lines of a sample."""
+    return [
+        [name, form, *(f"{a} -> {b}" for a, b in [each.inside]), f"{each.percent:.3f}", f"{each.deepest:.2f}"]
+        + [f"{a} -> {b}" for a, b in (each.body, each.cloth, each.between)]
+        + [f"{each.strain:.3f}"]
+        for form, each in sums.items()
+    ]
+
+
+def fewer(what: str, pair: tuple[int, int], most: int) -> Row:
+    """Crossings before and after that must not be over a number."""
+    return Row(what, f"{pair[0]} -> {pair[1]}", "-", f"at most {most}", pair[1] <= most)
+
+
+def beside_loop(name: str, short: bool) -> list[Row]:
+    """Energy and curvature beside Loop subdivision, and how far the shape is from the cage's."""
+    shot = opened(name, level_of(name, short))
+    single, double = problem_of(shot), problem_of(shot, torch.float64)
+    [frame] = frames_of(shot, [shot.scene.times[min(SAMPLES[name] + FRAMES[short], len(shot.scene.times)) - 1]])
+    ours = single.solve(frame, COLD).points
+    plain, loop = (single.upsampled(frame, smooth=smooth) for smooth in (False, True))
+    energy = [double.judge(frame, points).energy for points in (ours, loop)]
+    cage = float(single.refiner.groups[0].levels[0].spacing.mean())
+    away = float(np.sqrt(np.square(ours[0] - plain[0]).sum(axis=1).mean())) / cage
+    bends = [bending(double, frame, points) for points in (ours, loop)]
+    return [
+        Row(
+            f"{name}: potential, Loop's",
+            f"{1e3 * energy[0]:.3g} mJ, {1e3 * energy[1]:.3g} mJ",
+            "adds detail",
+            "less than Loop's",
+            energy[0] < energy[1],
+        ),
+        Row(f"{name}: RMS curvature over Loop's", f"{(bends[0] / bends[1]) ** 0.5:.3g}", "adds detail"),
+        under(f"{name}: RMS distance from the cage", away, 0.5, unit=" cage edges", paper="keeps the shape"),
+    ]
+
+
+def bending(problem: Problem, frame: Frame, points: tuple[np.ndarray, ...]) -> float:
+    """Bending energy [J], which is the square of curvature."""
+    return problem.judge(frame, points).energies["bending"]
+
+
+if __name__ == "__main__":
+    PARTS = {"colliders": colliders, "itself": itself, "several": several}
+    run_alone(PARTS[sys.argv.pop(1)])

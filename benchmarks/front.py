@@ -1,0 +1,190 @@
+"""Is refine's default on the front of speed against accuracy? Samples and, where they are there, real shots.
+
+    python -m benchmarks.front [--levels 1,2] [--shots flag,swatch] [--fresh]
+
+One cold frame of each shot at each level, contact included, measured as `physgraph-usd chart --clock cpu` does it:
+the processor time of one core, energies judged in float64. Rivals are quasi-Newton through the levels and at the finest
+alone and `physgraph`, each with growing steps; other methods are slower on every chart. A ratio is the default's time
+over the least of all to the same gap; up to 1.1 counts as level. Phi* is the least that anybody found, a nested solve
+of 48 steps in float64 among them. What was measured lies in build/front.jsonl: a run that was stopped goes on there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.rows import say, table
+from benchmarks.shots import opened
+from physgraph_usd.chart.problem import COLD, Problem, plain_detail
+from physgraph_usd.chart.table import TOLERANCE, quickest
+from physgraph_usd.integrate import METHODS
+from physgraph_usd.scene import Frame
+from physgraph_usd.shot import prepare_device
+from physgraph_usd.usd.reader import Shot, open_shot
+
+JOURNAL = Path("build") / "front.jsonl"
+SAMPLES: dict[str, float | None] = {
+    "flag": 12.0,
+    "swatch": None,
+    "sleeve": None,
+    "block": 12.0,
+    "frozen": None,
+    "armpit": 15.0,
+    "hood": 12.0,
+    "torus": 20.0,
+    "skirt": 24.0,
+    "tshirt": 36.0,
+    "layers": 8.0,
+}
+"""Samples and time codes; None takes the last."""
+REAL: dict[str, tuple[list[str], list[str], float]] = {
+    "07_flag_quads_nocollider.usda": (["/shot/flag"], [], 30.0),
+    "08_sphere_spin_xformcollider.usdc": (["/shot/set/cloth"], ["/shot/set/rig/sphere"], 36.0),
+    "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], ["/shot/char/body_geo"], 1030.0),
+    "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], ["/shot/CesiumMan"], 24.0),
+    "06_torus_pull.usda": (["/shot/cloth"], ["/shot/torus"], 30.0),
+    "02_makehuman_usdskel_dm.usdc": (["/shot/char/top", "/shot/char/shorts"], ["/shot/char/body"], 30.0),
+}
+"""Real shots: garments, bodies and time code."""
+STEPS = {"quasi-newton": (2, 4, 8, 16), "quasi-newton-flat": (4, 16, 32, 64), "physgraph": (2, 8)}
+DEFAULT, START, LEAST = "default", "start", "least"
+LEAST_STEPS = 48
+FAR = 2.0
+"""A method takes no more steps where it has taken so many times the default's time."""
+SLOW_MS = 700.0
+"""Time from which a solve is taken once: what else runs on the machine matters less then."""
+
+
+def main() -> None:
+    """Measure what is not known and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--levels", default="1,2")
+    parser.add_argument("--shots", default=",".join((*SAMPLES, *REAL)), help="names, or their beginnings")
+    parser.add_argument("--fresh", action="store_true", help="measure everything anew")
+    given = parser.parse_args()
+    prepare_device("cpu")
+    JOURNAL.parent.mkdir(parents=True, exist_ok=True)
+    if given.fresh or not JOURNAL.exists():
+        JOURNAL.write_text("", encoding="utf-8")
+    wanted = tuple(given.shots.split(","))
+    names = [name for name in (*SAMPLES, *REAL) if name.startswith(wanted)]
+    lines = []
+    for level in map(int, given.levels.split(",")):
+        for name in names:
+            if found := measured(name, level):
+                lines.append(placed(name, level, found))
+    head = ("shot", "level", "vertices", "gap", "ms", "fastest to that gap", "ratio", "the default went")
+    say(table(head, [line for line, _ in lines]))
+    say(f"\non the front (up to {TOLERANCE:g}): {sum(on for _, on in lines)} of {len(lines)}")
+
+
+def measured(name: str, level: int) -> list[dict[str, Any]]:
+    """All runs of a shot at a level; nothing where the shot is not there."""
+    shot = open_one(name, level)
+    if shot is None:
+        return []
+    known = [row for row in read() if (row["shot"], row["level"]) == (name, level)]
+    if not any(row["method"] == LEAST for row in known):
+        time = SAMPLES[name] if name in SAMPLES else REAL[name][2]
+        frame = plain_detail(shot.frame(time if time is not None else shot.scene.times[-1]))
+        known += Bench(name, level, shot, frame).run({(row["method"], row["steps"]) for row in known})
+    return known
+
+
+def open_one(name: str, level: int) -> Shot | None:
+    """A shot at a level, or None."""
+    if name in SAMPLES:
+        return opened(name, level)
+    file = Path(os.environ.get("PHYSGRAPH_DATA", "../shared/data")) / "shots" / name
+    garments, colliders, _ = REAL[name]
+    return open_shot(str(file), garments=garments, colliders=colliders, level=level) if file.exists() else None
+
+
+def read() -> Iterator[dict[str, Any]]:
+    """The journal's whole lines."""
+    for line in JOURNAL.read_text(encoding="utf-8").splitlines(keepends=True):
+        if line.endswith("\n"):
+            yield json.loads(line)
+
+
+class Bench:
+    """Runs the methods on one frame."""
+
+    def __init__(self, name: str, level: int, shot: Shot, frame: Frame) -> None:
+        """Build the problem in both precisions."""
+        levels = [level] * len(shot.scene.garments)
+        self._about, self._frame = {"shot": name, "level": level}, frame
+        self._timed = Problem(shot.scene, levels, device="cpu", lanes=1, clock="cpu")
+        self._judge = Problem(shot.scene, levels, device="cpu", lanes=1, dtype=torch.float64)
+        self._rows: list[dict[str, Any]] = []
+
+    def run(self, known: set[tuple[str, int]]) -> list[dict[str, Any]]:
+        """Every method but what is known; Phi* last."""
+        self._timed.solve(self._frame, COLD)
+        start = self._judge.judge(self._frame, self._timed.upsampled(self._frame, smooth=False)).energy
+        self._add(START, 0, ms=0.0, energy=start, vertices=self._timed.vertex_count)
+        most = FAR * self._one(DEFAULT, COLD.steps, COLD)
+        for method, ladder in STEPS.items():
+            for steps in ladder:
+                settings = replace(COLD, method=METHODS[method], steps=steps, tolerance=0.0)
+                if (method, steps) not in known and self._one(method, steps, settings) > most:
+                    break
+        settings = replace(COLD, method=METHODS["quasi-newton"], steps=LEAST_STEPS, tolerance=0.0)
+        self._judge.refiner.use(settings)
+        points = self._judge.next(self._frame).points
+        self._add(LEAST, 0, ms=0.0, energy=self._judge.judge(self._frame, points).energy)
+        return self._rows
+
+    def _one(self, method: str, steps: int, settings: Any) -> float:
+        """Time a method; returns its milliseconds."""
+        solved = self._timed.solve(self._frame, settings)
+        spent = [solved.milliseconds]
+        while len(spent) < (3 if method == DEFAULT else 2) and spent[0] < SLOW_MS:
+            spent.append(self._timed.solve(self._frame, settings).milliseconds)
+        energy = self._judge.judge(self._frame, solved.points).energy
+        self._add(method, steps, ms=round(min(spent), 2), energy=energy, chosen=self._chosen(method))
+        return min(spent)
+
+    def _chosen(self, method: str) -> str:
+        """What the default chose, in its own words."""
+        if method != DEFAULT:
+            return ""
+        self._timed.refiner.forget()
+        state = self._timed.refiner.solve(self._frame)
+        return str(state.telemetry[0].get("chosen", "")).partition(":")[0]
+
+    def _add(self, method: str, steps: int, **values: Any) -> None:
+        row = self._about | {"method": method, "steps": steps} | values
+        with JOURNAL.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        self._rows.append(row)
+
+
+def placed(name: str, level: int, rows: Sequence[dict[str, Any]]) -> tuple[list[str], bool]:
+    """Where the default stands: a line of the table, and whether it is on the front."""
+    start = next(row for row in rows if row["method"] == START)
+    least = min(row["energy"] for row in rows)
+    curves: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    for row in rows:
+        if row["method"] not in (START, LEAST):
+            curves[row["method"]].append((row["ms"], (row["energy"] - least) / (start["energy"] - least)))
+    ms, gap = curves[DEFAULT][0]
+    times = {method: time for method, points in curves.items() if (time := quickest(points, gap)) is not None}
+    best = min(times, key=lambda method: times[method])
+    ratio = ms / times[best]
+    chosen = next(row["chosen"] for row in rows if row["method"] == DEFAULT)
+    line = [name.partition(".")[0].partition("/")[0], f"{level}", f"{start['vertices']:,}", f"{gap:.2%}", f"{ms:.0f}"]
+    return [*line, f"{best}, {times[best]:.0f} ms", f"{ratio:.2f}", chosen], ratio <= TOLERANCE
+
+
+if __name__ == "__main__":
+    main()

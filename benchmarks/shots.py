@@ -1,0 +1,59 @@
+"""Sample shots opened for a benchmark, and what of contact is measured beside the report's own figures."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from physgraph_usd.chart.problem import Problem, plain_detail
+from physgraph_usd.colliders.sign import signed_distances
+from physgraph_usd.samples import write_sample
+from physgraph_usd.scene import Frame
+from physgraph_usd.usd.reader import Shot, open_shot
+
+CORES = os.cpu_count() or 1
+NEAR = 0.02
+"""Distance from a body up to which distances are asked for [m]."""
+
+
+def opened(name: str, level: int | None = None, garments: Sequence[str] = ()) -> Shot:
+    """A sample, opened.
+
+    Args:
+        name: One of the samples.
+        level: Subdivisions, or None for the sample's own.
+        garments: Prim paths to refine, or all.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return open_shot(str(write_sample(name, Path(folder))), level=level, garments=garments)
+
+
+def problem_of(shot: Shot, dtype: torch.dtype = torch.float32) -> Problem:
+    """The shot's frames, to be solved in any way."""
+    levels = [garment.level for garment in shot.scene.garments]
+    return Problem(shot.scene, levels, device="cpu", lanes=CORES, dtype=dtype)
+
+
+def frames_of(shot: Shot, times: Sequence[float]) -> list[Frame]:
+    """Frames without an artist's gain."""
+    return [plain_detail(shot.frame(time)) for time in times]
+
+
+def distances(problem: Problem, frame: Frame, points: Sequence[np.ndarray]) -> np.ndarray:
+    """Distance of each fine vertex from the nearest body [m], negative inside; a lower bound beyond `NEAR`."""
+    refiner, found = problem.refiner, []
+    for part in refiner.parts_of(frame):
+        level = refiner.group_of(part).levels[-1]
+        world = np.concatenate([points[index] for index in part])
+        nearest = np.full(len(world), np.inf)
+        for each in refiner.touching(part, frame):
+            x = torch.as_tensor(world - each.surface.origin, dtype=torch.float32)
+            own = signed_distances(each.surface, x, level.edges, reach=NEAR)
+            nearest = np.minimum(nearest, own.double().numpy())
+        found.append(nearest)
+    return np.concatenate(found)

@@ -1,0 +1,82 @@
+"""What `auto` chooses, that it says so, and that what it chooses is what the named methods do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from cloth import frame_of, refiner_of, sheet, solved, wave
+from folds import frame_with, named, refiner_with, square
+from sheets import garment_of
+
+from physgraph_usd.integrate.choice import LONGER, Choice, choose
+from physgraph_usd.options import RefineOptions
+
+
+@dataclass
+class Seen:
+    """Contact where cloth lies near cloth or not."""
+
+    crowded: bool
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_a_method_that_says_how_is_taken_at_its_word(nested: bool):
+    assert choose(nested, 1, Seen(True)) == Choice(nested)
+    assert choose(nested, 1, None, warm=True) == Choice(False)
+
+
+@pytest.mark.parametrize(
+    ("subdivisions", "contact", "nested"),
+    [(0, None, True), (1, None, False), (1, Seen(False), False), (1, Seen(True), True), (2, None, True)],
+)
+def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart(
+    subdivisions: int, contact: Seen | None, nested: bool
+):
+    found = choose(None, subdivisions, contact)
+    assert found.nested == nested
+    assert found.steps == (1 if nested else LONGER)
+    assert found.reason
+
+
+def test_refine_leaves_it_open():
+    assert RefineOptions().solve_settings().method.nested is None
+
+
+@pytest.mark.parametrize(("level", "same", "steps"), [(1, "quasi-newton-flat", 12 * LONGER), (2, "quasi-newton", 12)])
+def test_auto_is_what_it_chose_to_the_bit(level: int, same: str, steps: int):
+    mesh, rest = sheet(8, 6)
+    points = wave(rest)
+    auto = solved(mesh, rest, points, level=level, integrator="auto", tolerance=0.0)
+    other = solved(mesh, rest, points, level=level, integrator=same, steps=steps, tolerance=0.0)
+    assert np.array_equal(auto.points[0], other.points[0])
+    assert auto.telemetry[0]["chosen"].startswith("the finest level alone" if level == 1 else "level by level")
+    assert "chosen" not in other.telemetry[0]
+    assert [each["level"] for each in auto.telemetry[0]["levels"]] == ([1] if level == 1 else [0, 1, 2])
+
+
+def test_cloth_near_cloth_goes_through_the_cage_and_is_solved_as_if_never_asked():
+    lower, upper = square(8), square(8)
+    tilted = upper[1] + np.outer(0.3 * upper[1][:, 0] + 0.003, [0.0, 1.0, 0.0])
+    garments = [named(lower, "A"), named(upper, "B")]
+    for place in (tilted, upper[1] + [0.0, 0.0005, 0.0]):
+        auto, asked = (
+            refiner_with(garments, integrator=name).solve(frame_with([lower[1], place]))
+            for name in ("auto", "quasi-newton")
+        )
+        assert auto.telemetry[0]["chosen"] == "level by level: cloth lies near cloth"
+        for one, other in zip(auto.points, asked.points, strict=True):
+            np.testing.assert_array_equal(one, other)
+    far = refiner_with(garments, integrator="auto").solve(frame_with([lower[1], upper[1] + [0.0, 0.02, 0.0]]))
+    assert far.telemetry[0]["chosen"].startswith("the finest level alone")
+
+
+def test_a_warm_frame_chooses_nothing():
+    mesh, rest = sheet(8, 6)
+    refiner = refiner_of([garment_of(mesh, rest)], times=(0.0, 1.0), integrator="auto")
+    cold, warm = (refiner.solve(frame_of(wave(rest, phase=0.01 * t), t)) for t in (0.0, 1.0))
+    assert "chosen" in cold.telemetry[0]
+    assert warm.telemetry[0]["start"] == "warm"
+    assert "chosen" not in warm.telemetry[0]
+    assert warm.telemetry[0]["levels"][-1]["steps"] <= 12
