@@ -308,7 +308,8 @@ class Group:
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
         """Walk the levels; a warm start goes straight to the finest. Also says why, where there was a choice."""
         subdivisions, warm = len(self.levels) - 1, predicted is not None
-        choice = choose(self._settings.method.nested, subdivisions, contact, warm=warm)
+        choice = choose(self._settings.method.nested, subdivisions, contact, warm=warm, device=self.levels[0].device)
+        self._integrator = choice.integrator(self._settings.method.build)
         first = 0 if choice.nested else subdivisions
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
@@ -350,7 +351,7 @@ class Group:
                 ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing, level=level
             )
 
-        integrator = self._settings.method.build()
+        integrator = self._integrator
         if view is None:
             x = leave_saddle(system((), x), level, x, outward=self._outward) if cold else x
             x, report = solve_level(system((), x), integrator, x, level=level.index, budget=budget)

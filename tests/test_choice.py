@@ -11,6 +11,7 @@ from folds import frame_with, named, refiner_with, square
 from sheets import garment_of
 
 from physgraph_usd.integrate.choice import LONGER, Choice, choose
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.options import RefineOptions
 
 
@@ -38,6 +39,17 @@ def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart
     assert found.nested == nested
     assert found.steps == (1 if nested else LONGER)
     assert found.reason
+
+
+@pytest.mark.parametrize(("device", "contact", "learned"), [("cpu", None, False), ("cuda", None, True)])
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_network_makes_the_steps_on_cuda(device: str, contact: Seen | None, learned: bool, warm: bool):
+    found = choose(None, 2, contact, warm=warm, device=device)
+    assert found.learned == learned
+    assert ("physgraph" in found.reason) == learned
+    assert found.integrator(QuasiNewton).name == ("physgraph" if learned else "quasi-newton")
+    assert not choose(None, 2, Seen(True), warm=warm, device=device).learned
+    assert not choose(True, 2, contact, warm=warm, device=device).learned
 
 
 def test_refine_leaves_it_open():

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from cloth import FABRIC, GUIDE, group_of, sheet, wave
@@ -53,29 +52,29 @@ def test_s8_stiffness_over_six_decades(stretch: float, bend: float) -> None:
     """Ten steps come as far as quasi-Newton's do, or nearly, and never uphill."""
     mesh, rest = sheet(8, 6)
     fabric = replace(FABRIC, stretch=stretch * FABRIC.stretch, bend=bend * FABRIC.bend)
-    energies = {}
+    drops = {}
     for name in ("quasi-newton", "physgraph"):
         group = group_of(mesh, rest, level=2, dtype=torch.float32)
         systems, coarse = group.systems([GarmentFrame(wave(rest), fabric, GUIDE)])
         x = group.levels[-1].base.apply(coarse)
         _, report = solve_level(systems[-1], METHODS[name].build(), x, level=2, budget=Budget(10))
-        assert report.energy_after <= report.energy_before
-        energies[name] = report.energy_after
-    drop = report.energy_before - np.array(list(energies.values()))
-    assert drop[1] > 0.8 * drop[0]
+        drops[name] = report.energy_before - report.energy_after
+    assert drops["physgraph"] >= 0
+    assert drops["physgraph"] > 0.8 * drops["quasi-newton"]
 
 
 @pytest.mark.parametrize("level", [1, 2, 3, pytest.param(4, marks=pytest.mark.slow)])
 def test_levels_one_to_four(level: int) -> None:
     mesh, rest = sheet(8, 6, kind="quads")
-    energies = {}
+    group = group_of(mesh, rest, level=level, dtype=torch.float32)
+    systems, coarse = group.systems([GarmentFrame(wave(rest), FABRIC, GUIDE)])
+    start = systems[-1].energy_and_force(group.levels[-1].base.apply(coarse))[0]
+    drops = {}
     for name in ("quasi-newton", "physgraph"):
-        group = group_of(mesh, rest, level=level, dtype=torch.float32)
-        systems, coarse = group.systems([GarmentFrame(wave(rest), FABRIC, GUIDE)])
-        x = group.levels[0].base.apply(coarse)
+        x, energy = group.levels[0].base.apply(coarse), start
         for index, (one, system) in enumerate(zip(group.levels, systems, strict=True)):
             x = x if one.from_below is None else one.from_below.apply(x)
             x, report = solve_level(system, METHODS[name].build(), x, level=index, budget=Budget(10))
-        energies[name] = report.energy_after
-    start = systems[-1].energy_and_force(group.levels[-1].base.apply(coarse))[0]
-    assert start - energies["physgraph"] > 0.98 * (start - energies["quasi-newton"])
+            energy = report.energy_after
+        drops[name] = start - energy
+    assert drops["physgraph"] > 0.98 * drops["quasi-newton"]

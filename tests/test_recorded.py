@@ -21,11 +21,11 @@ def problem() -> tuple[System, torch.Tensor]:
     return finest_system(group_of(mesh, rest, level=2, dtype=torch.float32), wave(rest))
 
 
-def recorded(network: Physgraph, system: System) -> LearnedMetric:
-    """An integrator that records although it is not on CUDA: it then runs a step's kernels one by one."""
-    integrator = LearnedMetric(network)
-    integrator.records = lambda _: True
-    return integrator
+class Recorder(LearnedMetric):
+    """Records although it is not on CUDA: it then runs a step's kernels one by one."""
+
+    def records(self, system: System) -> bool:
+        return True
 
 
 @pytest.mark.parametrize("config", [LOCAL, ALL])
@@ -33,7 +33,7 @@ def test_recorded_steps_are_the_same_steps(config: PhysgraphConfig):
     system, x = problem()
     network = random_network(config, seed=3, scale=0.1)
     assert isinstance(network, Physgraph)
-    one, other = LearnedMetric(network), recorded(network, system)
+    one, other = LearnedMetric(network), Recorder(network)
     a, b = one.start(system, x), other.start(system, x)
     assert isinstance(b.memory, Place)
     before = (system.evaluations, system.metric_solves)
@@ -48,7 +48,7 @@ def test_a_carry_of_the_past_is_stepped_from_where_it_was():
     system, x = problem()
     network = random_network(LOCAL, seed=3, scale=0.1)
     assert isinstance(network, Physgraph)
-    integrator = recorded(network, system)
+    integrator = Recorder(network)
     start = integrator.start(system, x)
     first = integrator.step(system, start)
     kept = first.x.clone()
@@ -62,7 +62,7 @@ def test_resuming_keeps_the_memory():
     system, x = problem()
     network = random_network(LOCAL, seed=3, scale=0.1)
     assert isinstance(network, Physgraph)
-    one, other = LearnedMetric(network), recorded(network, system)
+    one, other = LearnedMetric(network), Recorder(network)
     a, b = one.start(system, x), other.start(system, x)
     for _ in range(3):
         a, b = one.step(system, a), other.step(system, b)

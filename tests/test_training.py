@@ -104,7 +104,9 @@ def test_patches_side_by_side_move_as_they_do_alone(patches: list[Patch], config
     together = integrator.start(system, x)
     for _ in range(3):
         together = integrator.step(system, together)
-    for number, (patch, span) in enumerate(zip(patches, system.level.spans, strict=True)):
+    assert system.level is not None
+    spans = system.level.spans
+    for number, (patch, span) in enumerate(zip(patches, spans, strict=True)):
         carry = integrator.start(patch.systems[-1], x[span])
         for _ in range(3):
             carry = integrator.step(patch.systems[-1], carry)

@@ -1,15 +1,25 @@
-"""Whether a cold frame goes through its coarse levels: what ``auto``, refine's default, decides frame by frame.
+"""What ``auto``, refine's default, decides frame by frame: the levels of a cold frame, and the integrator.
 
 Coarse levels are cheap and carry folds far, but each has a start of its own. Under one subdivision lies one coarse
 level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where cloth lies near
 cloth: who lies above whom is settled at the cage. `python -m benchmarks.front` measures it, and docs/chart.md has the
 table. What starts from the last frame's detail starts at the finest level in any case.
+
+On CUDA the network's step costs less than quasi-Newton's and goes further (docs/learned.md, `python -m
+benchmarks.learned --device cuda`); on the CPU it costs more than it gains. Where cloth presses on cloth the guard
+rejects most of its steps, so there quasi-Newton makes them everywhere.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
+
+from .base import Integrator
+from .guard import Guard
+from .learned import integrator_of
+from .weights import shipped_network
 
 LONGER = 4
 """Steps of the finest level alone over those that it takes after coarse ones."""
@@ -23,11 +33,17 @@ class Choice:
         nested: Coarse levels first; otherwise the finest level only.
         steps: Steps at the finest level, over those that were asked for.
         reason: Why, or "" where nothing was left to choose.
+        learned: Whether the network makes the steps, not quasi-Newton.
     """
 
     nested: bool
     steps: int = 1
     reason: str = ""
+    learned: bool = False
+
+    def integrator(self, asked: Callable[[], Integrator]) -> Integrator:
+        """The integrator: the network's, or what the method builds."""
+        return Guard(integrator_of(shipped_network("physgraph"))) if self.learned else asked()
 
 
 class Crowd(Protocol):
@@ -39,7 +55,9 @@ class Crowd(Protocol):
         ...
 
 
-def choose(nested: bool | None, subdivisions: int, contact: Crowd | None, *, warm: bool = False) -> Choice:
+def choose(
+    nested: bool | None, subdivisions: int, contact: Crowd | None, *, warm: bool = False, device: str = "cpu"
+) -> Choice:
     """Choose for one frame.
 
     Args:
@@ -47,11 +65,17 @@ def choose(nested: bool | None, subdivisions: int, contact: Crowd | None, *, war
         subdivisions: Number of levels above the cage.
         contact: The frame's contact, or None when nothing can touch; asked only where it matters.
         warm: Whether the frame starts from the last one's detail.
+        device: Where the frame is solved.
     """
-    if warm or nested is not None:
-        return Choice(bool(nested) and not warm)
+    if nested is not None:
+        return Choice(nested and not warm)
+    learned = device != "cpu" and (contact is None or not contact.crowded)
+    who = "; physgraph, the quicker one on CUDA" if learned else ""
+    if warm:
+        return Choice(False, reason=who.removeprefix("; "), learned=learned)
     if subdivisions != 1:
-        return Choice(True, reason=f"level by level: {subdivisions} subdivisions")
+        return Choice(True, reason=f"level by level: {subdivisions} subdivisions{who}", learned=learned)
     if contact is not None and contact.crowded:
         return Choice(True, reason="level by level: cloth lies near cloth")
-    return Choice(False, LONGER, "the finest level alone: one subdivision, and no cloth lies near cloth")
+    reason = f"the finest level alone: one subdivision, and no cloth lies near cloth{who}"
+    return Choice(False, LONGER, reason, learned)

@@ -19,6 +19,7 @@ The factorisation is multifrontal (Duff and Reid 1983), on the CPU in float64; b
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportIndexIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ combines; `tests/test_learned.py` holds them against `network.Physgraph`. The sa
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 from __future__ import annotations
 
 import functools
@@ -85,11 +85,10 @@ class FusedPhysgraph:
         normal, strain = (wp.zeros(1, dtype=t, device=device) for t in (wp.vec3f, wp.mat33f))
         shared = [vertices, flat, *which, spacing, normal, strain]
         given = {"device": device, "lanes": lanes}
-        see, combine = kernels(self.count, config.means)
         seen = [wp.from_torch(self._squares), wp.from_torch(self._cosines), vectors(self._scaled.reshape(-1, 3))]
-        self._see = Launch(see, vertices, [*shared, *seen], **given)
+        self._see = Launch(seeing(self.count, config.means), vertices, [*shared, *seen], **given)
         ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
-        self._combine = Launch(combine, vertices, [*shared, *ends], **given)
+        self._combine = Launch(combining(self.count), vertices, [*shared, *ends], **given)
 
     def __call__(
         self,
@@ -166,12 +165,12 @@ def part_of(s: wp.vec3f, kind: wp.int32, i: wp.int32, normal: wp.array(dtype=wp.
 
 
 @functools.cache
-def kernels(count: int, means: bool) -> tuple[wp.Kernel, wp.Kernel]:
-    """The kernels for so many vectors: features of each vertex, and the vectors' combination.
+def seeing(count: int, means: bool) -> wp.Kernel:
+    """The kernel that finds the features of each vertex.
 
     Args:
         count: Number of vectors.
-        means: Whether the first keeps the vectors in local edge lengths, for the garments' means.
+        means: Whether it keeps the vectors in local edge lengths, for the garments' means.
     """
     rows = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
     floor = FLOOR**2
@@ -209,6 +208,13 @@ def kernels(count: int, means: bool) -> tuple[wp.Kernel, wp.Kernel]:
                 cosines[i, row] = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
                 row = row + 1
 
+    return see
+
+
+@functools.cache
+def combining(count: int) -> wp.Kernel:
+    """The kernel that combines so many vectors."""
+
     @wp.kernel(module="unique")
     def combine(
         first: wp.int32,
@@ -232,4 +238,4 @@ def kernels(count: int, means: bool) -> tuple[wp.Kernel, wp.Kernel]:
             move = move * (most / far)
         out[i] = move
 
-    return see, combine
+    return combine

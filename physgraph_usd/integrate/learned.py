@@ -95,10 +95,10 @@ class LearnedMetric:
         energy, force = system.energy_and_force(carry.x)
         image = system.apply_metric_inverse(force)
         if isinstance(carry.memory, Place):
-            old, recording = carry.memory.recording, self._recorded(system)
+            before, recording = carry.memory.recording, self._recorded(system)
             assert recording is not None
-            if recording is not old:
-                recording.take_over(old)
+            if recording is not before:
+                recording.take_over(before)
             return recording.go_on(carry.x, energy, force, image)
         old: _Memory = carry.memory
         memory = replace(old, images=(image, *old.images[1:]), forces=(force, *old.forces[1:]))

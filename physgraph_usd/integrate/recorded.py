@@ -12,7 +12,7 @@ a garment and one more product replace the two loops of `learned.secant_directio
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false, reportReturnType=false
 from __future__ import annotations
 
 import gc
