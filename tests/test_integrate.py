@@ -13,7 +13,7 @@ from cloth import finest_system, group_of, sheet, wave
 
 from physgraph_usd.errors import SolveError, UsageError
 from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.integrate import METHODS, method_named
+from physgraph_usd.integrate import LEARNED, METHODS, method_named
 from physgraph_usd.integrate.base import Carry, ForceField, Integrator, System
 from physgraph_usd.integrate.metric import REGULARISATION, Metric, kept_to_edges
 from physgraph_usd.integrate.newton import Newton
@@ -219,7 +219,7 @@ class TestQuasiNewton:
         assert all(after <= before for before, after in pairwise(seen))
         assert seen[-1] < seen[0]
 
-    @pytest.mark.parametrize("name", [name for name in METHODS if name != "physgraph-paper"])  # that one needs a mesh
+    @pytest.mark.parametrize("name", [name for name in METHODS if name not in LEARNED])  # those need a mesh
     def test_fixed_vertices_never_move(self, name: str):
         system = system_of(spd(12, 9.0), metric=np.eye(12), fixed=(0, 5))
         x = start(12)
