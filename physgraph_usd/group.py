@@ -15,7 +15,7 @@ from torch import Tensor
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.rounds import UNTANGLINGS, WARM_UNTANGLINGS, solve_rounds, untangle
+from .contact.rounds import UNSETTLED, UNTANGLINGS, WARM_UNTANGLINGS, solve_apart, solve_rounds, untangle
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset, Solved
@@ -39,9 +39,6 @@ TORN = 0.5
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.25, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
-UNSETTLED = 0.1
-"""Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
-pinched between bodies cannot settle and holds up the steps of all the rest."""
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
 """Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
 
@@ -366,8 +363,8 @@ class Group:
         if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
             held = torch.stack([term.near(level) for term in touched]).any(dim=0)
             apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing, level=level)
-            x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
-            made.append(report)
+            x, more = solve_apart(apart, integrator, x, level=level.index, budget=budget)
+            made += more
         return x, made, touched
 
     def _budget(self, index: int, count: int, clock: float) -> Budget:

@@ -81,12 +81,13 @@ class _Track:
         if not len(which):
             return which, x[which], moved[which]
         asked = x[which] + self.shift
-        found = self.surface.closest(asked, torch.full_like(moved[which], float("inf")))
+        limit = self._limit(which, within[which], moved[which])
+        found = self.surface.closest(asked, limit)
         sign = self._signs(which, found, asked, moved[which])
-        self.at[which], self.known[which] = x[which], found.distance * sign
+        self.at[which], self.known[which] = x[which], torch.minimum(found.distance, limit) * sign
         distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
         within = torch.nonzero(sign < 0).squeeze(1)
-        kept = torch.ones_like(sign, dtype=torch.bool)
+        kept = distance.isfinite()
         if len(within):
             near = _at(found, within)
             way = self.surface.exit(asked[within], near)
@@ -97,6 +98,12 @@ class _Track:
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
         normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
         return which[kept], normal[kept], (distance * sign)[kept]
+
+    def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
+        """How far to look for the surface: what is farther away outside is known well enough by that bound."""
+        limit = torch.maximum(within + self.longest, MARGIN * moved)
+        everywhere = torch.full_like(limit, float("inf"))
+        return everywhere if self.surface.certain else torch.where(self.known[which] < 0, everywhere, limit)
 
     def _outward(self, which: Tensor) -> Tensor:
         """1 where a face's normal points away from the body, -1 where the start side is the other one."""
@@ -111,8 +118,8 @@ class _Track:
             return found.side
         known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
         may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
-        ask = may_have_crossed & (found.side != known)
-        sign = known.clone()
+        sign = torch.where(may_have_crossed & (found.side != 0), found.side, known)
+        ask = may_have_crossed & (found.side == 0)
         if bool(ask.any()):
             sign[ask] = 1.0 - 2.0 * self.surface.inside(asked[ask]).to(sign)
         return sign

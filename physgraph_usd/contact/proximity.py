@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from ..mesh.piercing import passes_through
+
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
 IN_PLANE = 0.5
@@ -207,36 +209,6 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
                 down = g
                 below[i] = wp.vec2f(s, t)
     other[i] = wp.vec2i(up, down)
-
-
-@wp.func
-def volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Six times the signed volume of a tetrahedron."""
-    return wp.dot(b - a, wp.cross(c - a, d - a))
-
-
-@wp.func
-def wide(v: wp.vec3f):
-    """The same in double precision."""
-    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-
-
-@wp.func
-def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int32):
-    """Whether the line from p to q passes an edge on its left; of two faces at a side just one has it on its left."""
-    low, high = wp.min(p, q), wp.max(p, q)
-    left = volume(wide(x[e[0]]), wide(x[e[1]]), wide(x[low]), wide(x[high])) >= wp.float64(0.0)
-    return left == (p < q)
-
-
-@wp.func
-def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces."""
-    p, q, r = wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])
-    if volume(p, q, r, wide(x[e[0]])) * volume(p, q, r, wide(x[e[1]])) >= wp.float64(0.0):
-        return False
-    first = turns_left(x, e, t[0], t[1])
-    return turns_left(x, e, t[1], t[2]) == first and turns_left(x, e, t[2], t[0]) == first
 
 
 @wp.kernel

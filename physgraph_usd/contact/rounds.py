@@ -15,6 +15,7 @@ from torch import Tensor
 from ..integrate.base import Carry, Integrator, System
 from ..integrate.solve import Budget, LevelReport, solve_level
 from .frame import LevelContact, Touch
+from .metric import HeldMetric
 
 UNTANGLINGS = 25
 """Most rounds that draw out what crosses from cold, at the cage."""
@@ -22,6 +23,9 @@ WARM_UNTANGLINGS = 4
 """The same in a frame that starts from the last one's detail, at the finest level."""
 STEPS = 4
 """Steps of each of them."""
+UNSETTLED = 0.2
+"""Remaining move, in edge lengths, above which the cloth away from what touches is solved once more by itself: cloth
+pinched between bodies cannot settle and holds up the steps of all the rest."""
 
 
 def untangle(
@@ -92,6 +96,8 @@ def solve_rounds(
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
             resume=kept[-1] if last is not None and system.shares_metric(last) else None,
         )
+        if isinstance(system.metric, HeldMetric):
+            report.remaining_move = system.remaining_move(system.metric.smooth(kept[-1].force))
         last = system
         reports.append(report)
         left -= report.steps
@@ -104,3 +110,26 @@ def solve_rounds(
             left = share
         elif report.steps == 0:
             return x, reports, terms
+
+
+def solve_apart(
+    apart: System, integrator: Integrator, x: Float[Tensor, "vertices 3"], *, level: int, budget: Budget
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
+    """Solve the cloth away from what touches, where it has not settled; what touches stays.
+
+    Args:
+        apart: The level's system without contact, in which what is near something may not move.
+        integrator: Any integrator.
+        x: Start positions [m].
+        level: Index for the report.
+        budget: When to stop.
+
+    Returns:
+        Final positions [m], x itself where the rest has settled, and the report if there is one.
+    """
+    force = apart.energy_and_force(x)[1]
+
+    if apart.remaining_move(apart.apply_metric_inverse(force)) <= UNSETTLED:
+        return x, []
+    x, report = solve_level(apart, integrator, x, level=level, budget=budget)
+    return x, [report]
