@@ -44,13 +44,13 @@ class LevelContact:
     _held: HeldMetric | None = None
 
     def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric | HeldMetric:
-        """The metric of a level whose cloth is held by what touches at x [m]; the same one while it lacks little."""
+        """The metric of a level whose cloth is held by what touches at x [m]; the same one while it serves."""
         if not terms:
             return plain
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
         if self._held is None:
             self._held = HeldMetric(plain, stiff)
-        elif not self._held.lacks_little(stiff):
+        elif not self._held.serves(stiff, tangled=self.tangled):
             self._held = HeldMetric(plain, torch.maximum(stiff, self._held.stiff))
         return self._held
 

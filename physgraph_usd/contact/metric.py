@@ -22,11 +22,12 @@ from torch import Tensor
 
 from ..integrate.metric import Metric
 
-ROUGH = 10.0
+ROUGH = 20.0
 """Weight of the diagonal's answer."""
-MISSING = 0.5
-"""Part of the stiffness of what touches that a metric may lack before it is made anew. What it has too much does no
-harm: what touched once in a level's rounds touches again, and a new metric drops what was learned of the curvature."""
+MISSING, MISSING_TANGLED = 0.9, 0.3
+"""Part of the stiffness of what touches that a metric may lack before it is made anew, and the same while cloth crosses
+cloth and what pushes changes sides. What it has too much does no harm: what touched once in a level's rounds touches
+again; and a new metric costs a factor and drops what was learned of the curvature."""
 REFACTORED = 60_000
 """Vertices up to which a level's factor takes up the stiffness of what touches."""
 
@@ -45,9 +46,10 @@ class HeldMetric:
         self._smooth = plain.plus(stiff) if len(stiff) <= REFACTORED else plain
         self._rough = (ROUGH / (plain.diagonal.to(stiff) + stiff)).unsqueeze(1)
 
-    def lacks_little(self, stiff: Float[Tensor, " vertices"]) -> bool:
-        """Whether it holds most of another stiffness [N/m]."""
-        return float((stiff - self.stiff).clamp_min(0.0).sum()) <= MISSING * float(stiff.sum())
+    def serves(self, stiff: Float[Tensor, " vertices"], *, tangled: bool = False) -> bool:
+        """Whether it holds enough of another stiffness [N/m]."""
+        most = MISSING_TANGLED if tangled else MISSING
+        return float((stiff - self.stiff).clamp_min(0.0).sum()) <= most * float(stiff.sum())
 
     @property
     def diagonal(self) -> Float[Tensor, " vertices"]:

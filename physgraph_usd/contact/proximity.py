@@ -5,7 +5,7 @@ edge. Parts that share a corner, or are one edge apart, are no pairs.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false
 from __future__ import annotations
 
 import warp as wp
@@ -269,3 +269,71 @@ def patches_meet(
             if not is_beside(i, j, starts, near):
                 found = 1
     flag[i] = found
+
+
+@wp.func
+def area_of(x: wp.array(dtype=wp.vec3f), t: wp.vec3i):
+    """Twice the area of a triangle along its normal."""
+    return wp.cross(x[t[1]] - x[t[0]], x[t[2]] - x[t[0]])
+
+
+@wp.kernel
+def patch_areas(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    members: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    x: wp.array(dtype=wp.vec3f),
+    total: wp.array(dtype=wp.vec3f),
+):
+    """The area of each patch's triangles together, along their normals."""
+    i = first + wp.tid()
+    out = wp.vec3f(0.0)
+    for k in range(starts[i], starts[i + 1]):
+        out += area_of(x, triangles[members[k]])
+    total[i] = out
+
+
+@wp.kernel
+def rings_turn(
+    first: wp.int32,
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    starts: wp.array(dtype=wp.int32),
+    members: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    x: wp.array(dtype=wp.vec3f),
+    total: wp.array(dtype=wp.vec3f),
+    least: wp.float32,
+    turns: wp.array(dtype=wp.int32),
+):
+    """Whether a triangle of the ring of patches round each is farther from the ring's mean normal than a cosine."""
+    i = first + wp.tid()
+    mean = wp.vec3f(0.0)
+    for k in range(ring_starts[i], ring_starts[i + 1]):
+        mean += total[ring[k]]
+    mean = wp.normalize(mean)
+    found = wp.int32(0)
+    for k in range(ring_starts[i], ring_starts[i + 1]):
+        for m in range(starts[ring[k]], starts[ring[k] + 1]):
+            if found == 0:
+                area = area_of(x, triangles[members[m]])
+                if wp.dot(area, mean) <= least * wp.length(area):
+                    found = 1
+    turns[i] = found
+
+
+@wp.kernel
+def any_of_ring(
+    first: wp.int32,
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    flag: wp.array(dtype=wp.int32),
+    out: wp.array(dtype=wp.int32),
+):
+    """Whether a patch of the ring round each is flagged."""
+    i = first + wp.tid()
+    found = wp.int32(0)
+    for k in range(ring_starts[i], ring_starts[i + 1]):
+        found = wp.max(found, flag[ring[k]])
+    out[i] = found
