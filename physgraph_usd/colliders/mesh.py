@@ -114,6 +114,7 @@ class MeshSurface:
         self._asked: Tensor | None = None
         self._buried: Tensor | None = None
         self._overlaps: Tensor | None = None
+        self._up: Tensor | None = None
         self._skin: tuple[wp.Mesh, Tensor] | None = None
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
@@ -122,7 +123,7 @@ class MeshSurface:
         """Move the surface to another pose of the same topology."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
         self.mesh.refit()
-        self._buried, self._overlaps, self._skin = None, None, None
+        self._buried, self._overlaps, self._up, self._skin = None, None, None, None
 
     def _place(self, pose: MeshPose) -> np.ndarray:
         """Recentre a pose; vertices that no face uses are put on one that a face does."""
@@ -213,6 +214,13 @@ class MeshSurface:
         """Whether points just above vertices are inside."""
         if not len(vertices):
             return torch.zeros(0, dtype=torch.bool, device=vertices.device)
+        if self._up is None:
+            self._up = self._normals()
+        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
+        return self.inside(wp.to_torch(self.mesh.points)[vertices] + lift * self._up[vertices])
+
+    def _normals(self) -> Float[Tensor, "vertices 3"]:
+        """Unit normals of the vertices."""
         points = wp.to_torch(self.mesh.points)
         a, b, c = (points[self._corners[:, corner]] for corner in range(3))
         area = torch.linalg.cross(b - a, c - a)
@@ -220,9 +228,7 @@ class MeshSurface:
         normal = torch.zeros_like(points)
         for corner in range(3):
             normal.index_put_((self._corners[:, corner],), area, accumulate=True)
-        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
-        up = torch.nn.functional.normalize(normal[vertices], dim=1, eps=1e-30)
-        return self.inside(points[vertices] + lift * up)
+        return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
     def _bare(self) -> tuple[wp.Mesh, Tensor] | None:
         """The faces that lie bare and their numbers; None when there are none."""

@@ -1,13 +1,13 @@
 """The preconditioner of cloth that something touches.
 
-    P = (H0 + K)^-1 + w (D + K)^-1
+    P = s (H0 + K)^-1 + w (D + K)^-1
 
 | symbol | meaning |
 |---|---|
 | H0 | the level's metric |
 | K | stiffness of what touches, a diagonal: three times its mean over directions, since a plane holds in one of them |
 | D | the diagonal of H0 |
-| w | `ROUGH` |
+| s, w | `SMOOTH`, `ROUGH`: about so much that a first step needs no shortening |
 
 H0 answers smooth moves well and rough ones as cloth at rest would. What touches leaves rough errors: planes that turn
 from vertex to vertex, cloth that was pushed out. The diagonal answers those, so few steps get far. Above `REFACTORED`
@@ -22,8 +22,8 @@ from torch import Tensor
 
 from ..integrate.metric import Metric
 
-ROUGH = 20.0
-"""Weight of the diagonal's answer."""
+SMOOTH, ROUGH = 0.1, 2.0
+"""Weights of the two answers."""
 MISSING, MISSING_TANGLED = 0.9, 0.3
 """Part of the stiffness of what touches that a metric may lack before it is made anew, and the same while cloth crosses
 cloth and what pushes changes sides. What it has too much does no harm: what touched once in a level's rounds touches
@@ -58,7 +58,7 @@ class HeldMetric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """P F [m]; zero where a vertex may not move, provided that the force is."""
-        return torch.addcmul(self._smooth.solve(force), self._rough, force)
+        return torch.addcmul(SMOOTH * self._smooth.solve(force), self._rough, force)
 
     def smooth(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """(H0 + K)^-1 F [m], by which the remaining move is judged."""

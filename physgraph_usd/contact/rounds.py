@@ -18,7 +18,7 @@ from ..integrate.base import Carry, Integrator, System
 from ..integrate.solve import Budget, LevelReport, solve_level
 from ..level import Level
 from .frame import LevelContact, Touch
-from .metric import HeldMetric
+from .metric import SMOOTH, HeldMetric
 
 UNTANGLINGS = 25
 """Most rounds that draw out what crosses from cold, at the cage."""
@@ -136,7 +136,7 @@ def solve_rounds(
             integrator,
             x,
             level=level,
-            budget=replace(budget, steps=min(left, share) if terms else left),
+            budget=_round_of(budget, system, min(left, share) if terms else left),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
             resume=kept[-1] if last is not None and system.shares_metric(last) else None,
         )
@@ -154,6 +154,12 @@ def solve_rounds(
             left = share
         elif report.steps == 0:
             return x, reports, terms
+
+
+def _round_of(budget: Budget, system: System, steps: int) -> Budget:
+    """The budget of a round: what a held metric calls a small move is that much smaller."""
+    shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
+    return replace(budget, steps=steps, tolerance=shrunk * budget.tolerance)
 
 
 def finish_rounds(
