@@ -15,14 +15,13 @@ from torch import Tensor
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.rounds import UNTANGLINGS, WARM_UNTANGLINGS, solve_rounds, untangle
+from .contact.rounds import UNTANGLINGS, WARM_UNTANGLINGS, crowded, finish_rounds, solve_rounds, untangle
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
-from .forces.self_contact import SelfContact
 from .integrate import Method
 from .integrate.base import System
 from .integrate.choice import choose
@@ -40,9 +39,6 @@ TORN = 0.5
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.25, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
-UNSETTLED = 0.1
-"""Remaining move, in edge lengths, above which the cloth away from the bodies is solved once more by itself: cloth
-pinched between bodies cannot settle and holds up the steps of all the rest."""
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
 """Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
 
@@ -361,17 +357,17 @@ class Group:
         x, freed, touched = untangle(system, integrator, x, view=view, level=level.index, budget=budget, most=most)
         x = leave_saddle(system(touched, x), level, x, outward=self._outward) if cold else x
         # A warm frame has no coarse levels that settle contact before; cloth on cloth settles slowly.
-        finest = level is self.levels[-1] and (not cold or any(isinstance(t, SelfContact) for t in touched))
+        finest = level is self.levels[-1] and (not cold or crowded(touched, x))
         share = budget.steps if finest else None
         x, made, touched = solve_rounds(
             system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, share=share
         )
         made = freed + made
-        if touched and level is self.levels[-1] and made[-1].remaining_move > UNSETTLED:
-            held = torch.stack([term.near(level) for term in touched]).any(dim=0)
-            apart = System(terms, metric, free=level.free & ~held, spacing=level.spacing, level=level)
-            x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
-            made.append(report)
+        if level is self.levels[-1]:
+            x, more = finish_rounds(
+                system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
+            )
+            made += more
         return x, made, touched
 
     def _budget(self, index: int, clock: float, *, more: int) -> Budget:

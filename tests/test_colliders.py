@@ -71,6 +71,32 @@ class TestMeshes:
         none = torch.zeros((0, 2), dtype=torch.int32)
         assert (signed_distances(surface, x, none, reach=1.0) > 0).tolist() == [True, True, True, False]
 
+    def test_a_side_that_is_told_is_the_winding_numbers(self):
+        """A small box pokes through the middle of a large face, no corner of which is inside it."""
+        points, triangles = box((0.06, 0.05, 0.05))
+        soup = together(box((0.4, 0.4, 0.4)), (points + np.array([0.22, 0.05, 0.03]), triangles))
+        (surface,) = surfaces(soup)
+        x = around(soup, 4000)
+        x[:2000] = np.array([0.2, 0.05, 0.03]) + 0.05 * np.random.default_rng(5).normal(size=(2000, 3))
+        asked = torch.as_tensor(x - surface.origin)
+        told = surface.closest(asked, endless(len(x))).side
+        inside = surface.inside(asked)
+        assert bool(((told < 0) == inside)[told != 0].all())
+        assert 0.3 < float((told != 0).double().mean()) < 1.0
+
+    def test_beyond_reach_sides_are_told_and_distances_are_bounds(self):
+        soup = together(ball(), ball(0.15, at=(0.25, 0.0, 0.0)))
+        (surface,) = surfaces(soup)
+        x = around(soup, 3000)
+        edges = np.argwhere(np.linalg.norm(x[:, None] - x[None, :500], axis=2) < 0.02).astype(np.int32)
+        asked = torch.as_tensor(x - surface.origin)
+        near = signed_distances(surface, asked, torch.as_tensor(edges), reach=0.02).numpy()
+        exact = signed_by(surface, x)
+        np.testing.assert_array_equal(near < 0, exact < 0)
+        within = np.abs(exact) < 0.02
+        np.testing.assert_allclose(near[within], exact[within], atol=1e-6)
+        assert (np.abs(near) <= np.abs(exact) + 1e-6).all()
+
     def test_a_tube_is_open_and_has_a_rim(self):
         soup = tube()
         (surface,) = surfaces(soup)

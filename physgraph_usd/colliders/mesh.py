@@ -15,6 +15,7 @@ from torch import Tensor
 from ..mesh.lanes import Launch
 from .base import Nearest
 from .orient import FIXED, Pieces, pieces_of
+from .overlap import overlapping
 from .pose import MeshPose
 
 Rim = tuple[np.ndarray, np.ndarray]
@@ -101,13 +102,19 @@ class MeshSurface:
         self.fixed_side = None if self.closed else FIXED.get(side)
         self.certain = self.closed and side == "winding"
         self.triangles = triangles
-        self.edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        self.edges, shared = np.unique(sides, axis=0, return_counts=True)
         self._device, self._lanes = device, lanes
         self._used = np.unique(triangles)
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
         self._corners = torch.as_tensor(triangles, device=device).long()
+        # At a hole or where more than two faces meet a pseudonormal says nothing.
+        ragged = np.isin(triangles, self.edges[shared != 2]).any(axis=1)
+        self._ragged = torch.as_tensor(ragged, device=device)
         self._asked: Tensor | None = None
         self._buried: Tensor | None = None
+        self._overlaps: Tensor | None = None
+        self._up: Tensor | None = None
         self._skin: tuple[wp.Mesh, Tensor] | None = None
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
@@ -116,7 +123,7 @@ class MeshSurface:
         """Move the surface to another pose of the same topology."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
         self.mesh.refit()
-        self._buried, self._skin = None, None
+        self._buried, self._overlaps, self._up, self._skin = None, None, None, None
 
     def _place(self, pose: MeshPose) -> np.ndarray:
         """Recentre a pose; vertices that no face uses are put on one that a face does."""
@@ -132,15 +139,15 @@ class MeshSurface:
         """The closest points within reach [m].
 
         The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface that is right unless the face
-        is buried in another part of the surface, or two parts are equally near: their normals make one that is
-        neither's. There it is left to `inside`. A certain surface asks `inside` for all.
+        is buried in another part of the surface or passes through one, is at a hole, or two parts are equally near:
+        their normals make one that is neither's. There it is left to `inside`. A certain surface asks `inside` for all.
         """
         found = self._closest(self.mesh, x, reach)
         if self.certain:
             return replace(found, side=1.0 - 2.0 * self.inside(x).to(x))
         if self.closed and len(x):
             tied = ((x - found.point) * found.normal).sum(dim=1) * found.side < 0
-            found.side[self._is_buried(found.face) | tied] = 0.0
+            found.side[self._is_buried(found.face) | self._is_unsure(found.face) | tied] = 0.0
         return found
 
     def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
@@ -193,10 +200,27 @@ class MeshSurface:
         self._asked[new] = True
         return self._buried[corners].any(dim=1)
 
+    def _is_unsure(self, face: Tensor) -> Bool[Tensor, " points"]:
+        """Whether faces pass through others or are at a hole; each face is asked for once a pose."""
+        if self._overlaps is None:
+            self._overlaps = torch.full((len(self._corners),), -1, dtype=torch.int8, device=face.device)
+        needed = torch.zeros(len(self._corners), dtype=torch.bool, device=face.device)
+        needed[face.long()] = True
+        new = torch.nonzero(needed & (self._overlaps < 0)).squeeze(1)
+        self._overlaps[new] = (overlapping(self.mesh, new, lanes=self._lanes) | self._ragged[new]).to(torch.int8)
+        return self._overlaps[face.long()] > 0
+
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
         """Whether points just above vertices are inside."""
         if not len(vertices):
             return torch.zeros(0, dtype=torch.bool, device=vertices.device)
+        if self._up is None:
+            self._up = self._normals()
+        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
+        return self.inside(wp.to_torch(self.mesh.points)[vertices] + lift * self._up[vertices])
+
+    def _normals(self) -> Float[Tensor, "vertices 3"]:
+        """Unit normals of the vertices."""
         points = wp.to_torch(self.mesh.points)
         a, b, c = (points[self._corners[:, corner]] for corner in range(3))
         area = torch.linalg.cross(b - a, c - a)
@@ -204,9 +228,7 @@ class MeshSurface:
         normal = torch.zeros_like(points)
         for corner in range(3):
             normal.index_put_((self._corners[:, corner],), area, accumulate=True)
-        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
-        up = torch.nn.functional.normalize(normal[vertices], dim=1, eps=1e-30)
-        return self.inside(points[vertices] + lift * up)
+        return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
     def _bare(self) -> tuple[wp.Mesh, Tensor] | None:
         """The faces that lie bare and their numbers; None when there are none."""

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from .base import Nearest, Surface
 
+LEAST_REACH = 1e-3
+"""Distance within which closest points are always asked for [m]."""
 MARGIN = 1.001
 """Distances are float32: a segment counts as clear of the surface with this to spare."""
 
@@ -25,13 +27,13 @@ def signed_distances(
 ) -> Float[Tensor, " vertices"]:
     """Distances to a surface [m], negative inside closed ones and behind open ones with a fixed side.
 
-    For points farther away than ``reach`` a lower bound.
+    For points farther away than ``reach``, on either side, a lower bound.
 
     Args:
         surface: The surface.
         x: Points in the surface's coordinates [m].
         edges: Pairs of points that are near each other.
-        reach: Distance from the surface's bounds over which nothing is asked [m].
+        reach: Distance over which only the side is told [m].
     """
     low, high = (torch.as_tensor(corner, dtype=x.dtype, device=x.device) for corner in surface.bounds)
     away = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
@@ -39,8 +41,10 @@ def signed_distances(
     near = torch.nonzero(away <= reach).squeeze(1)
     if not len(near):
         return out
-    found = surface.closest(x[near], torch.full_like(near, float("inf"), dtype=x.dtype))
-    out[near] = found.distance
+    # Behind an open surface cloth may be at any distance.
+    limit = float("inf") if surface.fixed_side is not None else max(reach, LEAST_REACH)
+    found = surface.closest(x[near], torch.full_like(near, limit, dtype=x.dtype))
+    out[near] = found.distance.clamp_max(limit)
     if surface.fixed_side is not None:
         out[near] *= torch.where(behind(found, surface.fixed_side), -1.0, 1.0).to(x.dtype)
     elif surface.certain:

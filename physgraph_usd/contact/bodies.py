@@ -20,7 +20,7 @@ from ..colliders.base import Nearest, Surface
 from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
-from .measure import DEEP, penetration, pierced, pinched
+from .measure import DEEP, Pierced, penetration, pierced, pinched
 from .room import room_above
 from .settings import ContactSettings
 
@@ -59,6 +59,7 @@ class _Track:
         at: Positions at which distances were found [m], shape (V, 3).
         known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
+        looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
     """
 
     surface: Surface
@@ -68,6 +69,13 @@ class _Track:
     at: Tensor
     known: Tensor
     longest: float
+    looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
+
+    def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
+        """What crosses at x [m], distances or bounds given; the answer is kept for the same tensor."""
+        if not self.looked or self.looked[0][0] is not x:
+            self.looked[:] = [(x, pierced(self.surface, level, x + self.shift, distance))]
+        return self.looked[0][1]
 
     def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Find anew what may be nearer than a distance that each vertex has [m].
@@ -81,12 +89,13 @@ class _Track:
         if not len(which):
             return which, x[which], moved[which]
         asked = x[which] + self.shift
-        found = self.surface.closest(asked, torch.full_like(moved[which], float("inf")))
+        limit = self._limit(which, within[which], moved[which])
+        found = self.surface.closest(asked, limit)
         sign = self._signs(which, found, asked, moved[which])
-        self.at[which], self.known[which] = x[which], found.distance * sign
+        self.at[which], self.known[which] = x[which], torch.minimum(found.distance, limit) * sign
         distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
         within = torch.nonzero(sign < 0).squeeze(1)
-        kept = torch.ones_like(sign, dtype=torch.bool)
+        kept = distance.isfinite()
         if len(within):
             near = _at(found, within)
             way = self.surface.exit(asked[within], near)
@@ -97,6 +106,12 @@ class _Track:
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
         normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
         return which[kept], normal[kept], (distance * sign)[kept]
+
+    def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
+        """How far to look for the surface: what is farther away outside is known well enough by that bound."""
+        limit = torch.maximum(within + self.longest, MARGIN * moved)
+        everywhere = torch.full_like(limit, float("inf"))
+        return everywhere if self.surface.certain else torch.where(self.known[which] < 0, everywhere, limit)
 
     def _outward(self, which: Tensor) -> Tensor:
         """1 where a face's normal points away from the body, -1 where the start side is the other one."""
@@ -111,8 +126,8 @@ class _Track:
             return found.side
         known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
         may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
-        ask = may_have_crossed & (found.side != known)
-        sign = known.clone()
+        sign = torch.where(may_have_crossed & (found.side != 0), found.side, known)
+        ask = may_have_crossed & (found.side == 0)
         if bool(ask.any()):
             sign[ask] = 1.0 - 2.0 * self.surface.inside(asked[ask]).to(sign)
         return sign
@@ -221,7 +236,7 @@ class LevelBodies:
         out = torch.zeros_like(self._level.free[:, 0])
         for track in self._tracks:
             moved = (x - track.at).norm(dim=1)
-            found = pierced(track.surface, self._level, x + track.shift, (track.known.abs() - moved).clamp_min(0.0))
+            found = track.pierced(self._level, x, (track.known.abs() - moved).clamp_min(0.0))
             held = ~self._level.free[:, 0] & (track.known < 0)
             for corners in (self._level.edges.long()[found.edges], self._level.triangles.long()[found.triangles]):
                 # What a pin holds inside comes out at no height.
@@ -291,10 +306,13 @@ class FrameBodies:
             surface, shift = each.surface, track.shift
             after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
+            through = len(track.pierced(finest, x, after.abs()))
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {
-                "before": asdict(penetration(surface, finest, base + shift, before, track.longest)),
-                "after": asdict(penetration(surface, finest, x + shift, after, track.longest)),
+                "before": asdict(penetration(surface, finest, base + shift, before, longest=track.longest)),
+                "after": asdict(
+                    penetration(surface, finest, x + shift, after, longest=track.longest, crossings=through)
+                ),
             }
         return {"bodies": bodies}
 

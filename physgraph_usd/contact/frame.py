@@ -16,6 +16,7 @@ from ..integrate.metric import Metric
 from ..level import Level
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
+from .metric import HeldMetric
 from .seams import Seams
 from .settings import ContactSettings
 
@@ -23,10 +24,6 @@ FINISHES = 3
 """How often cloth is mended and pushed out of bodies in turn, while either undoes the other."""
 Touch = Contact | SelfContact | Spheres | Seam
 """A term that stands for something near."""
-CHANGED = 0.3
-"""Part of the stiffness of what touches that may change before a metric is factorised anew."""
-REFACTORED = 60_000
-"""Vertices up to which a level's metric takes up the stiffness of what touches; above, factorising costs too much."""
 
 
 @dataclass(eq=False)
@@ -44,17 +41,18 @@ class LevelContact:
     cloth: ClothView | None
     rounds: int
     seam: Seam | None = None
-    _held: tuple[Tensor, Metric] | None = None
+    _held: HeldMetric | None = None
 
-    def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric:
-        """The metric of a level whose cloth is held by what touches at x [m]; the same one while little changes."""
-        if not terms or len(x) > REFACTORED:
+    def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric | HeldMetric:
+        """The metric of a level whose cloth is held by what touches at x [m]; the same one while it serves."""
+        if not terms:
             return plain
-        # A plane holds in one direction of three; the metric knows none, so it takes the whole stiffness.
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
-        if self._held is None or float((stiff - self._held[0]).abs().sum()) > CHANGED * float(stiff.sum()):
-            self._held = (stiff, plain.plus(stiff))
-        return self._held[1]
+        if self._held is None:
+            self._held = HeldMetric(plain, stiff)
+        elif not self._held.serves(stiff, tangled=self.tangled):
+            self._held = HeldMetric(plain, torch.maximum(stiff, self._held.stiff))
+        return self._held
 
     @property
     def tangled(self) -> bool:

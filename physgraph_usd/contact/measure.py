@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int
@@ -52,7 +51,9 @@ def penetration(
     level: Level,
     x: Float[Tensor, "vertices 3"],
     signed: Float[Tensor, " vertices"],
+    *,
     longest: float,
+    crossings: int | None = None,
 ) -> Penetration:
     """Measure one garment group against one surface.
 
@@ -62,6 +63,7 @@ def penetration(
         x: Positions in the surface's coordinates [m].
         signed: Signed distances at x, lower bounds where they are positive [m].
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
+        crossings: How many edges pass through faces, where that is known.
     """
     free = level.free[:, 0]
     depth, held = depths(surface, x, signed, longest)
@@ -74,7 +76,7 @@ def penetration(
         deepest_mm=round(1e3 * deepest, 4),
         pinned=int((deep & ~free).sum()),
         pinched=int((held & free).sum()),
-        crossings=len(pierced(surface, level, x, signed.abs())),
+        crossings=len(pierced(surface, level, x, signed.abs())) if crossings is None else crossings,
     )
 
 
@@ -177,12 +179,14 @@ def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tens
     near = torch.nonzero(distance[level.triangles.long()].amin(dim=1) <= COVER * sides.amax(dim=1)).squeeze(1)
     if not len(near):
         return near
-    place, index = np.unique(level.triangles[near].cpu().numpy(), return_inverse=True)
-    points = x[torch.as_tensor(place, device=x.device).long()].to(torch.float32).contiguous()
+    used = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    used[level.triangles[near].long().reshape(-1)] = True
+    index = (torch.cumsum(used, 0, dtype=torch.int32) - 1)[level.triangles[near].long()].reshape(-1)
+    points = x[used].to(torch.float32).contiguous()
     device = str(x.device)
     cloth = wp.Mesh(
         points=wp.from_torch(points, dtype=wp.vec3f),
-        indices=wp.array(index.ravel().astype(np.int32), dtype=wp.int32, device=device),
+        indices=wp.from_torch(index.contiguous()),
         bvh_constructor="median" if device == "cpu" else None,  # Built once and asked once: building must be cheap.
     )
     body = wp.to_torch(surface.mesh.points)

@@ -5,10 +5,12 @@ edge. Parts that share a corner, or are one edge apart, are no pairs.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false
 from __future__ import annotations
 
 import warp as wp
+
+from ..mesh.piercing import passes_through
 
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
@@ -209,36 +211,6 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
     other[i] = wp.vec2i(up, down)
 
 
-@wp.func
-def volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Six times the signed volume of a tetrahedron."""
-    return wp.dot(b - a, wp.cross(c - a, d - a))
-
-
-@wp.func
-def wide(v: wp.vec3f):
-    """The same in double precision."""
-    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-
-
-@wp.func
-def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int32):
-    """Whether the line from p to q passes an edge on its left; of two faces at a side just one has it on its left."""
-    low, high = wp.min(p, q), wp.max(p, q)
-    left = volume(wide(x[e[0]]), wide(x[e[1]]), wide(x[low]), wide(x[high])) >= wp.float64(0.0)
-    return left == (p < q)
-
-
-@wp.func
-def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces."""
-    p, q, r = wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])
-    if volume(p, q, r, wide(x[e[0]])) * volume(p, q, r, wide(x[e[1]])) >= wp.float64(0.0):
-        return False
-    first = turns_left(x, e, t[0], t[1])
-    return turns_left(x, e, t[1], t[2]) == first and turns_left(x, e, t[2], t[0]) == first
-
-
 @wp.kernel
 def pierced(
     first: wp.int32,
@@ -297,3 +269,71 @@ def patches_meet(
             if not is_beside(i, j, starts, near):
                 found = 1
     flag[i] = found
+
+
+@wp.func
+def area_of(x: wp.array(dtype=wp.vec3f), t: wp.vec3i):
+    """Twice the area of a triangle along its normal."""
+    return wp.cross(x[t[1]] - x[t[0]], x[t[2]] - x[t[0]])
+
+
+@wp.kernel
+def patch_areas(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    members: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    x: wp.array(dtype=wp.vec3f),
+    total: wp.array(dtype=wp.vec3f),
+):
+    """The area of each patch's triangles together, along their normals."""
+    i = first + wp.tid()
+    out = wp.vec3f(0.0)
+    for k in range(starts[i], starts[i + 1]):
+        out += area_of(x, triangles[members[k]])
+    total[i] = out
+
+
+@wp.kernel
+def rings_turn(
+    first: wp.int32,
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    starts: wp.array(dtype=wp.int32),
+    members: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    x: wp.array(dtype=wp.vec3f),
+    total: wp.array(dtype=wp.vec3f),
+    least: wp.float32,
+    turns: wp.array(dtype=wp.int32),
+):
+    """Whether a triangle of the ring of patches round each is farther from the ring's mean normal than a cosine."""
+    i = first + wp.tid()
+    mean = wp.vec3f(0.0)
+    for k in range(ring_starts[i], ring_starts[i + 1]):
+        mean += total[ring[k]]
+    mean = wp.normalize(mean)
+    found = wp.int32(0)
+    for k in range(ring_starts[i], ring_starts[i + 1]):
+        for m in range(starts[ring[k]], starts[ring[k] + 1]):
+            if found == 0:
+                area = area_of(x, triangles[members[m]])
+                if wp.dot(area, mean) <= least * wp.length(area):
+                    found = 1
+    turns[i] = found
+
+
+@wp.kernel
+def any_of_ring(
+    first: wp.int32,
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    flag: wp.array(dtype=wp.int32),
+    out: wp.array(dtype=wp.int32),
+):
+    """Whether a patch of the ring round each is flagged."""
+    i = first + wp.tid()
+    found = wp.int32(0)
+    for k in range(ring_starts[i], ring_starts[i + 1]):
+        found = wp.max(found, flag[ring[k]])
+    out[i] = found

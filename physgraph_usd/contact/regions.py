@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.lanes import Launch
-from .proximity import patches_meet
+from .proximity import any_of_ring, patch_areas, patches_meet, rings_turn
 
 TURNED = math.radians(85.0)
 """Angle from a piece's mean normal beyond which it may touch itself."""
@@ -37,20 +37,24 @@ class Regions:
             level: The level.
             meets: Which garments feel which, symmetric, shape (G, G), bool.
         """
+        wp.init()  # Views of tensors do not start Warp by themselves.
         self._level, self._count = level, cage.vertex_count
         device = level.device
         patch = np.asarray(level.from_coarse.argmax(axis=1)).ravel().astype(np.int64)
         self._patch = torch.as_tensor(patch, device=device)
         self._triangles = level.triangles.long()
-        self._triangle_patch = self._patch[self._triangles[:, 0]]
-        self._by_patch = torch.argsort(self._triangle_patch, stable=True)
-        counts = torch.bincount(self._triangle_patch, minlength=self._count)
-        self._first = torch.cat([counts.new_zeros(1), torch.cumsum(counts, 0)])
+        owner = self._patch[self._triangles[:, 0]]
+        counts = torch.bincount(owner, minlength=self._count)
+        first = torch.cat([counts.new_zeros(1), torch.cumsum(counts, 0)])
+        members = torch.argsort(owner, stable=True)
+        self._pieces = [
+            *(wp.from_torch(each.to(torch.int32)) for each in (first, members)),
+            wp.array(level.triangles.cpu().numpy(), dtype=wp.vec3i, device=device),
+        ]
         ring, near = _rings(cage.edges.cpu().numpy(), cage.vertex_count)
-        self._ring = sp.coo_matrix(ring)
-        self._centre, self._member = (
-            torch.as_tensor(each.astype(np.int64), device=device) for each in (self._ring.row, self._ring.col)
-        )
+        self._ring = [
+            wp.array(each.astype(np.int32), dtype=wp.int32, device=device) for each in (ring.indptr, ring.indices)
+        ]
         self._within = bool(np.diag(meets).any())
         self._static = [
             wp.array(near.indptr.astype(np.int32), dtype=wp.int32, device=device),
@@ -86,44 +90,24 @@ class Regions:
         boxes = [wp.from_torch(each.contiguous(), dtype=wp.vec3f) for each in (low, high)]
         tree = wp.Bvh(*boxes)
         inputs = [tree.id, *boxes, *self._static, wp.from_torch(flag)]
-        Launch(patches_meet, self._count, inputs, device=self._level.device, lanes=self._level.lanes)({})
+        self._run(patches_meet, inputs)
         return (flag > 0) & ~empty
 
     def _turned(self, x: Tensor) -> Bool[Tensor, " patches"]:
         """Patches in a ring of patches that turns over."""
-        corner = x.to(torch.float32)[self._triangles]
-        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        total = torch.zeros((self._count, 3), dtype=torch.float32, device=x.device)
-        total.index_put_((self._triangle_patch,), area, accumulate=True)
-        axis = torch.nn.functional.normalize(total, dim=1, eps=1e-30)
-        unit = torch.nn.functional.normalize(area, dim=1, eps=1e-30)
-        cosine = (unit * axis[self._triangle_patch]).sum(dim=1)
-        least = torch.ones(self._count, dtype=torch.float32, device=x.device)
-        least.scatter_reduce_(0, self._triangle_patch, cosine, "amin")
-        spread = torch.arccos(least.clamp(-1.0, 1.0))
-        sums = torch.zeros_like(total).index_put_((self._centre,), total[self._member], accumulate=True)
-        mean = torch.nn.functional.normalize(sums, dim=1, eps=1e-30)
-        angle = torch.arccos((mean[self._centre] * axis[self._member]).sum(dim=1).clamp(-1.0, 1.0))
-        over = angle + spread[self._member] > TURNED
-        turned = torch.zeros(self._count, dtype=torch.bool, device=x.device)
-        turned[self._centre[over]] = True
-        # The sum of angles is a bound; where it is exceeded, each triangle is held against the ring's mean.
-        return self._marked(turned, unit, mean)
+        points = wp.from_torch(x.to(torch.float32).contiguous(), dtype=wp.vec3f)
+        total = wp.zeros(self._count, dtype=wp.vec3f, device=self._level.device)
+        over, out = (torch.zeros(self._count, dtype=torch.int32, device=x.device) for _ in range(2))
+        cosine = wp.float32(math.cos(TURNED))
+        flags = [wp.from_torch(each) for each in (over, out)]
+        self._run(patch_areas, [*self._pieces, points, total])
+        self._run(rings_turn, [*self._ring, *self._pieces, points, total, cosine, flags[0]])
+        self._run(any_of_ring, [*self._ring, *flags])
+        return out > 0
 
-    def _marked(self, turned: Tensor, unit: Tensor, mean: Tensor) -> Bool[Tensor, " patches"]:
-        """All patches of rings in which some triangle turns away from the ring's mean normal."""
-        rings = turned[self._centre]
-        centre, member = self._centre[rings], self._member[rings]
-        first, count = self._first[member], self._first[member + 1] - self._first[member]
-        pair = torch.repeat_interleave(torch.arange(len(member), device=unit.device), count)
-        start = torch.cumsum(count, 0) - count
-        triangle = self._by_patch[torch.arange(len(pair), device=unit.device) - start[pair] + first[pair]]
-        away = (unit[triangle] * mean[centre[pair]]).sum(dim=1) < math.cos(TURNED)
-        over = torch.zeros(self._count, dtype=torch.bool, device=unit.device)
-        over[centre[pair[away]]] = True
-        out = torch.zeros_like(over)
-        out[self._member[over[self._centre]]] = True
-        return out
+    def _run(self, kernel: wp.Kernel, inputs: list[object]) -> None:
+        """Launch over the patches."""
+        Launch(kernel, self._count, inputs, device=self._level.device, lanes=self._level.lanes)({})
 
 
 def _rings(edges: np.ndarray, count: int) -> tuple[sp.csr_matrix, sp.csr_matrix]:

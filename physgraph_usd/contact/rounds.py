@@ -9,12 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..forces.self_contact import SelfContact
 from ..integrate.base import Carry, Integrator, System
 from ..integrate.solve import Budget, LevelReport, solve_level
+from ..level import Level
 from .frame import LevelContact, Touch
+from .metric import SMOOTH, HeldMetric
 
 UNTANGLINGS = 25
 """Most rounds that draw out what crosses from cold, at the cage."""
@@ -22,6 +26,19 @@ WARM_UNTANGLINGS = 4
 """The same in a frame that starts from the last one's detail, at the finest level."""
 STEPS = 4
 """Steps of each of them."""
+UNSETTLED = 0.2
+"""Remaining move, in edge lengths, above which the cloth away from what touches is solved once more by itself: cloth
+pinched between bodies cannot settle and holds up the steps of all the rest."""
+LAST_UNTANGLINGS, LAST_TRIES = 4, 3
+"""Rounds that draw out what still crosses at the end, and how often while they help."""
+CROWDED = 5e-3
+"""Part of the vertices that cloth must push for a level to get a budget's steps a round: a few are left to mending."""
+
+
+def crowded(terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> bool:
+    """Whether so much cloth pushes cloth at x [m] that it takes steps to settle."""
+    pushed = [term.diagonal(x) > 0 for term in terms if isinstance(term, SelfContact)]
+    return bool(pushed) and float(torch.stack(pushed).any(dim=0).to(x).mean()) > CROWDED
 
 
 def untangle(
@@ -46,6 +63,37 @@ def untangle(
         reports.append(report)
         terms = view.terms(x)
     return x, reports, terms
+
+
+def untangle_last(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
+    integrator: Integrator,
+    x: Float[Tensor, "vertices 3"],
+    *,
+    view: LevelContact,
+    level: int,
+    budget: Budget,
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
+    """Mend a level's result and draw out what still crosses, in turn, while fewer do; x itself where nothing crosses.
+
+    Arguments and results are those of `untangle`.
+    """
+    reports: list[LevelReport] = []
+    if view.cloth is None or not view.cloth.look(x).crossings.count:
+        return x, reports
+    best = view.cloth.mend(x)
+    for _ in range(LAST_TRIES):
+        if not best.crossings.count:
+            break
+        out, made, _ = untangle(
+            make_system, integrator, best.x, view=view, level=level, budget=budget, most=LAST_UNTANGLINGS
+        )
+        reports += made
+        state = view.cloth.mend(out)
+        if state.crossings.count >= best.crossings.count:
+            break
+        best = state
+    return best.x, reports
 
 
 def solve_rounds(
@@ -88,10 +136,12 @@ def solve_rounds(
             integrator,
             x,
             level=level,
-            budget=replace(budget, steps=min(left, share) if terms else left),
+            budget=_round_of(budget, system, min(left, share) if terms else left),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
             resume=kept[-1] if last is not None and system.shares_metric(last) else None,
         )
+        if isinstance(system.metric, HeldMetric):
+            report.remaining_move = system.remaining_move(system.metric.smooth(kept[-1].force))
         last = system
         reports.append(report)
         left -= report.steps
@@ -104,3 +154,44 @@ def solve_rounds(
             left = share
         elif report.steps == 0:
             return x, reports, terms
+
+
+def _round_of(budget: Budget, system: System, steps: int) -> Budget:
+    """The budget of a round: what a held metric calls a small move is that much smaller."""
+    shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
+    return replace(budget, steps=steps, tolerance=shrunk * budget.tolerance)
+
+
+def finish_rounds(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
+    integrator: Integrator,
+    x: Float[Tensor, "vertices 3"],
+    *,
+    terms: tuple[Touch, ...],
+    view: LevelContact,
+    level: Level,
+    last: LevelReport,
+    budget: Budget,
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
+    """What follows a finest level's rounds: the cloth away from what touches settles, and what crosses is drawn out.
+
+    Arguments and results are those of `solve_rounds`, but for the level itself; ``last`` is its last report.
+    """
+    made: list[LevelReport] = []
+    if terms and last.remaining_move > UNSETTLED:
+        x, made = _solve_apart(make_system((), x), integrator, x, terms=terms, level=level, budget=budget)
+    x, more = untangle_last(make_system, integrator, x, view=view, level=level.index, budget=budget)
+    return x, made + more
+
+
+def _solve_apart(
+    plain: System, integrator: Integrator, x: Tensor, *, terms: tuple[Touch, ...], level: Level, budget: Budget
+) -> tuple[Tensor, list[LevelReport]]:
+    """Solve the cloth away from what touches, without it, where it has not settled; what touches stays."""
+    held = torch.stack([term.near(level) for term in terms]).any(dim=0)
+    apart = System(plain.field, plain.metric, free=plain.free & ~held, spacing=plain.spacing, level=level)
+    force = apart.energy_and_force(x)[1]
+    if apart.remaining_move(apart.apply_metric_inverse(force)) <= UNSETTLED:
+        return x, []
+    x, report = solve_level(apart, integrator, x, level=level.index, budget=budget)
+    return x, [report]

@@ -1,0 +1,51 @@
+"""The preconditioner of cloth that something touches."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+
+from physgraph_usd.contact import metric as contact_metric
+from physgraph_usd.contact.metric import HeldMetric
+from physgraph_usd.integrate.metric import Metric
+
+
+def chain(count: int = 12) -> tuple[Metric, np.ndarray]:
+    """Springs in a row, held by their ground, and their matrix."""
+    off = np.full(count - 1, -1.0)
+    matrix = sp.csr_matrix(sp.diags([off, np.full(count, 2.5), off], [-1, 0, 1]))
+    free = torch.ones((count, 1), dtype=torch.bool)
+    return Metric(matrix, free=free, dtype=torch.float64), matrix.toarray()
+
+
+class TestHeldMetric:
+    def test_it_is_what_its_docstring_says(self):
+        plain, matrix = chain()
+        stiff = torch.linspace(0.0, 5.0, 12, dtype=torch.float64)
+        force = torch.randn((12, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+        held = matrix + np.diag(stiff.numpy())
+        smooth = np.linalg.solve(held, force.numpy())
+        rough = force.numpy() / np.diag(held)[:, None]
+        answer = contact_metric.SMOOTH * smooth + contact_metric.ROUGH * rough
+        metric = HeldMetric(plain, stiff)
+        np.testing.assert_allclose(metric.smooth(force).numpy(), smooth, rtol=1e-6)
+        np.testing.assert_allclose(metric.solve(force).numpy(), answer, rtol=1e-6)
+        np.testing.assert_allclose(metric.diagonal.numpy(), np.diag(held), rtol=1e-6)
+
+    def test_a_large_level_is_not_factorised_again(self, monkeypatch):
+        plain, matrix = chain()
+        monkeypatch.setattr(contact_metric, "REFACTORED", 11)
+        monkeypatch.setattr(Metric, "plus", lambda *_: (_ for _ in ()).throw(AssertionError("factorised")))
+        force = torch.ones((12, 3), dtype=torch.float64)
+        metric = HeldMetric(plain, torch.full((12,), 2.0, dtype=torch.float64))
+        np.testing.assert_allclose(metric.smooth(force).numpy(), np.linalg.solve(matrix, force.numpy()), rtol=1e-5)
+
+    def test_it_serves_while_it_lacks_little(self):
+        plain, _ = chain()
+        stiff = torch.ones(12, dtype=torch.float64)
+        metric = HeldMetric(plain, stiff)
+        assert metric.serves(0.0 * stiff)
+        assert metric.serves(9.0 * stiff)
+        assert not metric.serves(9.0 * stiff, tangled=True)
+        assert not metric.serves(11.0 * stiff)
