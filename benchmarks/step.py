@@ -16,6 +16,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -27,13 +28,13 @@ from physgraph_usd.integrate.base import Integrator, System
 from physgraph_usd.integrate.learned import integrator_of
 from physgraph_usd.integrate.network import PaperConfig, PhysgraphConfig
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.weights import random_network
+from physgraph_usd.integrate.weights import random_network, shipped_network
 from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.scene import Garment, GarmentFrame
 from physgraph_usd.shot import prepare_device
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
-SHIPPED = PhysgraphConfig(vectors=("secant", "metric", "metric1", "move1", "diagonal"), means=False)
+SHIPPED = cast(PhysgraphConfig, shipped_network("physgraph").config)
 PAPER = PaperConfig()
 WARM, REPEATS = 6, 15
 

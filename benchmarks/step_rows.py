@@ -45,7 +45,8 @@ def measure(short: bool) -> Found:
             forces = PAPER_MS[size_of(line)][0]
             rows.append(under(f"forces on {device}, {line['edges']:,} springs", line["forces"], forces, unit=" ms"))
             rows += [under_paper(f"{name} on {device}", line, name) for name in (CLASSIC, OURS, THEIRS)]
-        notes += [f"{device}, milliseconds, `{known['command']}`:", as_table(known["rows"])]
+        of = f" ({known['network']})" if "network" in known else ""
+        notes += [f"{device}, milliseconds, `{known['command']}`{of}:", as_table(known["rows"])]
     else:
         rows.append(Row("forces and integrators on a GPU", "not measured", "as above", "as the paper", False))
     return Found(rows, notes)
