@@ -44,21 +44,19 @@ CACHE = Path("build")
 """Folder of the journals."""
 PARTS = (
     Part("potentials", "Potentials and body collision", "benchmarks.potentials", potentials.measure),
-    Part("timing", "Time", "benchmarks.step_rows", step_rows.measure),
-    Part("convergence", "Convergence", "benchmarks.convergence --rows", convergence.rows),
-    Part("forces", "Forces, one after another", "benchmarks.forces_ablation", forces_ablation.measure),
+    Part("timing", "Time", "benchmarks.step_rows", step_rows.measure, 30.0),
+    Part("convergence", "Convergence", "benchmarks.convergence --rows", convergence.rows, 2.0),
+    Part("forces", "Forces, one after another", "benchmarks.forces_ablation", forces_ablation.measure, 4.0),
     Part("loose", "A loose garment against a converged solve", "benchmarks.loose_garment", loose_garment.measure),
-    Part("skinning", "Linear-blend skinning repaired", "benchmarks.skinning_repair", skinning_repair.measure),
-    Part("materials", "Materials", "benchmarks.material_grid", material_grid.measure),
+    Part("skinning", "Linear-blend skinning repaired", "benchmarks.skinning_repair", skinning_repair.measure, 5.0),
+    Part("materials", "Materials", "benchmarks.material_grid", material_grid.measure, 4.0),
     Part("colliders", "Block and torus", "benchmarks.contact_rows colliders", contact_rows.colliders),
     Part("itself", "Self collision", "benchmarks.contact_rows itself", contact_rows.itself),
-    Part("several", "Several garments", "benchmarks.contact_rows several", contact_rows.several),
-    Part("temporal", "A sequence", "benchmarks.temporal --rows", temporal.rows),
+    Part("several", "Several garments", "benchmarks.contact_rows several", contact_rows.several, 10.0),
+    Part("temporal", "A sequence", "benchmarks.temporal --rows", temporal.rows, 4.0),
 )
 """The page, from top to bottom."""
 
-LONG_MINUTES = 40.0
-"""Processor minutes of the long form, about."""
 TEXT = """# The paper's results
 
 Written by `python -m benchmarks.results{form}` in {minutes:.0f} minutes of processor time ({machine}, version
@@ -118,10 +116,11 @@ def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool
     shown = [(part, known[part.name]) for part in parts if part.name in known]
     rows = [row for _, each in shown for row in Found.of(each["found"]).rows if row.met is not None]
     seconds = sum(each["seconds"] for _, each in shown)
+    longer = sum(part.longer * each["seconds"] for part, each in shown) / 60.0
     head = TEXT.format(
         form=" --short" if short else "",
         minutes=seconds / 60.0,
-        long=f"The long form, without --short, takes about {LONG_MINUTES:.0f}." if short else "This is the long form.",
+        long=f"The long form takes about {longer:.0f}, by its steps, frames and levels." if short else "",
         machine=f"{platform.machine()}, CPU",
         version=__version__,
         met=sum(bool(row.met) for row in rows),

@@ -72,12 +72,14 @@ class Part:
         title: The heading.
         command: What measures it alone.
         measure: Takes whether the short form is wanted.
+        longer: Time of the long form over the short one's, about, by its steps, frames and levels.
     """
 
     name: str
     title: str
     command: str
     measure: Callable[[bool], Found]
+    longer: float = 3.0
 
 
 def under(what: str, value: float, most: float, *, unit: str = "", paper: str = "-", digits: str = ".3g") -> Row:
