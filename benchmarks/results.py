@@ -3,9 +3,9 @@
     python -m benchmarks.results [--short] [-o docs/results.md] [--only NAME] [--fresh]
 
 Each part is measured by a command of its own, which stands beside its figures. What was measured lies in a journal, a
-part the moment it is known: a run that was stopped goes on where it was; --fresh begins anew. The short form takes less
-than 15 minutes on two cores and writes how long the long form takes. GPU rows of the timing table are read from
-docs/figures/step_cuda.json, where `python -m benchmarks.step --device cuda` was run.
+part the moment it is known: a run that was stopped goes on where it was, while the code is the same. The short form
+takes less than 15 minutes on two cores and writes how long the long form takes. GPU rows of the timing table are read
+from docs/figures/step_cuda.json, which `python -m benchmarks.step_rows --device cuda --json FILE` writes.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 import click
 import torch
 
+import physgraph_usd
 from benchmarks import (
     contact_rows,
     convergence,
@@ -69,7 +70,7 @@ nothing was aimed at.
 
 
 class Journal:
-    """Parts that were measured, in a file that grows."""
+    """Parts that were measured, in a file that grows; with --fresh, or by other code, everything is measured anew."""
 
     def __init__(self, file: Path, key: dict[str, Any], *, fresh: bool) -> None:
         """Open it.
@@ -157,6 +158,15 @@ def hashes() -> Iterator[str]:
         yield f"`{file.stem}` {hashlib.sha256(file.read_bytes()).hexdigest()[:12]}"
 
 
+def code() -> str:
+    """The first digits of a hash of all code that figures depend on: what another code measured does not count."""
+    digest = hashlib.sha256()
+    for folder in (Path(physgraph_usd.__file__).parent, Path(__file__).parent):
+        for file in sorted(folder.rglob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 def _children() -> float:
     """Processor time of the processes that were waited for [s]."""
     spent = os.times()
@@ -172,7 +182,8 @@ def main(short: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:
     """Measure what is not yet known and write the page."""
     prepare_device("cpu")
     form = "short" if short else "long"
-    journal = Journal(CACHE / f"results.{form}.jsonl", {"version": __version__, "form": form}, fresh=fresh)
+    key = {"version": __version__, "form": form, "code": code()}
+    journal = Journal(CACHE / f"results.{form}.jsonl", key, fresh=fresh)
     with torch.no_grad():
         known = run([part for part in PARTS if not only or part.name in only], journal, short=short)
     out.write_text(page(PARTS, known, short=short), encoding="utf-8")

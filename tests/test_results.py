@@ -15,6 +15,7 @@ import torch
 from cloth import sheet
 from sheets import garment_of
 
+from benchmarks import step_rows
 from benchmarks.loose_garment import band_energy, chamfer
 from benchmarks.material_grid import Cell, exponents, peak
 from benchmarks.results import PARTS, Journal, page, run
@@ -64,6 +65,18 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path):
     run([one, two], Journal(file, {"form": "other"}, fresh=False), short=False)
     run([one, two], Journal(file, key, fresh=True), short=True)
     assert len(calls) == 6
+
+
+def test_figures_of_a_gpu_stand_beside_the_papers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / "cuda.json"
+    line = {"edges": 10208, "forces": 0.04, "quasi-newton": 1.0, "physgraph": 2.0, "physgraph-paper": 20.0}
+    file.write_text(json.dumps({"device": "a GPU", "command": "python -m benchmarks.step", "rows": [line]}))
+    monkeypatch.setattr(step_rows, "CUDA", file)
+    monkeypatch.setattr(step_rows, "timed", lambda options: [line])
+    rows = [row for row in step_rows.measure(True).rows if "a GPU" in row.what]
+    assert [row.met for row in rows] == [True, True, True, False]
+    monkeypatch.setattr(step_rows, "CUDA", tmp_path / "absent.json")
+    assert any(row.ours == "not measured" and row.met is False for row in step_rows.measure(True).rows)
 
 
 def test_the_page_counts_what_is_met_and_shows_what_is_missed(tmp_path: Path):

@@ -1,0 +1,38 @@
+"""Where the default stands among its rivals, from rows alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
+
+from benchmarks.front import placed
+from physgraph_usd.chart.table import quickest
+
+
+def rows(*runs: tuple[str, int, float, float]) -> list[dict[str, Any]]:
+    """Runs as (method, steps, milliseconds, energy), the start at 1 J and Phi* at 0."""
+    found = [{"method": "start", "steps": 0, "ms": 0.0, "energy": 1.0, "vertices": 9, "chosen": ""}]
+    found += [{"method": m, "steps": s, "ms": ms, "energy": e, "chosen": "level by level"} for m, s, ms, e in runs]
+    return [*found, {"method": "least", "steps": 0, "ms": 0.0, "energy": 0.0}]
+
+
+def test_the_default_is_on_the_front_where_no_rival_is_a_tenth_quicker_to_its_gap():
+    slow = ("quasi-newton-flat", 4, 100.0, 0.1), ("quasi-newton-flat", 8, 400.0, 0.001)
+    line, on = placed("flag", 1, rows(("default", 12, 210.0, 0.01), *slow))
+    assert on
+    assert line[5] == "quasi-newton-flat, 200 ms"
+    assert line[6] == "1.05"
+    assert not placed("flag", 1, rows(("default", 12, 230.0, 0.01), *slow))[1]
+
+
+def test_a_rival_that_never_gets_there_does_not_count():
+    assert placed("flag", 1, rows(("default", 12, 900.0, 0.01), ("physgraph", 2, 10.0, 0.02)))[0][6] == "1.00"
+
+
+def test_a_time_between_two_budgets_is_interpolated_by_powers_and_what_gets_worse_is_left_out():
+    assert quickest([(10.0, 0.1), (20.0, 0.5), (40.0, 0.001)], 0.01) == pytest.approx(20.0)
+    assert quickest([(10.0, 0.1)], 0.01) is None
+    assert quickest([(10.0, 0.1), (20.0, 0.01)], 0.2) == 10.0
