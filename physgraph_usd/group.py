@@ -15,7 +15,7 @@ from torch import Tensor
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.rounds import UNTANGLINGS, WARM_UNTANGLINGS, crowded, finish_rounds, solve_rounds, untangle
+from .contact.rounds import solve_touching
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Reset, Solved
@@ -170,11 +170,10 @@ class Group:
         carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
         strain = edge_strain(self.levels[-1], result)
         telemetry = self._telemetry(module, result, coarse, reports) | chosen | {"strain": strain, "start": start}
-        crossing = torch.zeros_like(self.levels[-1].free[:, 0])
-        if contact is not None:
-            measured, crossing = contact.measure(result)
-            if measured:
-                telemetry["contact"] = measured | moved
+        judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
+        measured, crossing = ({}, None) if judge is None else judge.measure(result)
+        if measured:
+            telemetry["contact"] = measured | moved
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -182,9 +181,10 @@ class Group:
         }
         points = result.double().cpu().numpy() + origin
         points[self._fixed] = self._place_fixed @ world
-        spans, crosses = self.levels[-1].spans, crossing.cpu().numpy()
-        own = [points[span] for span in spans], carried, telemetry, [crosses[span] for span in spans]
-        return Solved(*own), strain["p99"]
+        spans = self.levels[-1].spans
+        crosses = np.zeros(len(points), bool) if crossing is None else crossing.cpu().numpy()
+        own = [[each[span] for span in spans] for each in (points, crosses)]
+        return Solved(own[0], carried, telemetry, own[1]), strain["p99"]
 
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
@@ -222,8 +222,8 @@ class Group:
     ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
         """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
         world = np.concatenate([frame.points for frame in frames])
-        origin = world.mean(axis=0)
-        module, coarse = self._forces_for(frames)[-1], self._tensor(world - origin)
+        origin, module = world.mean(axis=0), self._forces_for(frames)[-1]
+        coarse = self._tensor(world - origin)
         return module.module(coarse), self._contact(touching, coarse, origin, frames), origin
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
@@ -273,10 +273,17 @@ class Group:
         return predicted, "warm"
 
     def _contact(
-        self, touching: Sequence[Touching], coarse: Tensor, origin: np.ndarray, frames: Sequence[GarmentFrame]
+        self,
+        touching: Sequence[Touching],
+        coarse: Tensor,
+        origin: np.ndarray,
+        frames: Sequence[GarmentFrame],
+        *,
+        settings: ContactSettings | None = None,
     ) -> FrameContact | None:
-        """What a frame's cloth may touch, or None when there is nothing."""
-        settings = self._settings.contact
+        """What a frame's cloth may touch, or None when there is nothing; as the group is set unless told otherwise."""
+        settings = settings or self._settings.contact
+        touching = touching if settings.form != "off" else ()
         cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
         if not len(self.levels[0].triangles):
             return None
@@ -292,6 +299,19 @@ class Group:
         return FrameContact(
             self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings, seams=seams
         )
+
+    def _judge(
+        self,
+        contact: FrameContact | None,
+        touching: Sequence[Touching],
+        coarse: Tensor,
+        *,
+        origin: np.ndarray,
+        frames: Sequence[GarmentFrame],
+    ) -> FrameContact | None:
+        """What a frame is measured by: what it may touch, and what is off but to be measured."""
+        settings = self._settings.contact.to_measure()
+        return contact if settings is None else self._contact(touching, coarse, origin, frames, settings=settings)
 
     def _descend(
         self,
@@ -352,23 +372,10 @@ class Group:
             x = leave_saddle(system((), x), level, x, outward=self._outward) if cold else x
             x, report = solve_level(system((), x), integrator, x, level=level.index, budget=budget)
             return x, [report], ()
-        freed: list[LevelReport] = []
-        most = UNTANGLINGS if level is self.levels[0] else WARM_UNTANGLINGS * (not cold)
-        x, freed, touched = untangle(system, integrator, x, view=view, level=level.index, budget=budget, most=most)
-        x = leave_saddle(system(touched, x), level, x, outward=self._outward) if cold else x
-        # A warm frame has no coarse levels that settle contact before; cloth on cloth settles slowly.
-        finest = level is self.levels[-1] and (not cold or crowded(touched, x))
-        share = budget.steps if finest else None
-        x, made, touched = solve_rounds(
-            system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, share=share
+        finest, outward = level is self.levels[-1], self._outward if cold else None
+        return solve_touching(
+            system, integrator, x, view=view, level=level, finest=finest, outward=outward, budget=budget
         )
-        made = freed + made
-        if level is self.levels[-1]:
-            x, more = finish_rounds(
-                system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
-            )
-            made += more
-        return x, made, touched
 
     def _budget(self, index: int, clock: float, *, more: int) -> Budget:
         """Steps and deadline of one level, the finest with so many times its steps."""

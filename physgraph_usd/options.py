@@ -96,7 +96,9 @@ class RefineOptions:
 
     def contact_settings(self) -> ContactSettings:
         """The part that concerns contact."""
-        return ContactSettings(CONTACTS[self.contact], cloth=SELF_CONTACTS[self.self_contact])
+        return ContactSettings(
+            CONTACTS[self.contact], cloth=SELF_CONTACTS[self.self_contact], measured=self.report is not None
+        )
 
     def solve_settings(self) -> SolveSettings:
         """The part that concerns the solver."""

@@ -237,7 +237,7 @@ class Refiner:
         found: set[int] = set()
         for index, frame in zip(part, frames, strict=True):
             garment = self._scene.garments[index]
-            if garment.colliders and self._settings.contact.form != "off":
+            if garment.colliders and self._settings.contact.sees_bodies:
                 found |= set(self._bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame)))
         return tuple(sorted(found))
 

@@ -13,7 +13,11 @@ from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API, vec3
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.colliders.pose import MeshPose
+from physgraph_usd.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.colliders.sweep import passages, through_shape
+from physgraph_usd.contact.passed import Passed
+from physgraph_usd.samples import write_sample
+from physgraph_usd.usd.reader import open_shot
 
 EDGE = 0.05
 MESH, REST = sheet(8, 8, EDGE)
@@ -79,6 +83,33 @@ def test_a_closed_body_that_moves_five_edges_a_frame_leaves_nothing_inside():
 def test_past_the_rim_is_no_passage():
     aside = pane()[0] + 0.5 * (1.0 - NORMAL), pane()[1]
     assert all("passed_through" not in entry for entry in passing(aside, [-0.5, 0.5]))
+
+
+START = np.array([[0.0, 0.3, 0.0], [0.15, 0.21, 0.0], [0.3, 0.3, 0.0]])
+END = np.array([[0.0, -0.3, 0.0], [0.21, 0.15, 0.0], [0.3, -0.3, 0.0]])
+"""Right through a box of half size 0.2, over an edge of it, and past it."""
+
+
+def test_what_slides_over_a_sharp_edge_of_a_mesh_does_not_come_through():
+    points, triangles = box((0.4, 0.4, 0.4))
+    counts, opposed = passages(triangles, points, points, start=START, end=END)
+    assert counts.tolist() == [2, 2, 0]
+    assert (opposed & (counts > 0)).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.1])
+def test_what_slides_over_a_sharp_edge_of_a_primitive_does_not_come_through(lift: float):
+    """Also while it moves and turns: its own axes are what the ways are seen in."""
+    before = ShapePose("cube", np.eye(3), np.zeros(3), np.full(3, 0.2))
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) if lift else np.eye(3)
+    after = ShapePose("cube", turn, np.array([lift, 2.0 * lift, 0.0]), np.full(3, 0.2))
+    assert through_shape(before, after, start=START, end=END @ turn.T + after.centre).tolist() == [True, False, False]
+
+
+def test_the_block_sample_has_no_passage(tmp_path: Path):
+    shot = open_shot(str(write_sample("block", tmp_path)))
+    passed = Passed(shot.scene.garments, shot.scene.colliders)
+    assert [passed.look(shot.frame(time)) for time in shot.scene.times] == [[{}]] * len(shot.scene.times)
 
 
 def test_after_a_gap_in_time_nothing_is_compared():

@@ -13,7 +13,7 @@ rng = np.random.default_rng(7)
 
 def through(soup: tuple, start: np.ndarray, end: np.ndarray, *, after: np.ndarray | None = None) -> np.ndarray:
     points, triangles = soup
-    return passages(triangles, points, points if after is None else after, start=start, end=end)
+    return passages(triangles, points, points if after is None else after, start=start, end=end)[0]
 
 
 def turn(angle: float) -> np.ndarray:
@@ -89,7 +89,7 @@ class TestTurning:
     def test_nothing_gives_nothing(self):
         none = np.zeros((0, 3))
         assert through(ball(), none, none).shape == (0,)
-        assert passages(np.zeros((0, 3), int), none, none, start=np.ones((2, 3)), end=np.zeros((2, 3))).tolist() == [
+        assert passages(np.zeros((0, 3), int), none, none, start=np.ones((2, 3)), end=np.zeros((2, 3)))[0].tolist() == [
             0,
             0,
         ]

@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..colliders.orient import pieces_of
-from ..colliders.pose import Collider, MeshPose
-from ..colliders.sweep import passages
+from ..colliders.pose import Collider, MeshPose, ShapePose
+from ..colliders.sweep import passages, through_shape
 from ..scene import Frame, Garment
 
 
 class Passed:
-    """Remembers the last frame of a shot. Primitives and meshes whose topology changes are not looked at."""
+    """Remembers the last frame of a shot. Meshes whose topology changes are not looked at."""
 
     def __init__(
         self, garments: Sequence[Garment], colliders: Sequence[Collider], *, device: str = "cpu", lanes: int = 1
@@ -37,8 +37,8 @@ class Passed:
         """Compare a frame with the last one.
 
         Returns:
-            For each garment, the number of its cage's points that came through, by the body's path: out of a closed
-            piece that they were not in before, or to the other side of an open one.
+            For each garment, the number of its cage's points that came through, by the body's path: out at the other
+            side of a closed piece that they were not in before, or to the other side of an open one.
         """
         last, self._last = self._last, frame
         if last is None:
@@ -52,6 +52,9 @@ class Passed:
 
     def _count(self, body: int, last: Frame, frame: Frame, ways: tuple[np.ndarray, np.ndarray]) -> int:
         before, after = last.colliders[body], frame.colliders[body]
+        if isinstance(before, ShapePose) and isinstance(after, ShapePose) and before.kind == after.kind:
+            # Points that are not finite make every comparison false.
+            return int(through_shape(before, after, start=ways[0], end=ways[1]).sum())
         if not isinstance(before, MeshPose) or not isinstance(after, MeshPose):
             return 0
         if before.points.shape != after.points.shape or not np.array_equal(before.triangles, after.triangles):
@@ -64,8 +67,9 @@ class Passed:
             passages(faces, before.points, after.points, start=start, end=end, **self._place)
             for faces in (closed, opened)
         ]
-        came_out = (through[0] > 0) & (through[0] % 2 == 0)
-        return int((came_out | (through[1] % 2 == 1)).sum())
+        (closings, opposed), (openings, _) = through
+        came_out = (closings > 0) & (closings % 2 == 0) & opposed
+        return int((came_out | (openings % 2 == 1)).sum())
 
     def _pieces(self, body: int, pose: MeshPose) -> tuple[np.ndarray, np.ndarray]:
         """Closed and open triangles, kept while the topology stays the same."""

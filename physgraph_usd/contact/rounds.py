@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..forces.self_contact import SelfContact
 from ..integrate.base import Carry, Integrator, System
+from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
 from ..level import Level
 from .frame import LevelContact, Touch
@@ -39,6 +40,49 @@ def crowded(terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> bool:
     """Whether so much cloth pushes cloth at x [m] that it takes steps to settle."""
     pushed = [term.diagonal(x) > 0 for term in terms if isinstance(term, SelfContact)]
     return bool(pushed) and float(torch.stack(pushed).any(dim=0).to(x).mean()) > CROWDED
+
+
+def solve_touching(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
+    integrator: Integrator,
+    x: Float[Tensor, "vertices 3"],
+    *,
+    view: LevelContact,
+    level: Level,
+    finest: bool,
+    outward: Float[Tensor, " garments"] | None,
+    budget: Budget,
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
+    """Solve one level: draw out what crosses, leave the saddle, then rounds, and what follows them.
+
+    Results are those of `solve_rounds`.
+
+    Args:
+        make_system: Makes the level's system with contact terms at positions.
+        integrator: Any integrator.
+        x: Start positions [m].
+        view: The level's view of what it may touch.
+        level: The level.
+        finest: Whether it is the last.
+        outward: As `leave_saddle` takes it, or None in a warm frame.
+        budget: When to stop.
+    """
+    most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS * (outward is None)
+    x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
+    if outward is not None:
+        x = leave_saddle(make_system(touched, x), level, x, outward=outward)
+    # A warm frame has no coarse levels that settle contact before; much cloth on cloth settles slowly.
+    share = budget.steps if finest and (outward is None or crowded(touched, x)) else None
+    x, more, touched = solve_rounds(
+        make_system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, share=share
+    )
+    made = made + more
+    if finest:
+        x, more = finish_rounds(
+            make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
+        )
+        made += more
+    return x, made, touched
 
 
 def untangle(

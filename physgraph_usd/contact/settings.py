@@ -22,6 +22,7 @@ class ContactSettings:
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
         lifts: How often it moves cloth farther out where a body comes through it.
+        measured: Whether what is off is measured all the same.
     """
 
     form: str = "quadratic"
@@ -34,6 +35,19 @@ class ContactSettings:
     clearance: float = 0.25
     projections: int = 10
     lifts: int = 5
+    measured: bool = False
+
+    @property
+    def sees_bodies(self) -> bool:
+        """Whether bodies are looked for at all."""
+        return self.form != "off" or self.measured
+
+    def to_measure(self) -> ContactSettings | None:
+        """Settings by which all is measured, where these leave out something that is to be; else None."""
+        if not self.measured or (self.form != "off" and self.cloth != "off"):
+            return None
+        on = ContactSettings()
+        return replace(self, form=on.form, cloth=on.cloth)
 
     def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
         """The same settings with their stiffnesses in SI: [N/m^3], of the linear form [N], of spheres [N/m].

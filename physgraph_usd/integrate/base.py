@@ -39,6 +39,15 @@ class Preconditioner(Protocol):
 
 
 @runtime_checkable
+class Layered(Preconditioner, Protocol):
+    """A preconditioner that answers smooth and rough forces by different parts."""
+
+    def smooth(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The part that is an inverse of its ``diagonal``'s matrix [m]."""
+        ...
+
+
+@runtime_checkable
 class Surface(Protocol):
     """What a level shows of its mesh; the fields are those of `Level`."""
 
@@ -122,6 +131,13 @@ class System:
         self.metric_solves += 1
         move = self.metric.solve(force)
         return move if self._all_free else move * self.free
+
+    def apply_smooth_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m] by the smooth part alone of a metric that has two."""
+        if not isinstance(self.metric, Layered):
+            return self.apply_metric_inverse(force)
+        self.metric_solves += 1
+        return self.metric.smooth(force) * self.free
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each vertex's Hessian block [N/m], positive."""

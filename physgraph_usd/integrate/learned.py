@@ -83,7 +83,7 @@ class LearnedMetric:
         """Evaluate x with an empty memory."""
         self._network = placed(self._network, system)
         energy, force = system.energy_and_force(x)
-        image = system.apply_metric_inverse(force)
+        image = system.apply_smooth_inverse(force)
         recording = self._recorded(system)
         if recording is not None:
             return recording.begin(x, energy, force, image)
@@ -93,7 +93,7 @@ class LearnedMetric:
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions under forces that changed a little; the last displacements are kept."""
         energy, force = system.energy_and_force(carry.x)
-        image = system.apply_metric_inverse(force)
+        image = system.apply_smooth_inverse(force)
         if isinstance(carry.memory, Place):
             before, recording = carry.memory.recording, self._recorded(system)
             assert recording is not None
@@ -111,7 +111,7 @@ class LearnedMetric:
         move = self.propose(system, carry)
         x = carry.x + move
         energy, force = system.energy_and_force(x)
-        image = system.apply_metric_inverse(force)
+        image = system.apply_smooth_inverse(force)
         return Carry(x, energy, force, image, self.name, self._remember(carry, move, force, image=image))
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:

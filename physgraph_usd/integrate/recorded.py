@@ -113,7 +113,6 @@ class Recording:
             self.begin(carry.x, carry.energy, carry.force, carry.preconditioned)
         self._run()
         self.system.evaluations += 1
-        self.system.metric_solves += 1
         self.version += 1
         x, force, image = self.x.clone(), self.rows[FORCE].clone(), self.rows[IMAGE].clone()
         return Carry(x, float(self.energy), force, image, "physgraph", Place(self, self.version))
@@ -146,7 +145,9 @@ class Recording:
                 graph.capture_end()
             torch.cuda.current_stream().wait_stream(side)
             self._graph = graph
+            self.system.metric_solves -= 1  # recording is no solve
         self._graph.replay()
+        self.system.metric_solves += 1
 
     def _step(self) -> None:
         """The kernels of a step."""
@@ -155,7 +156,7 @@ class Recording:
         x = self.x + move
         energy, force = system.field.energy_and_force(x)
         force = force * system.free
-        image = system.metric.solve(force) * system.free
+        image = system.apply_smooth_inverse(force)
         self.images.copy_(torch.stack([rows[IMAGE], self.images[0]]))
         self.force_before.copy_(rows[FORCE])
         last = SECANTS - 1

@@ -176,10 +176,10 @@ class TestFast:
             told.append(bool(answer.telemetry[0].get("passed_through")))
         assert told == [False, True, False]
 
-    @pytest.mark.xfail(strict=True, reason="primitives that pass right through between two frames are not looked at")
-    def test_s30_a_primitive_that_comes_through_is_told(self):
-        shape = up("sphere", (0.06, 0.06, 0.06))
-        one = refiner_with([named(SHEET)], ["sphere"], times=(0.0, 1.0))
+    @pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "cube"])
+    def test_s30_a_primitive_that_comes_through_is_told(self, kind: str):
+        shape = up(kind, (0.06, 0.06, 0.06))
+        one = refiner_with([named(SHEET)], [kind], times=(0.0, 1.0))
         for time, height in ((0.0, -0.5 * STEP), (1.0, 0.5 * STEP)):
             pose = type(shape)(shape.kind, shape.turn, np.array([0.0, height, 0.0]), shape.size)
             answer = one.solve(frame_with([REST], pose, time=time))
