@@ -7,7 +7,7 @@ the processor time of one core, energies judged in float64. Rivals are quasi-New
 alone and `physgraph`, each with growing steps; other methods are slower on every chart. A ratio is the default's time
 over the least of all to the same gap; up to 1.1 counts as level. Phi* is the least that anybody found, a nested solve
 of 48 steps in float64 and, where the default went to the finest level alone, one of 192 steps there among them. What
-was measured lies in build/front.jsonl: a run that was stopped goes on there.
+was measured lies in build/front.CODE.jsonl: a run that was stopped goes on there while the code is the same.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from typing import Any
 
 import torch
 
-from benchmarks.rows import say, table
+import physgraph_usd
+from benchmarks.rows import code_of, say, table
 from benchmarks.shots import opened
 from physgraph_usd.chart.problem import COLD, Problem, plain_detail
 from physgraph_usd.chart.table import TOLERANCE, quickest
@@ -32,7 +33,8 @@ from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.usd.reader import Shot, open_shot
 
-JOURNAL = Path("build") / "front.jsonl"
+JOURNAL = Path("build") / f"front.{code_of(Path(physgraph_usd.__file__).parent)}.jsonl"
+"""Rows of this code."""
 SAMPLES: dict[str, float | None] = {
     "flag": 12.0,
     "swatch": None,

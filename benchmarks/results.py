@@ -35,7 +35,7 @@ from benchmarks import (
     step_rows,
     temporal,
 )
-from benchmarks.rows import HEAD, Found, Part
+from benchmarks.rows import HEAD, Found, Part, code_of
 from physgraph_usd import __version__
 from physgraph_usd.integrate.weights import FOLDER
 from physgraph_usd.shot import prepare_device
@@ -158,15 +158,6 @@ def hashes() -> Iterator[str]:
         yield f"`{file.stem}` {hashlib.sha256(file.read_bytes()).hexdigest()[:12]}"
 
 
-def code() -> str:
-    """The first digits of a hash of all code that figures depend on: what another code measured does not count."""
-    digest = hashlib.sha256()
-    for folder in (Path(physgraph_usd.__file__).parent, Path(__file__).parent):
-        for file in sorted(folder.rglob("*.py")):
-            digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
-
-
 def _children() -> float:
     """Processor time of the processes that were waited for [s]."""
     spent = os.times()
@@ -182,7 +173,11 @@ def main(short: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:
     """Measure what is not yet known and write the page."""
     prepare_device("cpu")
     form = "short" if short else "long"
-    key = {"version": __version__, "form": form, "code": code()}
+    key = {
+        "version": __version__,
+        "form": form,
+        "code": code_of(Path(physgraph_usd.__file__).parent, Path(__file__).parent),
+    }
     journal = Journal(CACHE / f"results.{form}.jsonl", key, fresh=fresh)
     with torch.no_grad():
         known = run([part for part in PARTS if not only or part.name in only], journal, short=short)

@@ -26,6 +26,8 @@ import report_stages as stages
 import warp as wp
 from report_solver import Result
 
+import physgraph_usd
+from benchmarks.rows import code_of
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.integrate import METHODS
 
@@ -184,7 +186,9 @@ apart. `auto`, refine's default, is one of the first two, frame by frame, and ha
 SLOW = "physgraph-paper"
 """The column that takes as long as all others; the short form leaves it out."""
 LONG_MINUTES = 30
-CELLS = Path("build") / "stability.jsonl"
+HERE = Path(__file__).resolve().parent
+CELLS = Path("build") / f"stability.{code_of(Path(physgraph_usd.__file__).parent, HERE)}.jsonl"
+"""Cells of this code."""
 
 
 @click.command()
