@@ -206,10 +206,7 @@ class Group:
         """
         modules, coarse = self.modules(frames)
         parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
-        return [
-            System(m, lasting.metric, free=level.free, spacing=level.spacing, level=level)
-            for level, lasting, m in parts
-        ], coarse
+        return [System(m, own.metric, free=v.free, spacing=v.spacing, level=v) for v, own, m in parts], coarse
 
     def use(self, settings: SolveSettings) -> None:
         """Solve the frames that follow in another way; levels and metrics are kept."""
