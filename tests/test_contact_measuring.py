@@ -35,13 +35,13 @@ def test_what_is_off_is_measured_and_changes_no_bit():
     assert measured(judged, "before")["inside"] > 20
     assert measured(judged)["inside"] > 20
     assert measured(judged)["crossings"] > 20
-    np.testing.assert_array_equal(without.points[0], judged.points[0])
+    assert bool((np.asarray(without.points[0]) == np.asarray(judged.points[0])).all())
 
 
 def test_what_is_on_is_measured_as_ever():
     one, other = (solved(ContactSettings(measured=measured)) for measured in (False, True))
     assert one.telemetry[0]["contact"] == other.telemetry[0]["contact"]
-    np.testing.assert_array_equal(one.points[0], other.points[0])
+    assert bool((np.asarray(one.points[0]) == np.asarray(other.points[0])).all())
 
 
 @pytest.mark.parametrize("report", [None, Path("out.json")])

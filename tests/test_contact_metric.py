@@ -13,8 +13,7 @@ from physgraph_usd.integrate.metric import Metric
 
 def chain(count: int = 12) -> tuple[Metric, np.ndarray]:
     """Springs in a row, held by their ground, and their matrix."""
-    off = np.full(count - 1, -1.0)
-    matrix = sp.csr_matrix(sp.diags([off, np.full(count, 2.5), off], [-1, 0, 1]))
+    matrix = sp.csr_matrix(2.5 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
     free = torch.ones((count, 1), dtype=torch.bool)
     return Metric(matrix, free=free, dtype=torch.float64), matrix.toarray()
 

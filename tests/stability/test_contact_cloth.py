@@ -57,7 +57,7 @@ def left(kind: str, before: int, after: int) -> Any:
 class TestCrossed:
     """S24."""
 
-    @pytest.mark.parametrize("kind", ["dented", left("cornered", 102, 82), "tilted"])
+    @pytest.mark.parametrize("kind", ["dented", left("cornered", 102, 77), left("tilted", 112, 37)])
     def test_s24_two_crossing_sheets_come_apart(self, kind: str):
         """Untangling takes at most 25 rounds of 4 steps at the cage; the rest of the solve keeps them apart."""
         cloths, cages = crossed(kind)
