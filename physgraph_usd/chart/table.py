@@ -186,9 +186,8 @@ class Chart:
             )
         if self.busy:
             yield self.busy
-        plan, longer = self.about.get("plan"), self.about.get("long_minutes")
-        if plan and longer and longer > 1.1 * plan["minutes"]:
-            yield f"planned for {plan['minutes']:.0f} minutes; the long form would take about {longer:.0f}"
+        if longer := self.about.get("long_minutes"):
+            yield f"the long form would take about {longer:.0f} minutes here"
 
 
 def quickest(points: Sequence[tuple[float, float]], gap: float) -> float | None:
