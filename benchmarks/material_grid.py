@@ -2,8 +2,8 @@
 
     python -m benchmarks.material_grid [--long]        writes docs/pictures/material_grid.png
 
-The sample `sleeve`, whose coarse tube is compressed by a fifth and twisted, without cloth on cloth, solved by the learned
-integrator: one file of weights in all sixteen. A cell's
+The sample `sleeve`, whose coarse tube is compressed by a fifth and twisted, without cloth on cloth, solved by the
+learned integrator: one file of weights in all sixteen. A cell's
 wavelength is where the spectrum of the detail's slope has its peak: the energies of `benchmarks.loose_garment` between
 neighbouring low-pass filters, over the square of their wavelength, a parabola through the logarithms of the highest
 three; an eighth of the tube at either rim does not count. Thin sheets under a given strain have wrinkles as long as
