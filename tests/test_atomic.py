@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from layers import vec3
 from pxr import Sdf
 
 from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.usd.atomic import remove_stale, temporary_path
+from physgraph_usd.usd.atomic import leave_if_asked, remove_stale, temporary_path, termination_raises
 from physgraph_usd.usd.stream import LayerStream
 
 POINTS = Sdf.Path("/World/coat.points")
@@ -139,7 +140,10 @@ def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path, number: s
         process.stdout.readline()
         time.sleep(0.05)
         process.send_signal(number)
-        process.wait(timeout=30)
+        try:
+            process.wait(timeout=30)
+        finally:
+            process.kill()
     left = names(tmp_path)
     assert target.name not in left
     if number is not signal.SIGKILL:
@@ -148,6 +152,23 @@ def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path, number: s
         fill(stream, 2)
         stream.commit()
     assert names(tmp_path) == ["out.usdc"]
+
+
+def write_on(target: Path) -> None:
+    """Write although a termination signal came: its exception is lost, as it is in a destructor."""
+    with termination_raises(), LayerStream(target) as stream:
+        with suppress(SystemExit):
+            signal.raise_signal(signal.SIGTERM)
+        fill(stream, 2)
+        stream.flush()
+
+
+def test_a_signal_whose_exception_was_lost_ends_the_next_flush(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as caught:
+        write_on(tmp_path / "out.usdc")
+    assert caught.value.code == 128 + signal.SIGTERM
+    assert names(tmp_path) == []
+    leave_if_asked()
 
 
 FULL = """

@@ -12,7 +12,7 @@ from typing import Any
 from pxr import Sdf, Tf
 
 from ..errors import LayerError, UsageError
-from .atomic import prepare_target, publish, temporary_path
+from .atomic import leave_if_asked, prepare_target, publish, temporary_path
 from .stage import reason_of
 
 FLUSH_BYTES = 16_000_000
@@ -122,7 +122,9 @@ class LayerStream:
 
         Raises:
             LayerError: The disk is full or gone.
+            SystemExit: A termination signal came.
         """
+        leave_if_asked()
         try:
             saved = self.layer.Save()
         except Tf.ErrorException as error:
