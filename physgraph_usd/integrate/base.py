@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -134,10 +135,16 @@ class System:
 
     def apply_smooth_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m] by the smooth part alone of a metric that has two."""
-        if not isinstance(self.metric, Layered):
+        smooth = self._smooth
+        if smooth is None:
             return self.apply_metric_inverse(force)
         self.metric_solves += 1
-        return self.metric.smooth(force) * self.free
+        return smooth(force) * self.free
+
+    @cached_property
+    def _smooth(self) -> Callable[[Tensor], Tensor] | None:
+        """The smooth part of a metric that has two; asked once, for asking a protocol reads all of its properties."""
+        return self.metric.smooth if isinstance(self.metric, Layered) else None
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each vertex's Hessian block [N/m], positive."""
