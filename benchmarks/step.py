@@ -26,7 +26,8 @@ from physgraph_usd.group import Group, SolveSettings
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Integrator, System
 from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.network import PaperConfig, PhysgraphConfig
+from physgraph_usd.integrate.network import PhysgraphConfig
+from physgraph_usd.integrate.paper_network import PaperConfig
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.weights import random_network, shipped_network
 from physgraph_usd.mesh.topology import PolygonMesh

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,10 +15,11 @@ from sheets import garment_of
 
 from physgraph_usd.cli import main
 from physgraph_usd.group import Group
-from physgraph_usd.integrate.learned import LearnedMetric
+from physgraph_usd.integrate.learned import LearnedMetric, LearnedPaper
 from physgraph_usd.integrate.metric import Metric
 from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
-from physgraph_usd.integrate.weights import random_network
+from physgraph_usd.integrate.paper_network import PaperConfig, PaperNetwork, has_triton
+from physgraph_usd.integrate.weights import random_network, shipped_network
 from physgraph_usd.level import refine_garments
 from physgraph_usd.samples import write_sample
 from physgraph_usd.scene import GarmentFrame
@@ -86,6 +87,25 @@ def test_replayed_steps_are_the_same_steps(vectors: tuple[str, ...]) -> None:
         a, b = plain.step(system, a), replayed.step(system, b)
         assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
         assert b.energy == pytest.approx(a.energy, rel=1e-3)
+
+
+@pytest.mark.parametrize("latent", [32, 128])
+def test_the_papers_step_is_the_same_by_its_kernel(latent: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Triton's kernel against the layers in torch: a thousandth of the displacement, for its factors have 10 bits."""
+    if not has_triton():
+        pytest.skip("no Triton")
+    one, frames = cloth("cuda", torch.float32)
+    systems, coarse = one.systems(frames)
+    system, x = systems[-1], one.levels[-1].base.apply(coarse)
+    paper = LearnedPaper(cast(PaperNetwork, shipped_network("physgraph-paper")))
+    if latent != PaperConfig().latent:
+        paper = LearnedPaper(cast(PaperNetwork, random_network(PaperConfig(latent), seed=3, scale=0.3)))
+    carry = paper.start(system, x)
+    fused, again = paper.propose(system, carry), paper.propose(system, carry)
+    monkeypatch.setattr("physgraph_usd.integrate.paper_network.has_triton", lambda: False)
+    plain = paper.propose(system, carry)
+    assert torch.equal(fused, again)
+    assert 0.0 < float((fused - plain).norm()) < 3e-3 * float(plain.norm())
 
 
 def test_a_metric_with_springs_agrees() -> None:

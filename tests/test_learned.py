@@ -23,7 +23,8 @@ from physgraph_usd.group import Group
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Carry, Integrator, System
 from physgraph_usd.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
-from physgraph_usd.integrate.network import VECTORS, PaperConfig, Physgraph, PhysgraphConfig
+from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
+from physgraph_usd.integrate.paper_network import PaperConfig
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
 from physgraph_usd.level import refine_garments

@@ -13,8 +13,11 @@ from click.testing import CliRunner, Result
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import UsageError
+from physgraph_usd.forces.base import ForceModule
+from physgraph_usd.forces.contact import Contact
 from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.network import PaperConfig, PhysgraphConfig
+from physgraph_usd.integrate.network import PhysgraphConfig
+from physgraph_usd.integrate.paper_network import PaperConfig
 from physgraph_usd.integrate.weights import load_network, random_network
 from physgraph_usd.train import record
 from physgraph_usd.train.bundle import Bundle, deal
@@ -44,6 +47,12 @@ reference_steps = 10
 @pytest.fixture(scope="module")
 def patches() -> list[Patch]:
     return make_patches(FEW, seed=3)
+
+
+@pytest.fixture(scope="module")
+def resting() -> list[Patch]:
+    """Patches on bodies."""
+    return make_patches(replace(FEW, touched=1.0), seed=3)
 
 
 def test_the_same_seed_makes_the_same_patches(patches: list[Patch]):
@@ -80,6 +89,20 @@ def test_elastic_patches_feel_stretch_and_bending_only():
         assert not bool(patch.group.levels[-1].free.all())
 
 
+def test_a_body_comes_through_a_part_of_its_patch_and_is_left(resting: list[Patch]):
+    for patch in resting:
+        assert patch.words.endswith("on a body")
+        level, system = patch.group.levels[-1], patch.systems[-1]
+        assert isinstance(system.field, ForceModule)
+        contact = system.field.forces[-1]
+        assert isinstance(contact, Contact)
+        base = level.base.apply(patch.group.systems([patch.frame])[1])
+        free = level.free.squeeze(1)
+        first, last = (contact.depths(x)[0][free] for x in (base, torch.as_tensor(patch.solved[-1])))
+        assert 0.0 < float((first > 0).float().mean()) < 1.0
+        assert float(last.mean()) < 0.5 * float(first.mean())
+
+
 def joint(patches: list[Patch], *, through_forces: bool = True) -> tuple[JointSystem, torch.Tensor]:
     bundle = Bundle(patches, device="cpu", through_forces=through_forces)
     return bundle.systems[-1], torch.cat([p.begin(len(p.systems) - 1) for p in patches])
@@ -97,7 +120,11 @@ def calm(patches: list[Patch]) -> list[Patch]:
         PhysgraphConfig(("secant", "metric", "metric.normal", "move1.strain", "diagonal.smooth"), 8, 2, 1, True),
     ],
 )
-def test_patches_side_by_side_move_as_they_do_alone(patches: list[Patch], config: PhysgraphConfig):
+@pytest.mark.parametrize("which", ["patches", "resting"])
+def test_patches_side_by_side_move_as_they_do_alone(
+    config: PhysgraphConfig, which: str, request: pytest.FixtureRequest
+):
+    patches: list[Patch] = request.getfixturevalue(which)
     integrator = integrator_of(random_network(config, seed=1, scale=0.1))
     patches = calm(patches)
     system, x = joint(patches)
@@ -115,8 +142,9 @@ def test_patches_side_by_side_move_as_they_do_alone(patches: list[Patch], config
         assert float(system.energies[-1][number]) == pytest.approx(carry.energy, rel=1e-4)
 
 
-def test_the_energys_gradient_is_minus_the_force(patches: list[Patch]):
-    system, x = joint(calm(patches))
+@pytest.mark.parametrize("which", ["patches", "resting"])
+def test_the_energys_gradient_is_minus_the_force(which: str, request: pytest.FixtureRequest):
+    system, x = joint(calm(request.getfixturevalue(which)))
     x.requires_grad_()
     system.energy_and_force(x)
     (gradient,) = torch.autograd.grad(system.energies[-1].sum(), x)

@@ -105,7 +105,7 @@ class Contact:
             form: "quadratic" or "linear".
         """
         self.planes = tuple(each for each in planes if len(each.vertex))
-        self._form, self._stiffness = form, stiffness
+        self._level, self._form, self._stiffness = level, form, stiffness
         self._areas = [level.vertex_area[each.vertex.long()] for each in self.planes]
         self._buffers = [torch.zeros_like(each) for each in self._areas]
         self._weights = [stiffness * area for area in self._areas]
@@ -143,6 +143,11 @@ class Contact:
             force[planes.vertex.long()] += weight.unsqueeze(1) * planes.normal
             energy = energy + (weight * depth).sum(dtype=torch.float64)
         return energy
+
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each plane [J] where the force was added last, and its garment; of the quadratic form."""
+        owners = [self._level.vertex_garment[each.vertex.long()] for each in self.planes]
+        return 0.5 * torch.cat(self._buffers), torch.cat(owners)
 
     def depths(self, x: Float[Tensor, "vertices 3"]) -> list[Float[Tensor, " planes"]]:
         """How far each vertex is behind each of its planes [m], not below zero; one entry a body."""

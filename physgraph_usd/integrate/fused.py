@@ -23,7 +23,7 @@ from torch import Tensor
 from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
 from .around import Around
-from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of
+from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of, pairs_of
 
 NORMAL, STRAIN = 1, 2
 """Parts of a vector that the kernels take themselves; 0 is the vector, and means over neighbours are given."""
@@ -62,14 +62,14 @@ class FusedPhysgraph:
         self._spans = [slice(a, b) for a, b in pairwise(starts)]
         self.bases, source, kind = in_bases(config.vectors)
         self._kinds = set(kind)
-        pairs = self.count * (self.count - 1) // 2
+        self._pairs = pairs_of(config).to(device)
+        pairs = self._pairs.shape[1]
         self._stack = torch.zeros((len(self.bases), vertices, 3), device=device)
         self._squares = torch.zeros((self.count, vertices), device=device)
         self._cosines, self._out = (torch.zeros((vertices, n), device=device) for n in (pairs, 3))
         self._scaled = torch.zeros((self.count, vertices if config.means else 1, 3), device=device)
         self._bias, means = network.encode.bias.detach(), network.encode_means.weight.detach()
         self._clock, self._at_means = means[:, 0], means[:, 1:]
-        self._pairs = torch.triu_indices(self.count, self.count, 1, device=device)
         layers = [network.encode, *network.hidden, network.decode]
         self._weights = [layer.weight.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
         self._biases = [layer.bias.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
@@ -86,7 +86,8 @@ class FusedPhysgraph:
         shared = [vertices, flat, *which, spacing, normal, strain]
         given = {"device": device, "lanes": lanes}
         seen = [wp.from_torch(self._squares), wp.from_torch(self._cosines), vectors(self._scaled.reshape(-1, 3))]
-        self._see = Launch(seeing(self.count, config.means), vertices, [*shared, *seen], **given)
+        between = tuple((a, b) for a, b in self._pairs.T.tolist())
+        self._see = Launch(seeing(self.count, between, config.means), vertices, [*shared, *seen], **given)
         ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
         self._combine = Launch(combining(self.count), vertices, [*shared, *ends], **given)
 
@@ -165,11 +166,12 @@ def part_of(s: wp.vec3f, kind: wp.int32, i: wp.int32, normal: wp.array(dtype=wp.
 
 
 @functools.cache
-def seeing(count: int, means: bool) -> wp.Kernel:
+def seeing(count: int, pairs: tuple[tuple[int, int], ...], means: bool) -> wp.Kernel:
     """The kernel that finds the features of each vertex.
 
     Args:
         count: Number of vectors.
+        pairs: The vectors between which there are cosines.
         means: Whether it keeps the vectors in local edge lengths, for the garments' means.
     """
     rows = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
@@ -202,11 +204,9 @@ def seeing(count: int, means: bool) -> wp.Kernel:
             unit[a, 0] = s[0]
             unit[a, 1] = s[1]
             unit[a, 2] = s[2]
-        row = wp.int32(0)
-        for a in range(wp.static(count)):
-            for b in range(a + 1, wp.static(count)):
-                cosines[i, row] = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
-                row = row + 1
+        for p in range(wp.static(len(pairs))):
+            a, b = wp.static(pairs[p][0]), wp.static(pairs[p][1])
+            cosines[i, p] = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
 
     return see
 

@@ -29,7 +29,8 @@ from ..errors import SolveError
 from .around import Around
 from .base import Carry, Surface, System
 from .fused import can_fuse, fused_physgraph
-from .network import Graph, PaperNetwork, Physgraph, Ways
+from .network import Graph, Physgraph
+from .paper_network import PaperNetwork, Ways
 from .recorded import FORCE, IMAGE, MOST_GARMENTS, SECANTS, Place, Recording
 
 NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)

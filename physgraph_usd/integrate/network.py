@@ -1,17 +1,15 @@
-"""The networks of the learned integrators; they see numbers without units and know no force (DESIGN 4.4).
+"""The network of our own learned integrator; it sees numbers without units and knows no force (DESIGN 4.4).
 
 `Physgraph` looks at a few vectors per vertex and answers with the coefficients of their combination. It is told only
 what a rotation does not change: logarithms of lengths, cosines, means over the garment. So the displacement turns with
 the cloth exactly, whatever the weights.
-
-`PaperNetwork` is the paper's encode-process-decode network (PAPER.md P3 to P5, choices A1 to A7, A17).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -72,6 +70,7 @@ class PhysgraphConfig:
         rounds: Rounds of message passing, with shared weights.
         strain: Show each vertex the strain of its edges.
         means: Show each vertex what its garment as a whole does; without, a patch moves as it would in any garment.
+        cosines: Between "all" vectors, or "few" of them (`pairs_of`).
     """
 
     vectors: tuple[str, ...] = ("metric", "metric1", "move1", "move2", "diagonal")
@@ -80,6 +79,7 @@ class PhysgraphConfig:
     rounds: int = 0
     strain: bool = False
     means: bool = True
+    cosines: str = "all"
 
 
 class Physgraph(nn.Module):
@@ -90,7 +90,7 @@ class Physgraph(nn.Module):
         super().__init__()
         self.config = config
         count, width = len(config.vectors), config.width
-        first, second = torch.triu_indices(count, count, 1)
+        first, second = pairs_of(config)
         self._first: Tensor
         self._second: Tensor
         self.register_buffer("_first", first, persistent=False)
@@ -163,6 +163,25 @@ class Physgraph(nn.Module):
         return self.update(torch.cat([torch.relu(h), mean], dim=1))  # V W
 
 
+def pairs_of(config: PhysgraphConfig) -> Int[Tensor, "2 pairs"]:
+    """The vectors between which a network sees cosines.
+
+    The part of v along the normal is parallel to that of w: of all their cosines a few say everything. "few" are those
+    between whole vectors, between a part and the vector that it is of, and between a part and the first of its kind.
+    """
+    names = [name.partition(".")[::2] for name in config.vectors]
+    kinds = [kind for _, kind in names]
+
+    def seen(a: int, b: int) -> bool:
+        (whole, kind), (other, part) = names[a], names[b]
+        own = whole == other and not (kind and part)
+        return kind == part == "" or own or (kind == part and kinds.index(kind) in (a, b))
+
+    count = len(names)
+    every = [(a, b) for a in range(count) for b in range(a + 1, count)]
+    return torch.tensor([pair for pair in every if config.cosines == "all" or seen(*pair)]).reshape(-1, 2).T
+
+
 def clock_of(step: int | Tensor) -> Any:
     """What the networks see of the number of steps made."""
     return torch.log1p(step) - 1.5 if isinstance(step, Tensor) else math.log1p(step) - 1.5
@@ -180,141 +199,3 @@ def _strain_features(strain: Tensor, graph: Graph) -> Tensor:
     mean = summed[:, :3] / summed[:, 3:].clamp_min(1.0)  # V 3
     mean = torch.cat([mean[:, :2], (mean[:, 2:] + FLOOR).sqrt()], dim=1)
     return torch.asinh(30.0 * mean)
-
-
-@dataclass(frozen=True, eq=False)
-class Ways:
-    """The edges in both directions, sorted by their receiver.
-
-    Attributes:
-        sender: Vertex that each starts from, shape (2E,).
-        receiver: Vertex that it ends at, shape (2E,).
-        degree: How many end at each vertex, shape (V,).
-    """
-
-    sender: Int[Tensor, " directed"]
-    receiver: Int[Tensor, " directed"]
-    degree: Int[Tensor, " vertices"]
-
-    @staticmethod
-    def of(edges: Int[Tensor, "edges 2"], vertices: int) -> Ways:
-        """Both ways of each edge."""
-        sender, receiver = torch.cat([edges, edges.flip(1)]).long().T
-        order = receiver.argsort(stable=True)
-        return Ways(sender[order], receiver[order], torch.bincount(receiver, minlength=vertices))
-
-
-@dataclass(frozen=True)
-class PaperConfig:
-    """Size of a `PaperNetwork`.
-
-    Attributes:
-        latent: Numbers per vertex and edge inside.
-        rounds: Rounds of message passing.
-        history: Displacements and forces shown (H).
-        shared: All rounds have the same weights.
-        features: "scaled" without units (A7) or "paper", metres and newtons as they are.
-    """
-
-    latent: int = 128
-    rounds: int = 10
-    history: int = 2
-    shared: bool = True
-    features: str = "scaled"
-
-
-class PaperNetwork(nn.Module):
-    """Encode, process, decode; two hidden layers, LayerNorm on all but the decoder, residuals, sums (A2)."""
-
-    def __init__(self, config: PaperConfig) -> None:
-        """Make the five perceptrons; the decoder's last layer starts at zero (A6)."""
-        super().__init__()
-        self.config = config
-        latent, rounds = config.latent, 1 if config.shared else config.rounds
-        self.vertex_scale, self.edge_scale = Normaliser(6 * config.history), Normaliser(8)
-        self.encode_vertex = _perceptron(6 * config.history + 1, latent, latent)
-        self.encode_edge = _perceptron(8, latent, latent)
-        self.update_edge = nn.ModuleList(_perceptron(3 * latent, latent, latent) for _ in range(rounds))
-        self.update_vertex = nn.ModuleList(_perceptron(2 * latent, latent, latent) for _ in range(rounds))
-        self.decode = _perceptron(latent, latent, 3, norm=False)
-        self.step_length = nn.Parameter(torch.tensor(1.0))
-        for parameter in self.decode[-1].parameters():
-            nn.init.zeros_(parameter)
-
-    def forward(
-        self,
-        vertex: Float[Tensor, "vertices features"],
-        edge: Float[Tensor, "directed 8"],
-        fixed: Float[Tensor, "vertices 1"],
-        *,
-        ways: Ways,
-    ) -> Float[Tensor, "vertices 3"]:
-        """Displacement in local edge lengths.
-
-        Args:
-            vertex: Past displacements and forces (P3).
-            edge: Present and rest spans and their lengths (P4), of each edge in both directions (A3).
-            fixed: 1 where a vertex may not move (A17).
-            ways: The edges in both directions.
-        """
-        v = self.encode_vertex(torch.cat([self.vertex_scale(vertex), fixed], dim=1))  # V L
-        e = self.encode_edge(self.edge_scale(edge))  # 2E L
-        for k in range(self.config.rounds):
-            own = 0 if self.config.shared else k
-            e = self._edge_update(self.update_edge[own], v, e, ways)  # 2E L
-            gathered = torch.segment_reduce(e, "sum", lengths=ways.degree, axis=0, unsafe=True)  # V L
-            v = v + self.update_vertex[own](torch.cat([v, gathered], dim=1))  # V L
-        return self.step_length * self.decode(v)  # V 3
-
-    def _edge_update(self, perceptron: nn.Module, v: Tensor, e: Tensor, ways: Ways) -> Tensor:
-        """The perceptron of (receiver, sender, edge); its first layer meets each vertex once, not once an edge."""
-        first, *others = cast(nn.Sequential, perceptron)
-        at_receiver, at_sender, at_edge = cast(nn.Linear, first).weight.chunk(3, dim=1)
-        from_receiver, from_sender = v @ at_receiver.T, v @ at_sender.T
-        bias = cast(nn.Linear, first).bias
-
-        h = nn.functional.linear(e, at_edge, bias)
-        h = h + from_receiver[ways.receiver] + from_sender[ways.sender]
-        for layer in others:
-            h = layer(h)
-        return e + h
-
-
-class Normaliser(nn.Module):
-    """Scales features by their mean and deviation, gathered while training until it is frozen (A5)."""
-
-    def __init__(self, width: int, *, most: int = 1000) -> None:
-        """Start with nothing gathered.
-
-        Args:
-            width: Number of features.
-            most: Calls in training after which the statistics stay.
-        """
-        super().__init__()
-        self._most = most
-        self.count: Tensor
-        self.calls: Tensor
-        self.total: Tensor
-        self.square: Tensor
-        for name, shape in (("count", ()), ("calls", ()), ("total", (width,)), ("square", (width,))):
-            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
-
-    def forward(self, features: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
-        """Scaled features."""
-        if self.training and float(self.calls) < self._most:
-            shown = features.detach().double()
-            self.calls += 1
-            self.count += len(shown)
-            self.total += shown.sum(dim=0)
-            self.square += shown.square().sum(dim=0)
-        count = self.count.clamp_min(1.0)
-        mean = self.total / count
-        deviation = (self.square / count - mean.square()).clamp_min(1e-16).sqrt()
-        known = self.count > 0
-        mean, deviation = torch.where(known, mean, 0.0), torch.where(known, deviation, 1.0)
-        return (features - mean.to(features)) / deviation.to(features)
-
-
-def _perceptron(inputs: int, latent: int, outputs: int, *, norm: bool = True) -> nn.Sequential:
-    layers = [nn.Linear(inputs, latent), nn.ReLU(), nn.Linear(latent, latent), nn.ReLU(), nn.Linear(latent, outputs)]
-    return nn.Sequential(*layers, nn.LayerNorm(outputs)) if norm else nn.Sequential(*layers)

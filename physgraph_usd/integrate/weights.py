@@ -19,7 +19,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from ..errors import WeightsError
-from .network import VECTORS, PaperConfig, PaperNetwork, Physgraph, PhysgraphConfig
+from .network import VECTORS, Physgraph, PhysgraphConfig
+from .paper_network import PaperConfig, PaperNetwork
 
 VERSION = "1"
 """Format of the file and meaning of the features; other versions are refused."""

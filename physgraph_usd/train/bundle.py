@@ -13,6 +13,7 @@ from torch import Tensor
 from ..group import Group, SolveSettings
 from ..integrate import METHODS
 from ..level import refine_garments
+from .bodies import with_bodies
 from .patches import Patch
 from .unroll import JointSystem
 
@@ -39,7 +40,8 @@ class Bundle:
         settings = SolveSettings(METHODS["quasi-newton"])
         chains = refine_garments(garments, [count] * len(garments))
         group = Group(garments, chains, patches[0].gravity, settings, dtype=torch.float32, device=device)
-        systems, _ = group.systems([patch.frame for patch in patches])
+        plain, coarse = group.systems([patch.frame for patch in patches])
+        systems = with_bodies(plain, group.levels, coarse, [patch.body for patch in patches])
         self.systems = [JointSystem(system, through_forces=through_forces) for system in systems]
         self.levels = len(systems)
         self._from_below = [level.from_below for level in group.levels]

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from ..integrate.base import Integrator
 from ..integrate.learned import integrator_of
-from ..integrate.network import PaperConfig, PaperNetwork, Physgraph, PhysgraphConfig
+from ..integrate.network import Physgraph, PhysgraphConfig
+from ..integrate.paper_network import PaperConfig, PaperNetwork
 from ..integrate.quasi_newton import QuasiNewton
 from ..integrate.weights import make_network
 from .bundle import Bundle, deal

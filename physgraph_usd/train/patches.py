@@ -30,6 +30,7 @@ from ..level import refine_garments
 from ..mesh.topology import PolygonMesh, edges_of
 from ..scene import Garment, GarmentFrame
 from ..shot import prepare_device
+from .bodies import Body, with_bodies
 
 SHAPES = ("sheet", "tube", "dome")
 BORDERS = ("fixed", "one side", "free")
@@ -47,6 +48,7 @@ class PatchConfig:
         elastic: Stretch and bending only, the border fixed, as in the paper; else gravity and guide too.
         most_vertices: Finest vertices beyond which a patch has one level less.
         reference_steps: Quasi-Newton steps a level behind the least energy known.
+        touched: Part of the patches that rest on a body.
     """
 
     count: int = 64
@@ -56,6 +58,7 @@ class PatchConfig:
     elastic: bool = False
     most_vertices: int = 4000
     reference_steps: int = 150
+    touched: float = 0.0
 
 
 @dataclass(eq=False)
@@ -67,6 +70,7 @@ class Patch:
         frame: Its pose, about the origin, and fabric.
         gravity: [m/s^2], shape (3,).
         words: What it is.
+        body: What it rests on, or None.
         raw: Upsampled cage at each level [m], float32, off the saddle where it is flat.
         start: Its energy without leaving the saddle [J].
         least: Least energy known at each level [J].
@@ -77,6 +81,7 @@ class Patch:
     frame: GarmentFrame
     gravity: np.ndarray
     words: str
+    body: Body | None = None
     raw: list[np.ndarray] = field(default_factory=list)
     start: list[float] = field(default_factory=list)
     least: list[float] = field(default_factory=list)
@@ -90,7 +95,8 @@ class Patch:
     @cached_property
     def systems(self) -> list[System]:
         """One system a level, cage first."""
-        return self.group.systems([self.frame])[0]
+        systems, coarse = self.group.systems([self.frame])
+        return with_bodies(systems, self.group.levels, coarse, [self.body])
 
     def begin(self, index: int) -> Tensor:
         """The upsampled cage at a level [m], off the saddle where it is flat."""
@@ -175,7 +181,11 @@ def _patch(config: PatchConfig, rng: np.random.Generator) -> Patch:
         points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)
     frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
     words = f"{shape}, {'quads' if not mesh.is_triangles else 'triangles'}, border {border}, levels {levels}"
-    return Patch(garment, frame, gravity, words)
+    body = None
+    if config.touched and rng.random() < config.touched:
+        size = float(np.ptp(points, axis=0).max())
+        body, words = Body.random(rng, size=size, edge=edge, stretch=fabric.stretch), f"{words}, on a body"
+    return Patch(garment, frame, gravity, words, body)
 
 
 def _mesh(config: PatchConfig, rng: np.random.Generator) -> tuple[PolygonMesh, np.ndarray, bool]:

@@ -16,7 +16,8 @@ import torch
 
 from .. import __version__
 from ..errors import UsageError
-from ..integrate.network import VECTORS, PaperConfig, PhysgraphConfig
+from ..integrate.network import VECTORS, PhysgraphConfig
+from ..integrate.paper_network import PaperConfig
 from ..integrate.weights import save_network
 from .loop import TrainConfig, Trainer
 from .patches import PatchConfig, describe

@@ -13,7 +13,8 @@ from physgraph_usd.fabric import Fabric
 from physgraph_usd.integrate.base import Carry, System
 from physgraph_usd.integrate.guard import Guard
 from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.network import VECTORS, PaperConfig, PhysgraphConfig
+from physgraph_usd.integrate.network import VECTORS, PhysgraphConfig
+from physgraph_usd.integrate.paper_network import PaperConfig
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network, random_network
