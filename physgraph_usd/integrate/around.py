@@ -5,7 +5,7 @@ A vector v of a vertex gives others that turn with the cloth as v does, and that
 | name | vector | what for |
 |---|---|---|
 | ``v.normal`` | (v . n) n | cloth is soft across itself and stiff along itself |
-| ``v.strain`` | E v, E = mean of asinh(e / `STRAIN`) u u^T over the edges | it folds along what is compressed |
+| ``v.strain`` | E v, E = mean of `squashed` e / `STRAIN` u u^T over the edges | it folds along what is compressed |
 | ``v.smooth`` | mean of v over the neighbours | coarse and fine waves want steps of different lengths |
 """
 
@@ -31,7 +31,7 @@ from .base import Surface
 
 PARTS = ("normal", "strain", "smooth")
 SHOWN = 30.0
-"""What strains are multiplied by before a network sees their asinh."""
+"""What strains are multiplied by before a network sees them `squashed`."""
 FLOOR = 1e-9
 """Added to mean squares before their root."""
 STRAIN = 0.03
@@ -63,30 +63,37 @@ class Around:
         self._tables.normals({2: vectors(self._x), 3: vectors(out)})
         return out
 
-    @cached_property
+    @property
     def strain(self) -> Float[Tensor, "vertices 3 3"]:
         """E of each vertex."""
-        along, amount = self._edges
-        out = self._x.new_empty(len(self._x), 3, 3)
-        wide = wp.types.matrix(shape=(3, 3), dtype=SCALAR[self._x.dtype])
-        shown = torch.asinh(amount / STRAIN)
-        self._tables.strains({3: vectors(along), 4: wp.from_torch(shown), 5: wp.from_torch(out, dtype=wide)})
-        return out
+        return self._strained[0]
 
-    @cached_property
+    @property
     def stretch(self) -> Float[Tensor, "vertices 3"]:
         """Mean, mean compression and root mean square of the strain of each vertex's edges, as networks see them."""
-        out = torch.empty_like(self._x)
-        self._tables.stretches({3: wp.from_torch(self._edges[1]), 4: vectors(out)})
-        return torch.asinh(SHOWN * out)
+        return self._strained[1]
 
     @cached_property
-    def _edges(self) -> tuple[Float[Tensor, "edges 3"], Float[Tensor, " edges"]]:
-        """Direction and strain of each edge."""
-        along = self._x.new_empty(self._tables.edges, 3)
-        amount = self._x.new_empty(self._tables.edges)
-        self._tables.spans({2: vectors(self._x), 3: vectors(along), 4: wp.from_torch(amount)})
-        return along, amount
+    def _strained(self) -> tuple[Float[Tensor, "vertices 3 3"], Float[Tensor, "vertices 3"]]:
+        """`strain` and `stretch`."""
+        matrix, seen = self._x.new_empty(len(self._x), 3, 3), torch.empty_like(self._x)
+        wide = wp.types.matrix(shape=(3, 3), dtype=SCALAR[self._x.dtype])
+        self._tables.strains({3: vectors(self._x), 4: wp.from_torch(matrix, dtype=wide), 5: vectors(seen)})
+        return matrix, seen
+
+    def smooth_rows(self, rows: Float[Tensor, "rows vertices 3"], which: tuple[int, ...]) -> None:
+        """Write the means over the neighbours of some vectors behind them.
+
+        Args:
+            rows: Vectors, and at the end as many rows to write as there are means.
+            which: Rows whose means are wanted.
+        """
+        self._tables.means(rows.shape[0], which)({4: vectors(rows.reshape(-1, 3))})
+
+
+def squashed(strain: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """a / sqrt(1 + |a|): small strains as they are, large ones by their root."""
+    return strain / (1.0 + strain.abs()).sqrt()
 
 
 class _Tables:
@@ -99,27 +106,36 @@ class _Tables:
         others = triangles[corner.element]
         turned = np.take_along_axis(others, (corner.corner[:, None] + [1, 2]) % 3, axis=1).astype(np.int32)
         far = edges[end.element, 1 - end.corner].astype(np.int32)
-        self.edges = len(edges)
         x = vectors(torch.zeros_like(level.rest))
         wide = wp.zeros(count, dtype=wp.types.matrix(shape=(3, 3), dtype=SCALAR[dtype]), device=device)
 
         def ints(values: np.ndarray, kind: Any = wp.int32) -> wp.array:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=device)
 
-        given = {"device": device, "lanes": level.lanes}
-        self.normals = Launch(_NORMALS[dtype], count, [ints(corner.starts), ints(turned, wp.vec2i), x, x], **given)
-        rest = wp.array(level.rest_length.double().cpu().numpy(), dtype=SCALAR[dtype], device=device)
-        along, amount = vectors(level.rest.new_zeros(self.edges, 3)), wp.from_torch(level.rest.new_zeros(self.edges))
-        pairs = ints(edges, wp.vec2i)
-        self.spans = Launch(_SPANS[dtype], self.edges, [pairs, rest, x, along, amount], **given)
-        around = [ints(end.starts), ints(end.element)]
-        self.strains = Launch(_STRAINS[dtype], count, [*around, rest, along, amount, wide], **given)
-        self.stretches = Launch(_STRETCHES[dtype], count, [*around, rest, amount, x], **given)
+        self._given = given = {"device": device, "lanes": level.lanes}
+        self.normals = Launch(
+            _NORMALS[dtype], count, [ints(corner.starts), ints(turned, wp.vec2i), x, x], **self._given
+        )
+        lengths = level.rest_length.double().cpu().numpy()[end.element]
+        rest = wp.array(lengths, dtype=SCALAR[dtype], device=device)
+        self._around = [ints(end.starts), ints(far)]
+        self.strains = Launch(_STRAINS[dtype], count, [*self._around, rest, x, wide, x], **given)
+        self._count, self._dtype, self._means = count, dtype, dict[tuple[int, ...], Launch]()
         degree = np.diff(end.starts)
         weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
         mean = sp.csr_matrix((weights, far, end.starts), shape=(count, count))
-        self._mean = Stencil(mean, dtype=dtype, device=device, lanes=level.lanes)
-        self._back = Stencil(sp.csr_matrix(mean.T), dtype=dtype, device=device, lanes=level.lanes)
+        self._mean = Stencil(mean, dtype=dtype, **given)
+        self._back = Stencil(sp.csr_matrix(mean.T), dtype=dtype, **given)
+
+    def means(self, rows: int, which: tuple[int, ...]) -> Launch:
+        """The kernel that writes means of some of so many rows at their end."""
+        key = (rows, *which)
+        if key not in self._means:
+            numbers = wp.array(np.array(which, np.int32), dtype=wp.int32, device=self._given["device"])
+            x = vectors(torch.zeros((1, 3), dtype=self._dtype, device=self._given["device"]))
+            inputs = [*self._around, numbers, rows - len(which), x]
+            self._means[key] = Launch(_MEANS[self._dtype], self._count, inputs, **self._given)
+        return self._means[key]
 
     def smooth(self, vector: Tensor) -> Tensor:
         """Mean over the neighbours; gradients flow through."""
@@ -157,75 +173,72 @@ def _normals(
     out[i] = wp.normalize(total)
 
 
-@wp.kernel
-def _spans(
-    first: wp.int32,
-    ends: wp.array(dtype=wp.vec2i),
-    rest: wp.array(dtype=Any),
-    x: wp.array(dtype=Any),
-    along: wp.array(dtype=Any),
-    amount: wp.array(dtype=Any),
-):
-    e = first + wp.tid()
-    span = x[ends[e][1]] - x[ends[e][0]]
-    length = wp.max(wp.length(span), rest[e] * rest.dtype(1.0e-6))
-    along[e] = span / length
-    amount[e] = length / rest[e] - rest.dtype(1.0)
+@wp.func
+def squash(a: Any):
+    """`squashed` of a number."""
+    return a / wp.sqrt(type(a)(1.0) + wp.abs(a))
 
 
 @wp.kernel
 def _strains(
     first: wp.int32,
     starts: wp.array(dtype=wp.int32),
-    edges: wp.array(dtype=wp.int32),
+    far: wp.array(dtype=wp.int32),
     rest: wp.array(dtype=Any),
-    along: wp.array(dtype=Any),
-    amount: wp.array(dtype=Any),
-    out: wp.array(dtype=Any),
+    x: wp.array(dtype=Any),
+    matrix: wp.array(dtype=Any),
+    seen: wp.array(dtype=Any),
 ):
     i = first + wp.tid()
-    zero = along[0] - along[0]
+    zero = x[0] - x[0]
     total = wp.outer(zero, zero)
-    for k in range(starts[i], starts[i + 1]):
-        e = edges[k]
-        total += amount[e] * wp.outer(along[e], along[e])
-    out[i] = total / rest.dtype(wp.max(starts[i + 1] - starts[i], 1))
-
-
-@wp.kernel
-def _stretches(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    edges: wp.array(dtype=wp.int32),
-    rest: wp.array(dtype=Any),
-    amount: wp.array(dtype=Any),
-    out: wp.array(dtype=Any),
-):
-    i = first + wp.tid()
     mean = rest.dtype(0.0)
     below = rest.dtype(0.0)
     square = rest.dtype(0.0)
     for k in range(starts[i], starts[i + 1]):
-        e = amount[edges[k]]
+        span = x[far[k]] - x[i]
+        length = wp.max(wp.length(span), rest[k] * rest.dtype(1.0e-6))
+        e = length / rest[k] - rest.dtype(1.0)
+        total += squash(e / rest.dtype(wp.static(STRAIN))) / (length * length) * wp.outer(span, span)
         mean += e
         below += wp.min(e, rest.dtype(0.0))
         square += e * e
     share = rest.dtype(1.0) / rest.dtype(wp.max(starts[i + 1] - starts[i], 1))
-    v = out[i]
-    v[0] = mean * share
-    v[1] = below * share
-    v[2] = wp.sqrt(square * share + rest.dtype(wp.static(FLOOR)))
-    out[i] = v
+    shown = rest.dtype(wp.static(SHOWN))
+    matrix[i] = share * total
+    v = seen[i]
+    v[0] = squash(shown * share * mean)
+    v[1] = squash(shown * share * below)
+    v[2] = squash(shown * wp.sqrt(square * share + rest.dtype(wp.static(FLOOR))))
+    seen[i] = v
+
+
+@wp.kernel
+def _means(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    far: wp.array(dtype=wp.int32),
+    which: wp.array(dtype=wp.int32),
+    behind: wp.int32,
+    rows: wp.array(dtype=Any),
+):
+    i = first + wp.tid()
+    count = starts.shape[0] - 1
+    for s in range(which.shape[0]):
+        total = rows[i] - rows[i]
+        for k in range(starts[i], starts[i + 1]):
+            total += rows[which[s] * count + far[k]]
+        rows[(behind + s) * count + i] = total / type(total[0])(wp.max(starts[i + 1] - starts[i], 1))
 
 
 def _arrays(t: torch.dtype, kinds: str) -> list[Any]:
-    """Types of a kernel's parameters: i integers, p pairs of them, s scalars, v vectors, m matrices."""
-    known = {"i": wp.int32, "p": wp.vec2i, "s": SCALAR[t], "v": VECTOR[t]}
+    """Types of a kernel's parameters: i integers, n a number, p pairs, s scalars, v vectors, m matrices."""
+    known: dict[str, Any] = {"i": wp.int32, "p": wp.vec2i, "s": SCALAR[t], "v": VECTOR[t]}
     known["m"] = wp.types.matrix(shape=(3, 3), dtype=SCALAR[t])
-    return [wp.int32, *(wp.array(dtype=known[kind]) for kind in kinds)]
+    return [wp.int32, *(wp.int32 if kind == "n" else wp.array(dtype=known[kind]) for kind in kinds)]
 
 
-_NORMALS, _SPANS, _STRAINS, _STRETCHES = (
+_NORMALS, _STRAINS, _MEANS = (
     {t: wp.overload(kernel, _arrays(t, kinds)) for t in VECTOR}
-    for kernel, kinds in ((_normals, "ipvv"), (_spans, "psvvs"), (_strains, "iisvsm"), (_stretches, "iissv"))
+    for kernel, kinds in ((_normals, "ipvv"), (_strains, "iisvmv"), (_means, "iiinv"))
 )

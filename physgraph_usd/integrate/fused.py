@@ -13,7 +13,6 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import torch
 import warp as wp
@@ -26,7 +25,8 @@ from .around import Around
 from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of, pairs_of
 
 NORMAL, STRAIN = 1, 2
-"""Parts of a vector that the kernels take themselves; 0 is the vector, and means over neighbours are given."""
+"""Parts of a vector that the kernels take themselves; 0 is a row as it is: a whole vector or its mean."""
+Parts = tuple[tuple[int, int], ...]
 LOG_SCALE = 0.5 / math.log(10.0)
 LOG_OFFSET = 1.5
 """The networks see (log10 + 3) / 2 of a length."""
@@ -60,11 +60,11 @@ class FusedPhysgraph:
         self.vertices = vertices = starts[-1]
         self.count = len(config.vectors)
         self._spans = [slice(a, b) for a, b in pairwise(starts)]
-        self.bases, source, kind = in_bases(config.vectors)
-        self._kinds = set(kind)
+        self.bases, self._smoothed, self._parts = in_rows(config.vectors)
+        self._kinds = {kind for _, kind in self._parts}
         self._pairs = pairs_of(config).to(device)
         pairs = self._pairs.shape[1]
-        self._stack = torch.zeros((len(self.bases), vertices, 3), device=device)
+        self._rows = torch.zeros((len(self.bases) + len(self._smoothed), vertices, 3), device=device)
         self._squares = torch.zeros((self.count, vertices), device=device)
         self._cosines, self._out = (torch.zeros((vertices, n), device=device) for n in (pairs, 3))
         self._scaled = torch.zeros((self.count, vertices if config.means else 1, 3), device=device)
@@ -80,16 +80,15 @@ class FusedPhysgraph:
         self._bias = self._bias + LOG_OFFSET * lengths.sum(dim=1)
         self._at_lengths, self._at_cosines = 0.5 * LOG_SCALE * lengths, cosines.contiguous()
         self._layers = [torch.zeros((bias.numel(), vertices), device=device) for bias in self._biases]
-        which = [wp.array(values, dtype=wp.int32, device=device) for values in (source, kind)]
-        flat, spacing = vectors(self._stack.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
+        flat, spacing = vectors(self._rows.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
         normal, strain = (wp.zeros(1, dtype=t, device=device) for t in (wp.vec3f, wp.mat33f))
-        shared = [vertices, flat, *which, spacing, normal, strain]
+        shared = [vertices, flat, spacing, normal, strain]
         given = {"device": device, "lanes": lanes}
         seen = [wp.from_torch(self._squares), wp.from_torch(self._cosines), vectors(self._scaled.reshape(-1, 3))]
         between = tuple((a, b) for a, b in self._pairs.T.tolist())
-        self._see = Launch(seeing(self.count, between, config.means), vertices, [*shared, *seen], **given)
+        self._see = Launch(seeing(self._parts, between, config.means), vertices, [*shared, *seen], **given)
         ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
-        self._combine = Launch(combining(self.count), vertices, [*shared, *ends], **given)
+        self._combine = Launch(combining(self._parts), vertices, [*shared, *ends], **given)
 
     def __call__(
         self,
@@ -107,13 +106,15 @@ class FusedPhysgraph:
             step: Number of steps made before, a scalar on the device while steps are recorded.
             around: Gives the surroundings of the vertices; called where parts need them.
         """
-        torch.stack(list(bases), out=self._stack)
-        changed = {4: wp.from_torch(spacing, requires_grad=False)}
-        seen = around() if self._kinds & {NORMAL, STRAIN} or self._config.strain else None
+        torch.stack(list(bases), out=self._rows[: len(self.bases)])
+        changed = {2: wp.from_torch(spacing, requires_grad=False)}
+        seen = around() if self._kinds & {NORMAL, STRAIN} or self._smoothed or self._config.strain else None
+        if seen is not None and self._smoothed:
+            seen.smooth_rows(self._rows, self._smoothed)
         if seen is not None and NORMAL in self._kinds:
-            changed[5] = vectors(seen.normal)
+            changed[3] = vectors(seen.normal)
         if seen is not None and STRAIN in self._kinds:
-            changed[6] = wp.from_torch(seen.strain, dtype=wp.mat33f)
+            changed[4] = wp.from_torch(seen.strain, dtype=wp.mat33f)
         self._see(changed)
         h = self._layers[0]
         bias = self._bias + self._clock * clock_of(step)
@@ -147,43 +148,49 @@ def fused_physgraph(
     return FusedPhysgraph(network, starts, longest, device=device, lanes=lanes)
 
 
-def in_bases(names: Sequence[str]) -> tuple[tuple[str, ...], list[int], list[int]]:
-    """The vectors that a kernel must be given for vectors of these names, and for each the base and the part of it."""
-    whole = [name if name.endswith(".smooth") else name.partition(".")[0] for name in names]
-    bases = tuple(dict.fromkeys(whole))
-    kinds = [{"normal": NORMAL, "strain": STRAIN}.get(name.partition(".")[2], 0) for name in names]
-    return bases, [bases.index(name) for name in whole], kinds
+def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Parts]:
+    """The whole vectors behind vectors of these names, those whose means follow them, and each one's row and part."""
+    split = [name.partition(".")[::2] for name in names]
+    wholes = tuple(dict.fromkeys(whole for whole, _ in split))
+    smoothed = tuple(wholes.index(whole) for whole, part in split if part == "smooth")
+
+    def place(whole: str, part: str) -> tuple[int, int]:
+        row = wholes.index(whole)
+        if part == "smooth":
+            return len(wholes) + smoothed.index(row), 0
+        return row, {"normal": NORMAL, "strain": STRAIN}.get(part, 0)
+
+    return wholes, smoothed, tuple(place(*each) for each in split)
 
 
 @wp.func
-def part_of(s: wp.vec3f, kind: wp.int32, i: wp.int32, normal: wp.array(dtype=wp.vec3f), strain: wp.array(dtype=Any)):
+def part_of(v: wp.vec3f, kind: wp.int32, normal: wp.vec3f, strain: wp.mat33f):
     """A vector or its part."""
     if kind == wp.static(NORMAL):
-        s = normal[i] * wp.dot(s, normal[i])
+        v = normal * wp.dot(v, normal)
     if kind == wp.static(STRAIN):
-        s = strain[i] * s
-    return s
+        v = strain * v
+    return v
 
 
 @functools.cache
-def seeing(count: int, pairs: tuple[tuple[int, int], ...], means: bool) -> wp.Kernel:
+def seeing(parts: Parts, pairs: tuple[tuple[int, int], ...], means: bool) -> wp.Kernel:
     """The kernel that finds the features of each vertex.
 
     Args:
-        count: Number of vectors.
+        parts: Row and part of each vector.
         pairs: The vectors between which there are cosines.
         means: Whether it keeps the vectors in local edge lengths, for the garments' means.
     """
-    rows = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
+    units = wp.types.matrix(shape=(len(parts), 3), dtype=wp.float32)
     floor = FLOOR**2
+    kinds = {kind for _, kind in parts}
 
     @wp.kernel(module="unique")
     def see(
         first: wp.int32,
         vertices: wp.int32,
         v: wp.array(dtype=wp.vec3f),
-        source: wp.array(dtype=wp.int32),
-        kind: wp.array(dtype=wp.int32),
         spacing: wp.array(dtype=wp.float32),
         normal: wp.array(dtype=wp.vec3f),
         strain: wp.array(dtype=wp.mat33f),
@@ -192,36 +199,35 @@ def seeing(count: int, pairs: tuple[tuple[int, int], ...], means: bool) -> wp.Ke
         scaled: wp.array(dtype=wp.vec3f),
     ):
         i = first + wp.tid()
-        unit = rows()
+        unit, across, along = units(), wp.vec3f(), wp.mat33f()
+        if wp.static(NORMAL in kinds):
+            across = normal[i]
+        if wp.static(STRAIN in kinds):
+            along = strain[i]
         scale = wp.float32(1.0) / spacing[i]
-        for a in range(wp.static(count)):
-            s = part_of(v[source[a] * vertices + i], kind[a], i, normal, strain) * scale
+        for a in range(wp.static(len(parts))):
+            s = scale * part_of(v[wp.static(parts[a][0]) * vertices + i], wp.static(parts[a][1]), across, along)
             if wp.static(means):
                 scaled[a * vertices + i] = s
             square = wp.dot(s, s) + wp.float32(wp.static(floor))
             squares[a, i] = square
-            s = s * (wp.float32(1.0) / wp.sqrt(square))
-            unit[a, 0] = s[0]
-            unit[a, 1] = s[1]
-            unit[a, 2] = s[2]
+            unit[a] = s * (wp.float32(1.0) / wp.sqrt(square))
         for p in range(wp.static(len(pairs))):
-            a, b = wp.static(pairs[p][0]), wp.static(pairs[p][1])
-            cosines[i, p] = unit[a, 0] * unit[b, 0] + unit[a, 1] * unit[b, 1] + unit[a, 2] * unit[b, 2]
+            cosines[i, p] = wp.dot(unit[wp.static(pairs[p][0])], unit[wp.static(pairs[p][1])])
 
     return see
 
 
 @functools.cache
-def combining(count: int) -> wp.Kernel:
-    """The kernel that combines so many vectors."""
+def combining(parts: Parts) -> wp.Kernel:
+    """The kernel that combines vectors of which these are the rows and parts."""
+    kinds = {kind for _, kind in parts}
 
     @wp.kernel(module="unique")
     def combine(
         first: wp.int32,
         vertices: wp.int32,
         v: wp.array(dtype=wp.vec3f),
-        source: wp.array(dtype=wp.int32),
-        kind: wp.array(dtype=wp.int32),
         spacing: wp.array(dtype=wp.float32),
         normal: wp.array(dtype=wp.vec3f),
         strain: wp.array(dtype=wp.mat33f),
@@ -230,9 +236,14 @@ def combining(count: int) -> wp.Kernel:
         out: wp.array(dtype=wp.vec3f),
     ):
         i = first + wp.tid()
-        move = wp.vec3f()
-        for a in range(wp.static(count)):
-            move += coefficients[a, i] * part_of(v[source[a] * vertices + i], kind[a], i, normal, strain)
+        move, across, along = wp.vec3f(), wp.vec3f(), wp.mat33f()
+        if wp.static(NORMAL in kinds):
+            across = normal[i]
+        if wp.static(STRAIN in kinds):
+            along = strain[i]
+        for a in range(wp.static(len(parts))):
+            s = part_of(v[wp.static(parts[a][0]) * vertices + i], wp.static(parts[a][1]), across, along)
+            move += coefficients[a, i] * s
         far, most = wp.length(move), longest * spacing[i]
         if far > most:
             move = move * (most / far)

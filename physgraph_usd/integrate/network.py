@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from .around import PARTS
+from .around import PARTS, SHOWN, squashed
 
 WHOLE = ("metric", "metric1", "metric2", "move1", "move2", "diagonal", "diagonal1", "secant")
 """Vectors of a vertex: H0^-1 F now and one and two steps ago, the last displacements, the force over H0's diagonal now
@@ -192,10 +192,10 @@ def _scaled_log(length: Tensor) -> Tensor:
 
 
 def _strain_features(strain: Tensor, graph: Graph) -> Tensor:
-    """Mean, mean compression and root mean square of the strain at each vertex, compressed by asinh."""
+    """Mean, mean compression and root mean square of the strain at each vertex, as `Around.stretch` has them."""
     ends = graph.edges.long().T.reshape(-1)
     shown = torch.stack([strain, strain.clamp_max(0.0), strain.square(), torch.ones_like(strain)], dim=1)  # E 4
     summed = strain.new_zeros(len(graph.spacing), 4).index_add_(0, ends, shown.repeat(2, 1))  # V 4
     mean = summed[:, :3] / summed[:, 3:].clamp_min(1.0)  # V 3
     mean = torch.cat([mean[:, :2], (mean[:, 2:] + FLOOR).sqrt()], dim=1)
-    return torch.asinh(30.0 * mean)
+    return squashed(SHOWN * mean)
