@@ -27,6 +27,9 @@ VECTORS = (*WHOLE, *(f"{name}.{part}" for name in WHOLE for part in PARTS))
 
 FLOOR = 1e-9
 """Lengths below this many edges count as none."""
+PIECE = 4096
+"""Edges that are updated at once on a CPU: what lies between the layers of more does not stay in its cache, and from
+32 MB on the system hands out fresh pages each time."""
 FEW = 8
 """Garments up to which sums over each are made one by one."""
 
@@ -273,11 +276,17 @@ class PaperNetwork(nn.Module):
         from_receiver, from_sender = v @ at_receiver.T, v @ at_sender.T
         bias = cast(nn.Linear, first).bias
 
-        h = nn.functional.linear(e, at_edge, bias)
-        h = h + from_receiver[ways.receiver] + from_sender[ways.sender]
-        for layer in others:
-            h = layer(h)
-        return e + h
+        def change(e: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+            h = nn.functional.linear(e, at_edge, bias)
+            h = h + from_receiver[receiver] + from_sender[sender]
+            for layer in others:
+                h = layer(h)
+            return h
+
+        if torch.is_grad_enabled() or e.device.type != "cpu":
+            return e + change(e, ways.receiver, ways.sender)
+        pieces = (part.split(PIECE) for part in (e, ways.receiver, ways.sender))
+        return torch.cat([part + change(part, *ends) for part, *ends in zip(*pieces, strict=True)])
 
 
 class Normaliser(nn.Module):
