@@ -85,7 +85,11 @@ def _trace(chart: Chart, name: str, style: Style, *, field: str, first: bool) ->
         showlegend=first,
         mode="markers" if name in SIGNS else "lines+markers",
         line={"color": style.colour, "dash": "dash" if style.dashed else "solid", "width": 2},
-        marker={"symbol": SIGNS.get(name, "circle"), "size": 16 if name == DEFAULT else 8, "color": style.colour},
+        marker={
+            "symbol": SIGNS.get(name, "triangle-up" if style.outside else "circle"),
+            "size": 16 if name == DEFAULT else 8,
+            "color": style.colour,
+        },
         customdata=said,
         hovertemplate=f"<b>{html.escape(name)}</b><br>%{{customdata}}<extra></extra>",
     )

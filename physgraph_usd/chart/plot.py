@@ -88,8 +88,8 @@ def _line(axes: Axes, name: str, points: Sequence[Point], style: Style, heights:
         heights,
         color=style.colour,
         linestyle="" if alone else "--" if style.dashed else "-",
-        marker=ONE_POINT.get(name, "o"),
-        markersize=11 if name == DEFAULT else 5 if alone else 3,
+        marker=ONE_POINT.get(name, "^" if style.outside else "o"),
+        markersize=11 if name == DEFAULT else 5 if alone or style.outside else 3,
         linewidth=1.4,
         zorder=5 if name == DEFAULT else 2,
         label=name,
@@ -103,8 +103,14 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, look: dict[str,
         points = [point for point in chart.curve(method) if getattr(point, name) is not None]
         _line(axes, method, points, look[method], [float(getattr(p, name)) for p in points])
     axes.set(xscale="log", xlabel="milliseconds a frame", title=words[0].upper() + words[1:])
-    axes.set_yscale("symlog", linthresh={"percent": 0.01, "strain": 0.1, "apart_mm": 0.1}.get(name, 1.0))
-    axes.set_ylim(bottom=0)
+    if name in chart.likeness:
+        alone = [getattr(point, name) or 0.0 for each in ONE_POINT for point in chart.curve(each)]
+        axes.set_ylim(0, 1.5 * max(alone, default=0.0) or None)
+        for line in axes.lines:  # A solver that flew apart flies out of the picture.
+            line.set_clip_on(True)
+    else:
+        axes.set_yscale("symlog", linthresh=0.01 if name == "percent" else 1.0)
+        axes.set_ylim(bottom=0)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
