@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("pxr", reason="charts read stages with usd-core")
@@ -30,12 +31,14 @@ from physgraph_usd.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
 from physgraph_usd.chart.options import LONG, SHORT, ChartOptions
 from physgraph_usd.chart.peers.run import PEERS, Peer, parse_peers
 from physgraph_usd.chart.plan import make_plan
+from physgraph_usd.chart.reference import Solutions
 from physgraph_usd.chart.run import chart_shot
 from physgraph_usd.chart.table import Chart, Point, typical
 from physgraph_usd.chart.words import settings
 from physgraph_usd.errors import UsageError
 from physgraph_usd.integrate import METHODS, Method
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.scene import Frame
 
 ECHO = """
 import sys
@@ -123,6 +126,24 @@ def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Char
     after = garment["contact"]["bodies"]["/World/ball"]["after"]
     assert (own.inside, own.crossings) == (after["inside"], after["crossings"])
     assert chart.curve(UPSAMPLED)[0].inside > 0
+
+
+def test_shapes_come_nearer_to_the_reference(made: tuple[Path, Path, Chart], tmp_path: Path):
+    chart = made[2]
+    far, near = chart.curve(UPSAMPLED)[0].apart_mm, chart.curve(DEFAULT)[0].apart_mm
+    assert far is not None
+    assert near is not None
+    assert 0.0 < near < 0.5 * far
+    assert not chart.likeness, "it is drawn where there are solvers outside"
+
+
+def test_positions_of_a_reference_are_found_again_and_not_of_another_chart(tmp_path: Path):
+    points = (np.zeros((4, 3)), np.ones((2, 3)))
+    frame = Frame(time=2.5, garments=(), colliders=())
+    Solutions(tmp_path, fresh=True).keep(2.5, points)
+    moved = tuple(each + np.array([0.003, 0.0, 0.004]) for each in points)
+    assert Solutions(tmp_path, fresh=False).apart_mm(frame, moved) == pytest.approx(5.0)
+    assert Solutions(tmp_path, fresh=True).apart_mm(frame, moved) is None
 
 
 def test_terms_tell_what_is_worse_without_them(made: tuple[Path, Path, Chart]):
@@ -297,6 +318,10 @@ def test_a_solver_outside_is_measured_by_the_same_ruler(
     assert chart.curve("Echo")[0].gap == pytest.approx(1.0, abs=1e-6)
     assert chart.curve("Echo")[0].ms == 5.0
     assert "nothing of the problem" in settings(chart.curve("Echo")[0])
+    assert chart.curve("Echo")[0].apart_mm == pytest.approx(chart.curve(UPSAMPLED)[0].apart_mm, abs=1e-4)
+    assert "Echo was given nothing of the problem" in list(chart.lines())
+    assert set(chart.likeness) == {"strain", "apart_mm"}
+    assert "was given" in (tmp_path / "out" / "chart.html").read_text(encoding="utf-8")
 
 
 def test_a_solver_outside_that_fails_is_told(made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any):

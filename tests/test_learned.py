@@ -20,7 +20,7 @@ from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.group import Group
-from physgraph_usd.integrate import METHODS
+from physgraph_usd.integrate import METHODS, paper_network
 from physgraph_usd.integrate.base import Carry, Integrator, System
 from physgraph_usd.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
 from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
@@ -65,6 +65,19 @@ def test_untrained_the_papers_network_stays():
     system, x = problem()
     carry = run(integrator_of(make_network(PAPER).eval().requires_grad_(False)), system, x)
     assert torch.equal(carry.x, x)
+
+
+def test_edges_in_pieces_are_the_edges_at_once(monkeypatch: pytest.MonkeyPatch):
+    """Without gradients a CPU updates edges piece by piece; with them all go at once."""
+    system, x = problem()
+    integrator = integrator_of(random_network(PAPER, seed=3, scale=SMALL))
+    with torch.enable_grad():
+        whole = run(integrator, system, x)
+    monkeypatch.setattr(paper_network, "PIECE", 7)
+    with torch.no_grad():
+        pieces = run(integrator, system, x)
+    assert not torch.equal(whole.x, x)
+    assert torch.allclose(pieces.x, whole.x, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("more", [{"means": False}, {"means": False, "strain": True}, {"strain": True, "depth": 3}])

@@ -12,12 +12,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
+
 from ..errors import SolveError
 from ..scene import Frame
 from .journal import Journal
 from .methods import DEFAULT, SMOOTH, UPSAMPLED, Curve
 from .plan import Clock, Plan
 from .problem import COLD, Problem
+from .reference import Solutions
 
 FLAT = 1e-4
 """Fall of the energy over a rung, over the whole fall, under which a method has stopped getting anywhere."""
@@ -32,6 +35,7 @@ def measure_curves(
     curves: Sequence[Curve],
     plan: Plan,
     clock: Clock,
+    solutions: Solutions,
 ) -> None:
     """Measure every curve into the journal; rows that are there are not measured again.
 
@@ -42,8 +46,9 @@ def measure_curves(
         curves: The methods.
         plan: Repeats, rungs and the longest time.
         clock: Tells when to stop.
+        solutions: What the results are compared to.
     """
-    bench = _Bench(journal, problems, frames, plan=plan, clock=clock)
+    bench = _Bench(journal, problems, frames, plan=plan, clock=clock, solutions=solutions)
     bench.without_physics()
     first_above = next(steps for steps in rungs(plan.growth) if steps >= COLD.steps)
     for repeat in range(plan.repeats):
@@ -80,8 +85,10 @@ class _Bench:
         *,
         plan: Plan,
         clock: Clock,
+        solutions: Solutions,
     ) -> None:
         self._journal, self._frames, self._plan, self._clock = journal, frames, plan, clock
+        self._solutions = solutions
         self._timed, self._judge = problems
 
     def without_physics(self) -> None:
@@ -93,7 +100,7 @@ class _Bench:
                 began = time.perf_counter()
                 points = self._timed.upsampled(frame, smooth=smooth)
                 spent = 1e3 * (time.perf_counter() - began)
-                found = asdict(self._judge.judge(frame, points))
+                found = self._judged(frame, points)
                 self._add(name, frame, spent, steps=0, repeat=0, made=0, **found)
 
     def run(self, name: str, curve: Curve | None, steps: int, *, repeat: int) -> None:
@@ -113,9 +120,12 @@ class _Bench:
             except SolveError as error:
                 self._journal.add("failed", error=str(error), **key)
                 continue
-            found = {} if repeat else asdict(self._judge.judge(frame, solved.points))
+            found = {} if repeat else self._judged(frame, solved.points)
             found |= {"made": solved.steps, "elapsed": solved.elapsed, "waited": solved.waited}
             self._add(name, frame, solved.milliseconds, steps=steps, repeat=repeat, **about, **found)
+
+    def _judged(self, frame: Frame, points: Sequence[np.ndarray]) -> dict[str, Any]:
+        return asdict(self._judge.judge(frame, points)) | {"apart_mm": self._solutions.apart_mm(frame, points)}
 
     def is_done(self, name: str, steps: int, *, growth: float) -> bool:
         """Whether a method's next rung would take too long, or gets nowhere."""

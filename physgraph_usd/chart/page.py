@@ -47,13 +47,13 @@ def write_page(chart: Chart, file: Path) -> None:
 
 def _figure(chart: Chart) -> go.Figure:
     """Gap, penetrations and crossings against time, with one legend."""
-    panels = {"gap": "energy gap (Phi - Phi*) / (Phi0 - Phi*)", **chart.panels}
+    panels = {"gap": "energy gap (Phi - Phi*) / (Phi0 - Phi*)", **chart.panels, **chart.likeness}
     figure = make_subplots(
         rows=len(panels),
         cols=1,
         shared_xaxes=True,
         vertical_spacing=0.05,
-        row_heights=[2.0, *[1.0] * len(chart.panels)],
+        row_heights=[2.0, *[1.0] * (len(panels) - 1)],
     )
     look = styles(chart)
     for row, (field, words) in enumerate(panels.items(), start=1):
@@ -85,7 +85,11 @@ def _trace(chart: Chart, name: str, style: Style, *, field: str, first: bool) ->
         showlegend=first,
         mode="markers" if name in SIGNS else "lines+markers",
         line={"color": style.colour, "dash": "dash" if style.dashed else "solid", "width": 2},
-        marker={"symbol": SIGNS.get(name, "circle"), "size": 16 if name == DEFAULT else 8, "color": style.colour},
+        marker={
+            "symbol": SIGNS.get(name, "triangle-up" if style.outside else "circle"),
+            "size": 16 if name == DEFAULT else 8,
+            "color": style.colour,
+        },
         customdata=said,
         hovertemplate=f"<b>{html.escape(name)}</b><br>%{{customdata}}<extra></extra>",
     )
@@ -143,6 +147,7 @@ def _notes(chart: Chart) -> str:
         [
             f"<h2>How it was measured</h2><p>{HOW.format(repeats=plan.get('repeats', '?'))}</p>",
             table("references", ("frame", "Phi0 [J]", "Phi* [J]", "found by"), rows, numbers=(0, 1, 2)),
+            table("outside", ("solver outside", "was given"), list(chart.notes.items())) if chart.notes else "",
             "<h2>Runs that failed</h2>" + table("failed", ("method", "steps", "error"), failed) if failed else "",
             f"<p class='note'>The long form would take about {longer:.0f} minutes here.</p>" if longer else "",
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,8 @@ def draw_chart(chart: Chart, folder: Path) -> None:
 
 def _figure(chart: Chart) -> Figure:
     steps = changes(chart)
-    heights = [4.2, *([2.6] if chart.panels else []), *([0.6 + 0.28 * len(steps)] if steps else [])]
+    rows = [each for each in (chart.panels, chart.likeness) if each]
+    heights = [4.2, *[2.6] * len(rows), *([0.6 + 0.28 * len(steps)] if steps else [])]
     figure = Figure(figsize=(9.6, sum(heights) + 1.0), layout="constrained")
     figure.suptitle(title(chart), x=0.01, ha="left", fontsize=11)
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
@@ -57,10 +59,10 @@ def _figure(chart: Chart) -> Figure:
     axes = parts[0].subplots()
     _curves(axes, chart, look)
     parts[0].legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
-    if chart.panels:
-        panels = parts[1].subplots(1, len(chart.panels), squeeze=False)[0]
-        for axes, (name, words) in zip(panels, chart.panels.items(), strict=True):
-            _contact(axes, name, words, chart=chart, look=look)
+    for part, row in zip(parts[1:], rows, strict=False):
+        panels = part.subplots(1, len(row), squeeze=False)[0]
+        for axes, (name, words) in zip(panels, row.items(), strict=True):
+            _measure(axes, name, words, chart=chart, look=look)
     if steps:
         _terms(parts[-1].subplots(1, 3, sharey=True, width_ratios=[1.0, 1.0, 1.5]), steps)
     return figure
@@ -78,7 +80,7 @@ def _curves(axes: Axes, chart: Chart, look: dict[str, Style]) -> None:
     axes.axhline(0.03, color="#b0b0b0", linewidth=0.8, linestyle=":")
 
 
-def _line(axes: Axes, name: str, points: tuple[Point, ...], style: Style, heights: list[float]) -> None:
+def _line(axes: Axes, name: str, points: Sequence[Point], style: Style, heights: list[float]) -> None:
     """One method."""
     alone = name in ONE_POINT
     axes.plot(
@@ -86,8 +88,8 @@ def _line(axes: Axes, name: str, points: tuple[Point, ...], style: Style, height
         heights,
         color=style.colour,
         linestyle="" if alone else "--" if style.dashed else "-",
-        marker=ONE_POINT.get(name, "o"),
-        markersize=11 if name == DEFAULT else 5 if alone else 3,
+        marker=ONE_POINT.get(name, "^" if style.outside else "o"),
+        markersize=11 if name == DEFAULT else 5 if alone or style.outside else 3,
         linewidth=1.4,
         zorder=5 if name == DEFAULT else 2,
         label=name,
@@ -95,14 +97,20 @@ def _line(axes: Axes, name: str, points: tuple[Point, ...], style: Style, height
     )
 
 
-def _contact(axes: Axes, name: str, words: str, *, chart: Chart, look: dict[str, Style]) -> None:
-    """One measure of contact against time."""
+def _measure(axes: Axes, name: str, words: str, *, chart: Chart, look: dict[str, Style]) -> None:
+    """One measure of contact or of likeness against time."""
     for method in chart.methods:
-        points = chart.curve(method)
+        points = [point for point in chart.curve(method) if getattr(point, name) is not None]
         _line(axes, method, points, look[method], [float(getattr(p, name)) for p in points])
     axes.set(xscale="log", xlabel="milliseconds a frame", title=words[0].upper() + words[1:])
-    axes.set_yscale("symlog", linthresh=0.01 if name == "percent" else 1.0)
-    axes.set_ylim(bottom=0)
+    if name in chart.likeness:
+        alone = [getattr(point, name) or 0.0 for each in ONE_POINT for point in chart.curve(each)]
+        axes.set_ylim(0, 1.5 * max(alone, default=0.0) or None)
+        for line in axes.lines:  # A solver that flew apart flies out of the picture.
+            line.set_clip_on(True)
+    else:
+        axes.set_yscale("symlog", linthresh=0.01 if name == "percent" else 1.0)
+        axes.set_ylim(bottom=0)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 

@@ -30,7 +30,7 @@ from .peers.run import measure_peers, parse_peers
 from .plan import Clock, Plan, make_plan
 from .plot import draw_chart
 from .problem import COLD, Problem, plain_detail
-from .reference import find_reference
+from .reference import Solutions, find_reference
 from .table import Chart, collate
 from .terms import RUN, Bench, measure_terms
 
@@ -94,6 +94,7 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
     problems = build(opened.scene, levels), build(opened.scene, levels, torch.float64)
     about = _about(opened, levels, options) | {"vertices": problems[0].vertex_count}
     journal = Journal(folder, about, overwrite=options.overwrite)
+    solutions = Solutions(folder, fresh=not journal.rows("reference"))
     curves = find_curves(options.methods)
     plan = _plan(journal, problems, _frame(opened, _times(opened, 1)[0]), curves=curves, options=options)
     clock.expect(60.0 * plan.minutes)
@@ -102,11 +103,13 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
         if not journal.one("reference", frame=frame.time):
             clock.say("the least energy of a frame")
             found = find_reference(problems[1], frame, seconds=plan.reference_seconds)
+            solutions.keep(frame.time, found.points)
             journal.add("reference", frame=frame.time, **found.plain())
-    measure_curves(journal, problems, frames, curves=curves, plan=plan, clock=clock)
+    place: dict[str, Any] = {"plan": plan, "clock": clock, "solutions": solutions}
+    measure_curves(journal, problems, frames, curves=curves, **place)
     budgets = [steps for steps in rungs(plan.growth) if steps <= MOST_PEER_STEPS]
-    place = {"plan": plan, "clock": clock, "clock_name": options.clock, "steps": budgets}
-    measure_peers(journal, problems, frames, peers=parse_peers(options.peers), **place)
+    place |= {"peers": parse_peers(options.peers), "clock_name": options.clock, "steps": budgets}
+    measure_peers(journal, problems, frames, **place)
     run = tuple(_frame(opened, time) for time in _run_up_to(opened, frames[-1].time))
     bench = Bench(*problems, opened.scene, levels, frames=frames, run=run, build=build)
     measure_terms(journal, bench, clock)

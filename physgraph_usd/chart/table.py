@@ -50,6 +50,7 @@ class Point:
         frames: Number of frames.
         repeats: Number of times that the time was taken.
         note: What a solver outside was given of the problem, "" for ours.
+        apart_mm: RMS distance from the reference's positions [mm], mean over the frames; None where they are not known.
     """
 
     method: str
@@ -73,6 +74,7 @@ class Point:
     frames: int
     repeats: int
     note: str = ""
+    apart_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,19 @@ class Chart:
             for name, words in known.items()
             if any(getattr(point, name) for point in self.points) or (touches and name != "tangles")
         }
+
+    @property
+    def likeness(self) -> dict[str, str]:
+        """What compares with solvers outside, too, where there are any: fields of the points, and their titles."""
+        if not self.notes:
+            return {}
+        known = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from Phi*'s shape [mm]"}
+        return {name: words for name, words in known.items() if any(getattr(p, name) for p in self.points)}
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What each solver outside was given of the problem, by its name."""
+        return {point.integrator: point.note for point in self.points if point.note}
 
     def curve(self, method: str) -> tuple[Point, ...]:
         """The points of one method, in the order of the budgets."""
@@ -186,6 +201,7 @@ class Chart:
             )
         if self.busy:
             yield self.busy
+        yield from (f"{name} was given {note}" for name, note in self.notes.items())
         if longer := self.about.get("long_minutes"):
             yield f"the long form would take about {longer:.0f} minutes here"
 
@@ -248,6 +264,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, dict[str, Any]]
     least = sum(each["least"] for each in references.values())
     start = sum(each["start"] for each in references.values())
     energy = sum(energies.values())
+    apart = [each for v in values if (each := v.get("apart_mm")) is not None]
     return Point(
         method=first["method"],
         integrator=first.get("integrator", ""),
@@ -270,6 +287,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, dict[str, Any]]
         frames=len(values),
         repeats=min(len(each) for each in times),
         note=first.get("note", ""),
+        apart_mm=statistics.fmean(apart) if len(apart) == len(values) else None,
     )
 
 

@@ -18,6 +18,7 @@ from ..scene import Frame, GarmentFrame, Scene
 from .journal import Journal
 from .plan import Clock
 from .problem import COLD, Problem, Solved, with_garments
+from .reference import rms_mm
 from .table import typical
 
 REPEATS = 5
@@ -199,8 +200,7 @@ def _carried_up(bench: Bench, points: Sequence[np.ndarray], levels: Sequence[int
 
 def _moved(a: Sequence[tuple[np.ndarray, ...]], b: Sequence[tuple[np.ndarray, ...]]) -> float:
     """RMS distance between two results [mm]."""
-    apart = np.concatenate([(p - q).ravel() for x, y in zip(a, b, strict=True) for p, q in zip(x, y, strict=True)])
-    return 1e3 * float(np.sqrt(3.0 * np.square(apart).mean()))
+    return rms_mm([points for each in a for points in each], [points for each in b for points in each])
 
 
 def _jerk(bench: Bench, points: Sequence[tuple[np.ndarray, ...]]) -> float:

@@ -66,7 +66,8 @@ def figures(point: Point, *, touches: bool) -> list[str]:
         f"{point.ms:.1f} ms a frame (median {point.ms_median:.1f}, least {point.ms_least:.1f}; "
         f"{point.repeats} turns of {_frames(point)})",
         ", ".join(f"{name} {1e3 * value:.3g}" for name, value in sorted(point.energies.items())) + " mJ",
-        f"strain p99 {percent(point.strain)}",
+        f"strain p99 {percent(point.strain)}"
+        + (f", {point.apart_mm:.3g} mm from Phi*'s shape" if point.apart_mm is not None else ""),
     ]
     if touches:
         said.append(

@@ -13,6 +13,9 @@ from torch import Tensor, nn
 
 LATENTS = (32, 64, 128)
 """Latent sizes that the kernels of `messages` cover."""
+PIECE = 4096
+"""Edges that are updated at once on a CPU: what lies between the layers of more does not stay in its cache, and from
+32 MB on the system hands out fresh pages each time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +119,18 @@ def _updated_edges(perceptron: nn.Sequential, v: Tensor, e: Tensor, *, ways: Way
         from .messages import updated_edges  # noqa: PLC0415  Triton is not everywhere
 
         return updated_edges(perceptron, from_receiver, from_sender, e, ways=ways)
-    h = nn.functional.linear(e, at_edge, cast(nn.Linear, first).bias)
-    h = h + from_receiver[ways.receiver] + from_sender[ways.sender]
-    for layer in others:
-        h = layer(h)
-    return e + h
+
+    def change(e: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        h = nn.functional.linear(e, at_edge, cast(nn.Linear, first).bias)
+        h = h + from_receiver[receiver] + from_sender[sender]
+        for layer in others:
+            h = layer(h)
+        return h
+
+    if torch.is_grad_enabled() or e.is_cuda:
+        return e + change(e, ways.receiver, ways.sender)
+    pieces = (part.split(PIECE) for part in (e, ways.receiver, ways.sender))
+    return torch.cat([part + change(part, *ends) for part, *ends in zip(*pieces, strict=True)])
 
 
 def _vertex_update(perceptron: nn.Sequential, v: Tensor, gathered: Tensor, *, kernels: bool) -> Tensor:

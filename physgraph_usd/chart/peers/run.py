@@ -24,6 +24,7 @@ from ...scene import Frame
 from ..journal import Journal
 from ..plan import Clock, Plan
 from ..problem import Problem
+from ..reference import Solutions
 
 HERE = Path(__file__).parent
 
@@ -36,17 +37,26 @@ class Peer:
         name: Its name in the chart.
         adapter: The script that its Python runs.
         note: What of the problem it was given, in words.
+        options: What its script is told beside the problem.
     """
 
     name: str
     adapter: str
     note: str
+    options: tuple[str, ...] = ()
 
 
+OURS = "our springs, hinges, guide and gravity; no bodies; 3 iterations a step"
 PEERS = {
-    "newton": Peer(
-        "Newton VBD", "newton_adapter.py", "our springs, hinges, guide and gravity; no bodies; 3 iterations a step"
-    )
+    "newton": Peer("Newton VBD", "newton_adapter.py", OURS, ("--solver", "vbd")),
+    "newton-xpbd": Peer("Newton XPBD", "newton_adapter.py", OURS, ("--solver", "xpbd")),
+    "blender": Peer(
+        "Blender cloth (own energy)",
+        "blender_adapter.py",
+        "an energy of its own, made from our springs, hinges, gravity and rest shape, with a goal at each vertex in "
+        "place of the guide; no bodies; its gap is by our potential and tells how far the two energies are apart, too: "
+        "compare its strain and its shape",
+    ),
 }
 """Peers by the name that ``--peer`` takes."""
 
@@ -78,6 +88,7 @@ def measure_peers(
     clock: Clock,
     clock_name: str,
     steps: Sequence[int],
+    solutions: Solutions,
 ) -> None:
     """Measure peers into the journal, frame by frame.
 
@@ -90,6 +101,7 @@ def measure_peers(
         clock: Says what is going on.
         clock_name: "wall" or "cpu".
         steps: Budgets.
+        solutions: What the results are compared to.
     """
     timed, judge = problems
     for peer, python in peers:
@@ -105,7 +117,7 @@ def measure_peers(
                 continue
             for nested, count, points, times in found:
                 name = f"{peer.name}, nested" if nested else peer.name
-                judged = asdict(judge.judge(frame, points))
+                judged = asdict(judge.judge(frame, points)) | {"apart_mm": solutions.apart_mm(frame, points)}
                 about = {"integrator": peer.name, "nested": nested, "note": peer.note, "made": count}
                 for repeat, ms in enumerate(times):
                     more = judged if not repeat else {}
@@ -128,7 +140,7 @@ def _run(
         np.savez(given, **dict(_problem(problem, frame, part)))
         line = [python, str(HERE / peer.adapter), str(given), str(result)]
         line += ["--steps", ",".join(map(str, steps)), "--repeats", str(plan.repeats)]
-        line += ["--most-ms", str(plan.most_ms), "--clock", clock_name]
+        line += ["--most-ms", str(plan.most_ms), "--clock", clock_name, *peer.options]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
             last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
@@ -178,6 +190,8 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
         term.add_force(base, load)
     values = {
         "base": base,
+        "rest": level.rest,
+        "triangles": level.triangles,
         "load": load,
         "free": level.free[:, 0],
         "edges": level.edges,
