@@ -21,12 +21,12 @@ import trimesh
 from physgraph_usd.colliders.pose import Collider, MeshPose
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.fabric import PRESETS
-from physgraph_usd.group import SolveSettings
 from physgraph_usd.integrate import method_named
 from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solve_settings import SolveSettings
 
 REPEATS = 5
 SIDE = 79

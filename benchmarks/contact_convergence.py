@@ -19,12 +19,12 @@ import torch
 
 from benchmarks.sleeve import CORES, say
 from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.group import SolveSettings
 from physgraph_usd.integrate import method_named
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
 from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solve_settings import SolveSettings
 from physgraph_usd.usd.reader import Shot, open_shot
 
 SAMPLES = {"block": 12.0, "armpit": 15.0, "layers": 8.0, "sleeve": 24.0}

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 
-from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.group import Group
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Integrator, System
 from physgraph_usd.integrate.first_order import Adam, GradientDescent
@@ -31,6 +31,7 @@ from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network
 from physgraph_usd.level import refine_garments
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solve_settings import SolveSettings
 from physgraph_usd.train.patches import PatchConfig, make_patches
 
 from .rows import Found, Row, run_alone, say, table

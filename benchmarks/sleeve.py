@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 
 from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.integrate.newton import Newton
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
@@ -29,6 +29,7 @@ from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import prepare_device, refine_shot
+from physgraph_usd.solve_settings import SolveSettings
 from physgraph_usd.usd.reader import open_shot
 
 REPEATS = 5

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from physgraph_usd.fabric import PRESETS
-from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.group import Group
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Integrator, System
 from physgraph_usd.integrate.learned import integrator_of
@@ -34,6 +34,7 @@ from physgraph_usd.integrate.weights import random_network, shipped_network
 from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.scene import Garment, GarmentFrame
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solve_settings import SolveSettings
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 SHIPPED = cast(PhysgraphConfig, shipped_network("physgraph").config)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from physgraph_usd.fabric import PRESETS
-from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.integrate.base import Carry, Integrator, System
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
@@ -24,6 +24,7 @@ from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.level import refine_garments
 from physgraph_usd.samples import write_sample
 from physgraph_usd.scene import Garment, GarmentFrame
+from physgraph_usd.solve_settings import SolveSettings
 from physgraph_usd.usd.reader import open_shot
 
 SHOTS: dict[str, tuple[str, float | None]] = {

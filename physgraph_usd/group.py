@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 
 import numpy as np
 import scipy.sparse as sp
@@ -18,12 +18,11 @@ from .contact.frame import FrameContact, LevelContact, Touch
 from .contact.rounds import solve_touching
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
-from .detail import Carried, MovingFrames, Reset, Solved
+from .detail import Carried, MovingFrames, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
-from .integrate import Method
-from .integrate.base import System
+from .integrate.base import Integrator, System
 from .integrate.choice import choose
 from .integrate.metric import Metric
 from .integrate.saddle import leave_saddle
@@ -33,41 +32,13 @@ from .level_forces import LevelForces, blame, build_forces
 from .mesh.subdivide import Refinement
 from .resolution import edge_strain, sharp_folds
 from .scene import Garment, GarmentFrame, recentred
+from .solve_settings import SolveSettings
 
 TORN = 0.5
 """The same percentile of a result beyond which a frame that started warm is solved again from cold."""
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.25, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
-COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
-"""Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
-
-
-@dataclass(frozen=True)
-class SolveSettings:
-    """How each frame is solved.
-
-    Attributes:
-        method: The integrator and whether it is nested.
-        steps: Most steps at the finest level; each level below it may take four times as many.
-        tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
-        budget_ms: Milliseconds a frame, or None.
-        temporal: "tether", "warm" or "off".
-        tether: Tether stiffness [1/s^2].
-        potential: "continuum" or "paper".
-        reset: When a frame starts cold.
-        contact: How contact is solved.
-    """
-
-    method: Method
-    steps: int = 12
-    tolerance: float = 2e-3
-    budget_ms: float | None = None
-    temporal: str = "tether"
-    tether: float = 2000.0
-    potential: str = "continuum"
-    reset: Reset = field(default_factory=Reset)
-    contact: ContactSettings = field(default_factory=ContactSettings)
 
 
 class Group:
@@ -116,6 +87,8 @@ class Group:
         self._material: tuple[object, ...] = ()
         self._forces: list[LevelForces] = []
         self._stretch = 0.0
+        # What an integrator records on CUDA lasts as long as the systems and itself.
+        self._recorded, self._integrators = device != "cpu", dict[bool, Integrator]()
 
     def solve(
         self,
@@ -206,13 +179,14 @@ class Group:
         """
         modules, coarse = self.modules(frames)
         parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
-        return [System(m, own.metric, free=v.free, spacing=v.spacing, level=v) for v, own, m in parts], coarse
+        given = [(m, own.metric, {"free": v.free, "spacing": v.spacing, "level": v}) for v, own, m in parts]
+        return [System(m, metric, **shown, lasting=True) for m, metric, shown in given], coarse
 
     def use(self, settings: SolveSettings) -> None:
         """Solve the frames that follow in another way; levels and metrics are kept."""
         if settings.potential != self._settings.potential:
             self._material = ()
-        self._settings = settings
+        self._settings, self._integrators = settings, {}
 
     def potential(
         self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()
@@ -322,7 +296,9 @@ class Group:
         """Walk the levels; a warm start goes straight to the finest. Also says why, where there was a choice."""
         subdivisions, warm = len(self.levels) - 1, predicted is not None
         choice = choose(self._settings.method.nested, subdivisions, contact, warm=warm, device=self.levels[0].device)
-        self._integrator = choice.integrator(self._settings.method.build)
+        if choice.learned not in self._integrators:
+            self._integrators[choice.learned] = choice.integrator(self._settings.method.build)
+        self._integrator = self._integrators[choice.learned]
         first = 0 if choice.nested else subdivisions
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
@@ -332,13 +308,17 @@ class Group:
             if index > first and level.from_below is not None:
                 x = level.from_below.apply(x)
             module = lasting.module(coarse)
-            terms = module
-            if predicted is not None and self._settings.temporal == "tether":
-                terms = ForceModule((*module.forces, lasting.tether(self._settings.tether, predicted)))
-            budget = self._budget(index, clock, more=choice.steps)
+            tied = predicted is not None and self._settings.temporal == "tether"
+            tie = (self._settings.tether, predicted) if tied and predicted is not None else None
+            budget = self._settings.budget(len(self.levels) - 1 - index, clock, more=choice.steps)
             view = None if contact is None else contact.at(level)
             cold = predicted is None
-            x, made, touched = self._solve_level(terms, lasting.metric, level, x=x, cold=cold, view=view, budget=budget)
+            if self._recorded:
+                alone = lasting.lasting_system(coarse, tie)
+            else:
+                terms = module if tie is None else ForceModule((*module.forces, lasting.tether(*tie)))
+                alone = System(terms, lasting.metric, free=level.free, spacing=level.spacing, level=level)
+            x, made, touched = self._solve_level(alone, level, x=x, cold=cold, view=view, budget=budget)
             if index < len(self.levels) - 1:
                 made[-1].energies = module.energies(x)
             reports += made
@@ -346,44 +326,28 @@ class Group:
         return x, reports, module, {"chosen": choice.reason} if choice.reason else {}
 
     def _solve_level(
-        self,
-        terms: ForceModule,
-        metric: Metric,
-        level: Level,
-        *,
-        x: Tensor,
-        cold: bool,
-        view: LevelContact | None,
-        budget: Budget,
+        self, alone: System, level: Level, *, x: Tensor, cold: bool, view: LevelContact | None, budget: Budget
     ) -> tuple[Tensor, list[LevelReport], tuple[Touch, ...]]:
         """Solve one level, in rounds where something is near; returns the contact terms too."""
-
-        def system(touched: Sequence[Touch], at: Tensor) -> System:
-            held = metric if view is None else view.metric(metric, touched, at)
-            return System(
-                ForceModule((*terms.forces, *touched)), held, free=level.free, spacing=level.spacing, level=level
-            )
-
         integrator = self._integrator
         if view is None:
-            x = leave_saddle(system((), x), level, x, outward=self._outward) if cold else x
-            x, report = solve_level(system((), x), integrator, x, level=level.index, budget=budget)
+            x = leave_saddle(alone, level, x, outward=self._outward) if cold else x
+            x, report = solve_level(alone, integrator, x, level=level.index, budget=budget)
             return x, [report], ()
+
+        def system(touched: Sequence[Touch], at: Tensor) -> System:
+            if not touched:
+                return alone
+            assert isinstance(alone.field, ForceModule)
+            assert isinstance(alone.metric, Metric)
+            field = ForceModule((*alone.field.forces, *touched))
+            held = view.metric(alone.metric, touched, at)
+            return System(field, held, free=level.free, spacing=level.spacing, level=level)
+
         finest, outward = level is self.levels[-1], self._outward if cold else None
         return solve_touching(
             system, integrator, x, view=view, level=level, finest=finest, outward=outward, budget=budget
         )
-
-    def _budget(self, index: int, clock: float, *, more: int) -> Budget:
-        """Steps and deadline of one level, the finest with so many times its steps."""
-        settings = self._settings
-        below = len(self.levels) - 1 - index
-        deadline = None
-        if settings.budget_ms is not None:
-            deadline = clock + 1e-3 * settings.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
-        if not below:
-            return Budget(more * settings.steps, settings.tolerance, deadline)
-        return Budget(COARSE_STEPS * settings.steps, COARSE_TOLERANCE * settings.tolerance, deadline)
 
     def _telemetry(
         self, module: ForceModule, x: Tensor, coarse: Tensor, reports: list[LevelReport]

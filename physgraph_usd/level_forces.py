@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from .forces.base import Force, ForceModule
 from .forces.guide import Guide, GuideMap
 from .forces.stretch import PAPER_SPRING, garment_area
 from .forces.tether import Tether
+from .integrate.base import System
 from .integrate.metric import Metric, kept_to_edges
 from .level import Level
 from .scene import Garment, GarmentFrame
@@ -43,6 +45,39 @@ class LevelForces:
     def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
         """All terms of one frame, given its recentred coarse positions [m]."""
         return ForceModule((*self.elastic, *self.body, self.guide.retarget(coarse)))
+
+    def lasting_system(
+        self, coarse: Float[Tensor, "coarse 3"], tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None
+    ) -> System:
+        """The system of a frame in which nothing touches: the same in every frame, aimed anew.
+
+        What was recorded of its steps serves in the next frame too.
+
+        Args:
+            coarse: Recentred coarse positions [m].
+            tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
+        """
+        stiffness = None if tie is None else tie[0]
+        if stiffness not in self._lasting:
+            self._lasting[stiffness] = self._made(coarse, tie)
+        system, guide, tether = self._lasting[stiffness]
+        guide.aim(coarse)
+        if tie is not None and tether is not None:
+            tether.aim(tie[1])
+        return system
+
+    def _made(self, coarse: Tensor, tie: tuple[float, Tensor] | None) -> tuple[System, Guide, Tether | None]:
+        """A system that lasts, and what is aimed in it."""
+        level, guide = self.level, self.guide.retarget(coarse)
+        tether = None if tie is None else self.tether(tie[0], tie[1].clone())
+        field = ForceModule((*self.elastic, *self.body, guide, *([] if tether is None else [tether])))
+        system = System(field, self.metric, free=level.free, spacing=level.spacing, level=level, lasting=True)
+        return system, guide, tether
+
+    @cached_property
+    def _lasting(self) -> dict[float | None, tuple[System, Guide, Tether | None]]:
+        """What `lasting_system` gave, by the tether's stiffness."""
+        return {}
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""

@@ -10,9 +10,9 @@ from typing import Any
 
 from .contact.settings import ContactSettings
 from .errors import UsageError
-from .group import SolveSettings
 from .integrate import method_named
 from .integrate.weights import weights_hash
+from .solve_settings import SolveSettings
 
 TEMPORAL = ("tether", "warm", "off")
 POTENTIALS = ("continuum", "paper")

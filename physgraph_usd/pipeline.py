@@ -16,11 +16,12 @@ from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
 from .detail import Carried, join, split
 from .errors import GarmentError
-from .group import Group, SolveSettings
+from .group import Group
 from .level import refine_garments
 from .mesh.subdivide import Refinement
 from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State
+from .solve_settings import SolveSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from physgraph_usd.group import Group
 from physgraph_usd.integrate import METHODS, paper_network
 from physgraph_usd.integrate.base import Carry, Integrator, System
 from physgraph_usd.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
-from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
+from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
 from physgraph_usd.integrate.paper_network import PaperConfig
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
@@ -80,13 +80,22 @@ def test_edges_in_pieces_are_the_edges_at_once(monkeypatch: pytest.MonkeyPatch):
     assert torch.allclose(pieces.x, whole.x, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("more", [{"means": False}, {"means": False, "strain": True}, {"strain": True, "depth": 3}])
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"means": False},
+        {"means": False, "strain": True},
+        {"strain": True, "depth": 3},
+        {"strain": True, "cosines": "few"},
+    ],
+)
 @pytest.mark.parametrize(
     "vectors",
     [
         ("metric", "move1", "diagonal"),
         ("secant", "metric", "metric1", "move1"),
         ("secant", "secant.normal", "metric.strain", "diagonal.smooth"),
+        ("secant", "metric", "secant.normal", "metric.normal", "metric.smooth", "secant.smooth"),
     ],
 )
 def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str, Any]):
@@ -100,6 +109,20 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str
         move, expected = one.propose(system, carry), other.propose(system, carry)
         assert float((move - expected).abs().max()) < 1e-5 * float(expected.abs().max())
         assert not bool(move[~system.free.squeeze(1)].any())
+
+
+def test_few_cosines_are_those_of_whole_vectors_and_of_what_belongs_together():
+    names = ("secant", "metric", "secant.normal", "metric.normal", "move1.normal", "metric.smooth")
+    pairs = [(names[a], names[b]) for a, b in pairs_of(PhysgraphConfig(names, cosines="few")).T.tolist()]
+    assert set(pairs) == {
+        ("secant", "metric"),
+        ("secant", "secant.normal"),
+        ("metric", "metric.normal"),
+        ("metric", "metric.smooth"),
+        ("secant.normal", "metric.normal"),
+        ("secant.normal", "move1.normal"),
+    }
+    assert pairs_of(PhysgraphConfig(names)).shape == (2, 15)
 
 
 @pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])

@@ -16,12 +16,13 @@ from test_forces import crumple
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.forces.membrane import Membrane, in_plane_terms
 from physgraph_usd.forces.stretch import Stretch
-from physgraph_usd.group import Group, SolveSettings
+from physgraph_usd.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
 from physgraph_usd.mesh.diagonals import quad_edges
 from physgraph_usd.scene import GarmentFrame
 from physgraph_usd.shot import inspect_shot
+from physgraph_usd.solve_settings import SolveSettings
 
 SPRINGS, TRIANGLES = Fabric(30.0), Fabric(30.0, shear=7.0)
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
-from cloth import finest_system, group_of, sheet, wave
+from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
+from physgraph_usd.fabric import Fabric
 from physgraph_usd.integrate.base import System
 from physgraph_usd.integrate.learned import LearnedMetric
 from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
 from physgraph_usd.integrate.recorded import Place
 from physgraph_usd.integrate.weights import random_network
+from physgraph_usd.scene import GarmentFrame
 
 LOCAL = PhysgraphConfig(("secant", "metric1", "move1", "diagonal"), width=16, means=False)
 ALL = PhysgraphConfig(VECTORS, width=8, rounds=1, strain=True)
@@ -68,3 +70,40 @@ def test_resuming_keeps_the_memory():
         a, b = one.step(system, a), other.step(system, b)
     a, b = one.step(system, one.resume(system, a)), other.step(system, other.resume(system, b))
     assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
+
+
+@pytest.mark.parametrize("integrator", ["quasi-newton", "physgraph"])
+def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, monkeypatch: pytest.MonkeyPatch):
+    """A cold frame, warm ones with a tether, and another fabric: systems aimed anew give the same bytes."""
+    mesh, rest = sheet(6, 5)
+    stiff = Fabric(10.0 * FABRIC.stretch, FABRIC.bend, FABRIC.density)
+    shown = [(0.0, FABRIC), (0.1, FABRIC), (0.2, FABRIC), (0.2, stiff), (0.3, stiff)]
+    frames = [[GarmentFrame(wave(rest, phase=phase), fabric, GUIDE)] for phase, fabric in shown]
+    results = []
+    for lasting in (False, True):
+        group = group_of(mesh, rest, level=2, dtype=torch.float32, integrator=integrator)
+        monkeypatch.setattr(group, "_recorded", lasting)
+        kept, points = None, []
+        for frame in frames:
+            solved = group.solve(frame, kept, at=None)
+            kept = solved.carried
+            points.append(solved.points[0])
+        results.append(points)
+    assert [a.tobytes() for a in results[0]] == [b.tobytes() for b in results[1]]
+
+
+def test_lasting_systems_are_the_same_system_every_frame():
+    mesh, rest = sheet(4, 4)
+    forces = group_of(mesh, rest, level=1)._forces_for([GarmentFrame(rest, FABRIC, GUIDE)])[-1]
+    coarse = torch.as_tensor(rest)
+    predicted = forces.level.base.apply(coarse)
+    plain, tied = forces.lasting_system(coarse), forces.lasting_system(coarse, (5.0, predicted))
+    assert plain is not tied
+    assert forces.lasting_system(2.0 * coarse) is plain
+    fresh = forces.module(2.0 * coarse).energy_and_force(predicted)[1]
+    assert torch.equal(plain.field.energy_and_force(predicted)[1], fresh)
+    moved = forces.lasting_system(2.0 * coarse, (5.0, 2.0 * predicted))
+    assert moved is tied
+    pull = forces.tether(5.0, 2.0 * predicted).add_force
+    assert float(pull(predicted, fresh)) > 0.0
+    assert torch.allclose(moved.field.energy_and_force(predicted)[1], fresh)

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 
 from ..detail import Carried
-from ..group import SolveSettings
 from ..level import Level
 from ..options import RefineOptions
 from ..pipeline import Refiner
 from ..scene import Frame, Scene
+from ..solve_settings import SolveSettings
 from .judge import Judgement, judge
 
 DEFAULT = RefineOptions().solve_settings()

@@ -94,6 +94,11 @@ class Guide:
         guide._target = self._map.average.apply(guide._base)
         return guide
 
+    def aim(self, coarse: Float[Tensor, "coarse 3"]) -> None:
+        """Tie to other coarse positions [m] in place: whoever holds this term, or recorded it, follows."""
+        self._base.copy_(self._level.base.apply(coarse))
+        self._target.copy_(self._map.average.apply(self._base))
+
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         lag = self._map.average.apply(x) - self._target

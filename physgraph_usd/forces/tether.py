@@ -43,6 +43,10 @@ class Tether:
         self._weight = stiffness * density.to(level.rest)[owner] * level.vertex_area
         self._predicted = predicted
 
+    def aim(self, predicted: Float[Tensor, "vertices 3"]) -> None:
+        """Tie to other positions [m] in place."""
+        self._predicted.copy_(predicted)
+
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         stray = x - self._predicted

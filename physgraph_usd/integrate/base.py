@@ -95,6 +95,7 @@ class System:
         free: False where a vertex may not move, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
         level: The level's mesh; None for a system that has none.
+        lasting: Whether it is met again, in the next frame or for another descent: recording its steps then pays.
         field: The forces.
         metric: H0.
         evaluations: Number of force evaluations so far.
@@ -109,8 +110,10 @@ class System:
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
         level: Surface | None = None,
+        lasting: bool = False,
     ) -> None:
         """Join a force field with its metric and its mask."""
+        self.lasting = lasting
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())

@@ -37,6 +37,8 @@ NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
 
 LONGEST = 5.0
 """Most edge lengths that a vertex moves in a step."""
+RECORDINGS = 6
+"""Recordings kept: of the levels of a garment, or of two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ class LearnedMetric:
         trained = not any(parameter.requires_grad for parameter in network.parameters())
         self._fuse = fuse and trained and can_fuse(network.config, torch.float32)
         self._record = record and trained
-        self._recording: Recording | None = None
+        self._recordings: dict[System, Recording] = {}
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory."""
@@ -144,18 +146,22 @@ class LearnedMetric:
         return limited(move, system.spacing) * system.free
 
     def records(self, system: System) -> bool:
-        """Whether a system's steps are recorded: on CUDA, once trained."""
+        """Whether a system's steps are recorded: on CUDA, once trained, where the system is met again."""
         few = system.level is None or len(system.level.spans) <= MOST_GARMENTS
-        return self._record and system.spacing.is_cuda and few
+        return self._record and system.lasting and system.spacing.is_cuda and few
 
     def _recorded(self, system: System) -> Recording | None:
-        """The recording of a system's steps, where they are recorded."""
+        """The recording of a system's steps, where they are recorded; those of the last few systems are kept."""
         if not self.records(system):
             return None
-        if self._recording is None or self._recording.system is not system:
+        known = self._recordings.pop(system, None)
+        if known is None:
             graph = graph_of(system)
-            self._recording = Recording(system, lambda recording: self._propose_recorded(recording, graph))
-        return self._recording
+            known = Recording(system, lambda recording: self._propose_recorded(recording, graph))
+        self._recordings[system] = known
+        while len(self._recordings) > RECORDINGS:
+            del self._recordings[next(iter(self._recordings))]
+        return known
 
     def _propose_recorded(self, recording: Recording, graph: Graph) -> Tensor:
         """The displacement of the next step [m] out of a recording's buffers."""

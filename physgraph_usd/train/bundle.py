@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..group import Group, SolveSettings
+from ..group import Group
 from ..integrate import METHODS
 from ..level import refine_garments
+from ..solve_settings import SolveSettings
 from .bodies import with_bodies
 from .patches import Patch
 from .unroll import JointSystem

@@ -20,7 +20,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 from ..fabric import Fabric
-from ..group import Group, SolveSettings
+from ..group import Group
 from ..integrate import METHODS
 from ..integrate.base import System
 from ..integrate.quasi_newton import QuasiNewton
@@ -30,6 +30,7 @@ from ..level import refine_garments
 from ..mesh.topology import PolygonMesh, edges_of
 from ..scene import Garment, GarmentFrame
 from ..shot import prepare_device
+from ..solve_settings import SolveSettings
 from .bodies import Body, with_bodies
 
 SHAPES = ("sheet", "tube", "dome")

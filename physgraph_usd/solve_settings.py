@@ -1,0 +1,55 @@
+"""How each frame is solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .contact.settings import ContactSettings
+from .detail import Reset
+from .integrate import Method
+from .integrate.solve import Budget
+
+COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
+"""Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """How each frame is solved.
+
+    Attributes:
+        method: The integrator and whether it is nested.
+        steps: Most steps at the finest level; each level below it may take four times as many.
+        tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
+        budget_ms: Milliseconds a frame, or None.
+        temporal: "tether", "warm" or "off".
+        tether: Tether stiffness [1/s^2].
+        potential: "continuum" or "paper".
+        reset: When a frame starts cold.
+        contact: How contact is solved.
+    """
+
+    method: Method
+    steps: int = 12
+    tolerance: float = 2e-3
+    budget_ms: float | None = None
+    temporal: str = "tether"
+    tether: float = 2000.0
+    potential: str = "continuum"
+    reset: Reset = field(default_factory=Reset)
+    contact: ContactSettings = field(default_factory=ContactSettings)
+
+    def budget(self, below: int, clock: float, *, more: int) -> Budget:
+        """Steps and deadline of a level.
+
+        Args:
+            below: How many levels lie above it.
+            clock: When the frame began [s].
+            more: How many times its steps the finest level takes.
+        """
+        deadline = None
+        if self.budget_ms is not None:
+            deadline = clock + 1e-3 * self.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
+        if not below:
+            return Budget(more * self.steps, self.tolerance, deadline)
+        return Budget(COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance, deadline)
