@@ -153,13 +153,14 @@ class Group:
         coarse = self._tensor(world - origin)
         predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
         contact = self._contact(touching, coarse, origin, frames)
+        aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            x, reports, module, chosen = self._descend(forces, coarse, predicted, clock, contact=contact)
+            x, reports, module, chosen = self._descend(forces, aim, predicted, clock, contact=contact)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
-        result = self._frames.scaled(coarse, x, gain)
+        result = self._frames.scaled(aim, x, gain)
         moved: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
@@ -219,9 +220,11 @@ class Group:
     ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
         """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
         world = np.concatenate([frame.points for frame in frames])
-        origin, module = world.mean(axis=0), self._forces_for(frames)[-1]
+        origin = world.mean(axis=0)
         coarse = self._tensor(world - origin)
-        return module.module(coarse), self._contact(touching, coarse, origin, frames), origin
+        contact = self._contact(touching, coarse, origin, frames)
+        aim = coarse if contact is None else contact.aim
+        return self._forces_for(frames)[-1].module(aim), contact, origin
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
