@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -167,8 +167,7 @@ class Group:
             result, start_next, moved = contact.finish(result)
             x = x if scaled else start_next
         solved = time.perf_counter()
-        carried = self._frames.store(coarse, x)
-        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
+        carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world))
         strain = edge_strain(self.levels[-1], result)
         telemetry = self._telemetry(module, result, coarse, reports) | chosen | {"strain": strain, "start": start}
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
@@ -182,9 +181,8 @@ class Group:
         }
         points = result.double().cpu().numpy() + origin
         points[self._fixed] = self._place_fixed @ world
-        spans = self.levels[-1].spans
         crosses = np.zeros(len(points), bool) if crossing is None else crossing.cpu().numpy()
-        own = [[each[span] for span in spans] for each in (points, crosses)]
+        own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
         return Solved(own[0], carried, telemetry, own[1]), strain["p99"]
 
     def energies(
@@ -230,8 +228,7 @@ class Group:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
         world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
         coarse = self._tensor((world - world.mean(dim=0)).numpy())
-        forces = self._forces_for(frames)
-        return [lasting.module(coarse) for lasting in forces], coarse
+        return [lasting.module(coarse) for lasting in self._forces_for(frames)], coarse
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)

@@ -20,7 +20,7 @@ from ..colliders.base import Nearest, Surface
 from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
-from .measure import DEEP, Pierced, depths, penetration, pierced, pinched
+from .measure import DEEP, Pierced, depths, longest_ways, penetration, pierced, pinched
 from .room import room_above
 from .settings import ContactSettings
 
@@ -59,7 +59,7 @@ class _Track:
         at: Positions at which distances were found [m], shape (V, 3).
         known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
-        part: Part of that which holds now.
+        held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
         looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
     """
 
@@ -70,7 +70,7 @@ class _Track:
     at: Tensor
     known: Tensor
     longest: float
-    part: float = 1.0
+    held: Tensor | None = None
     looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
 
     def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
@@ -102,7 +102,7 @@ class _Track:
             near = _at(found, within)
             way = self.surface.exit(asked[within], near)
             distance[within], point[within], outward[within] = way.distance, way.point, way.normal
-            kept[within] = ~pinched(near, way, self.part * self.longest)
+            kept[within] = ~pinched(near, way, longest_ways(self.longest, self.held, which[within]))
         away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
         outward = outward * self._outward(which).unsqueeze(1)
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
@@ -195,15 +195,15 @@ class LevelBodies:
         for track in self._tracks:
             track.refresh(x, torch.zeros_like(x[:, 0]))
             deep = torch.where(track.at.eq(x).all(dim=1), track.known, track.known.abs())
-            depth, pinned = depths(track.surface, x + track.shift, deep, track.part * track.longest)
+            depth, pinned = depths(track.surface, x + track.shift, deep, track.longest)
             inside |= depth > 0
             held |= pinned
         return inside, held
 
-    def hold(self, part: float) -> None:
-        """Leave vertices between overlapping parts of a body whose way out is over a part of the longest one."""
+    def hold(self, held: Bool[Tensor, " vertices"] | None) -> None:
+        """From now on leave these vertices where they are between overlapping parts of a body."""
         for track in self._tracks:
-            track.part = part
+            track.held = held
 
     def _out(self, x: Tensor, extra: Tensor) -> tuple[Tensor, int]:
         """Push out to the least clearance and more, body by body; the positions and the passes made.
@@ -314,7 +314,12 @@ class FrameBodies:
         return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
 
     def measure(
-        self, finest: Level, base: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"], *, part: float = 1.0
+        self,
+        finest: Level,
+        base: Float[Tensor, "vertices 3"],
+        x: Float[Tensor, "vertices 3"],
+        *,
+        held: Bool[Tensor, " vertices"] | None = None,
     ) -> dict[str, object]:
         """What is in each body and what crosses it, before and after, as plain values.
 
@@ -322,7 +327,7 @@ class FrameBodies:
             finest: The finest level.
             base: The upsampled cage [m].
             x: The result [m].
-            part: Part of the longest way out beyond which a vertex between overlapping parts counts as pinched.
+            held: Vertices that count as pinched between overlapping parts, however short the way out, or None.
         """
         bodies: dict[str, object] = {}
         for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
@@ -331,10 +336,11 @@ class FrameBodies:
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
             through = len(track.pierced(finest, x, after.abs()))
             name = each.path if surface.closed else f"{each.path} (open part)"
-            longest = part * track.longest
             bodies[name] = {
-                "before": asdict(penetration(surface, finest, base + shift, before, longest=longest)),
-                "after": asdict(penetration(surface, finest, x + shift, after, longest=longest, crossings=through)),
+                "before": asdict(penetration(surface, finest, base + shift, before, longest=track.longest)),
+                "after": asdict(
+                    penetration(surface, finest, x + shift, after, longest=track.longest, held=held, crossings=through)
+                ),
             }
         return {"bodies": bodies}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,8 +24,8 @@ from .settings import ContactSettings
 
 FINISHES = 3
 """How often cloth is mended and pushed out of bodies in turn, while either undoes the other."""
-WAYS_OUT = (1.0, 0.5, 0.25, 0.0)
-"""Parts of the longest way out that are tried in turn where pushing out cloth that is nearly pinched makes it cross."""
+HOLDS = 6
+"""How often more of what is between overlapping parts of a body is left there, while pushing it out makes it cross."""
 Touch = Contact | SelfContact | Spheres | Seam
 """A term that stands for something near."""
 
@@ -95,7 +96,7 @@ class FrameContact:
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._aim: Tensor | None = None
-        self._way_out = WAYS_OUT[0]
+        self._held: Tensor | None = None
         self._bodies, self._cloth = bodies, cloth
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
         self._views: dict[int, LevelContact] = {}
@@ -119,6 +120,8 @@ class FrameContact:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
             cloth = self._cloth_at(level, base)
+            if cloth is not None and level is self._levels[-1] and self._judge is not None:
+                cloth.allowed = self._judge.before
             seam = None if self._seams is None else self._seams.term(level, base)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
         return self._views[level.index]
@@ -174,25 +177,27 @@ class FrameContact:
 
         Between overlapping parts of a body there is no room: what is pushed out there piles up in the crease.
         """
-        best = (cloth.look(x).crossings.count, x, told, self._way_out)
-        for part in WAYS_OUT:
-            bodies.hold(part)
+        best = (cloth.look(x).crossings.count, x, told, self._held)
+        held, out = torch.zeros_like(self._levels[-1].free[:, 0]), x
+        for attempt in range(HOLDS):
+            held = held | cloth.round_crossings(out, rings=attempt)
+            bodies.hold(held)
             out, moved = bodies.project(mended)
             count = cloth.look(out).crossings.count
-            if count < best[0]:
-                best = (count, out, moved, part)
+            if count >= best[0]:
+                break
+            best = (count, out, moved, held)
             if not cloth.worse(out):
                 break
-        self._way_out = best[3]
-        bodies.hold(self._way_out)
+        self._held = best[3]
+        bodies.hold(self._held)
         return best[1], best[2]
 
+    @cached_property
     def _judge(self) -> ClothView | None:
-        """The finest level's cloth as the input has it."""
+        """The finest level's cloth as the input has it, where another cage is followed; else None."""
         finest = self._levels[-1]
-        if self._aim is self._coarse:
-            return self.at(finest).cloth
-        return self._cloth_at(finest, finest.base.apply(self._coarse))
+        return None if self.aim is self._coarse else self._cloth_at(finest, finest.base.apply(self._coarse))
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
         """What is in bodies and what crosses, before and after, as plain values, and vertices of cloth that crosses.
@@ -201,11 +206,11 @@ class FrameContact:
             x: The result [m].
         """
         finest = self._levels[-1]
-        judge, crossing = self._judge(), torch.zeros_like(finest.free[:, 0])
+        view, crossing = self._judge or self.at(finest).cloth, torch.zeros_like(finest.free[:, 0])
         said: dict[str, object] = {}
         if self._bodies is not None:
-            said |= self._bodies.measure(finest, finest.base.apply(self._coarse), x, part=self._way_out)
-        if judge is not None:
-            cloth, crossing = judge.measure(x)
+            said |= self._bodies.measure(finest, finest.base.apply(self._coarse), x, held=self._held)
+        if view is not None:
+            cloth, crossing = view.measure(x)
             said |= {"cloth": cloth} if cloth else {}
         return said, crossing
