@@ -19,6 +19,8 @@ from .untangle import pieces_of
 
 PASSES = 6
 """Most pieces' goes: a piece laid back may uncover another contour."""
+WIDER = (0.0, 0.25, 0.5)
+"""Least gaps that are tried, in mean edges: faces of curved cloth come through ones that lie closer than they sag."""
 BESIDE = 2
 """Rings round a piece that are its own cloth and no barrier to it."""
 
@@ -31,25 +33,38 @@ def drawn_apart(
     Args:
         mesh: The cloth of one level.
         x: Positions [m].
-        gap: Distance that they end from what they were behind [m].
+        gap: Distance that they end from what they were behind [m], or a part of an edge where that crosses less.
 
     Returns:
         Positions [m], x itself where nothing gets better, and the number of crossings before and after.
     """
-    every = torch.ones_like(mesh.level.free[:, 0])
-    mesh.move(x)
-    found = mesh.crossings(every)
-    before, best = found.count, x
-    for _ in range(PASSES):
-        if not found.count:
+    start = _look(mesh, x)
+    best = (x, start)
+    for least in WIDER:
+        if not best[1].count:
             break
-        moved = _lay_back(mesh, found, best, gap=gap)
-        mesh.move(moved)
-        after = mesh.crossings(every)
+        found = _in_passes(mesh, x, start, gap=max(gap, least * float(mesh.level.spacing.mean())))
+        best = found if found[1].count < best[1].count else best
+    return best[0], start.count, best[1].count
+
+
+def _in_passes(mesh: ClothMesh, x: Tensor, found: Crossings, *, gap: float) -> tuple[Tensor, Crossings]:
+    """Lay pieces back while fewer parts cross; the positions, and what crosses there."""
+    for _ in range(PASSES):
+        moved = _lay_back(mesh, found, x, gap=gap)
+        after = _look(mesh, moved)
         if after.count >= found.count:
             break
-        best, found = moved, after
-    return best, before, found.count
+        x, found = moved, after
+        if not found.count:
+            break
+    return x, found
+
+
+def _look(mesh: ClothMesh, x: Tensor) -> Crossings:
+    """What crosses at x [m]."""
+    mesh.move(x)
+    return mesh.crossings(torch.ones_like(mesh.level.free[:, 0]))
 
 
 def _lay_back(mesh: ClothMesh, crossings: Crossings, x: Tensor, *, gap: float) -> Tensor:

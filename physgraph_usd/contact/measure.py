@@ -68,7 +68,7 @@ def penetration(
         crossings: How many edges pass through faces, where that is known.
     """
     free = level.free[:, 0]
-    depth, stays = depths(surface, x, signed, longest, held)
+    depth, stays = depths(surface, x, signed, longest, held=held)
     deep = (depth > DEEP) & ~stays
     inside = int((deep & free).sum())
     deepest = float((depth * (free & ~stays)).max()) if len(depth) else 0.0
@@ -87,6 +87,7 @@ def depths(
     x: Float[Tensor, "vertices 3"],
     signed: Float[Tensor, " vertices"],
     longest: float,
+    *,
     held: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
     """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched.
