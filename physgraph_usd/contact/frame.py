@@ -110,8 +110,15 @@ class FrameContact:
             if self._cloth is not None and self._seams is None:
                 cage = self._levels[0]
                 bodies = None if self._bodies is None else self._bodies.at(cage, self._levels[-1])
-                mesh, gap = self._cloth.mesh(cage), float(self._thickness.mean())
-                self._aim = repaired_cage(cage, self._coarse, bodies=bodies, mesh=mesh, gap=gap)
+                view = self._cloth_at(cage, cage.base.apply(self._coarse))
+                self._aim = repaired_cage(
+                    cage,
+                    self._coarse,
+                    bodies=bodies,
+                    mesh=self._cloth.mesh(cage),
+                    gap=float(self._thickness.mean()),
+                    crosses=view is not None and view.before.crossings.count > 0,
+                )
         return self._aim
 
     def at(self, level: Level) -> LevelContact:

@@ -32,6 +32,7 @@ def repaired_cage(
     bodies: LevelBodies | None,
     mesh: ClothMesh,
     gap: float,
+    crosses: bool = True,
 ) -> Float[Tensor, "coarse 3"]:
     """The cage that the fine cloth is to follow; the input itself where nothing is pinched and nothing crosses.
 
@@ -41,11 +42,14 @@ def repaired_cage(
         bodies: The cage's view of the bodies, or None without.
         mesh: The cage's faces.
         gap: Distance at which cloth drawn apart lies [m].
+        crosses: Whether the input may cross itself.
 
     Returns:
         Positions [m].
     """
     taut = coarse if bodies is None else _drawn_taut(cage, coarse, bodies, mesh)
+    if not crosses and taut is coarse:
+        return coarse
     out, before, after = drawn_apart(mesh, taut, gap=gap)
     return out if before > after or taut is not coarse else coarse
 
