@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +83,8 @@ def test_a_sleeve_deep_in_the_body_ends_with_no_more_crossings(tmp_path: Path):
     """The T-shirt with an arm through its chest: nothing that has a way out stays inside."""
     shot = open_shot(str(write_sample("tshirt", tmp_path)))
     refiner = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[2])
-    contact = refiner.solve(shot.frame(36.0)).telemetry[0]["contact"]
+    telemetry: dict[str, Any] = refiner.solve(shot.frame(36.0)).telemetry[0]
+    contact = telemetry["contact"]
     assert contact["cloth"]["before"]["crossings"] > 200
     assert contact["cloth"]["after"]["crossings"] <= contact["cloth"]["before"]["crossings"]
     for body in contact["bodies"].values():
