@@ -193,9 +193,10 @@ class LevelBodies:
         """Vertices inside closed bodies at x [m], and those of them that are pinched."""
         inside, held = (torch.zeros_like(self._level.free[:, 0]) for _ in range(2))
         for track in self._tracks:
-            track.refresh(x, torch.zeros_like(x[:, 0]))
-            deep = torch.where(track.at.eq(x).all(dim=1), track.known, track.known.abs())
-            depth, pinned = depths(track.surface, x + track.shift, deep, track.longest)
+            at = x + track.shift
+            signed = signed_distances(track.surface, at, self._level.edges, reach=self._reach)
+            signed = torch.where(track.offset.isfinite(), signed, signed.abs())
+            depth, pinned = depths(track.surface, at, signed, track.longest)
             inside |= depth > 0
             held |= pinned
         return inside, held

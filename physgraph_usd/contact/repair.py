@@ -21,6 +21,8 @@ from .apart import drawn_apart
 from .bodies import LevelBodies
 from .cloth_mesh import ClothMesh
 
+WORTH = 0.9
+"""Part of the input's crossings under which a cage must come for the fine cloth to follow it."""
 FAIRINGS, PASSES = 3, 2
 """How often drawn cloth is smoothed and pushed out in turn, and passes of the smoothing."""
 
@@ -51,7 +53,7 @@ def repaired_cage(
     if not crosses and taut is coarse:
         return coarse
     out, before, after = drawn_apart(mesh, taut, gap=gap)
-    return out if before > after or taut is not coarse else coarse
+    return out if after < WORTH * before or taut is not coarse else coarse
 
 
 def _drawn_taut(cage: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Tensor:
