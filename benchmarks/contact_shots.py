@@ -30,7 +30,7 @@ FORMS = {
     "paper": ContactSettings(form="linear", cloth="spheres", projections=0, lifts=0),
     "elastic": ContactSettings(form="off", cloth="off"),
 }
-SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "crossing": 1, "skirt": 20}
+SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "crossing": 1, "skirt": 20, "tshirt": 30}
 """Samples and the number of their first frame here."""
 REAL = {
     "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], ["/shot/char/body_geo"], 36),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -126,21 +126,21 @@ class Group:
         coarse = self._tensor(world - origin)
         predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
         contact = self._contact(touching, coarse, origin, frames)
+        aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            x, reports, module, chosen = self._descend(forces, coarse, predicted, clock, contact=contact)
+            x, reports, module, chosen = self._descend(forces, aim, predicted, clock, contact=contact)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
-        result = self._frames.scaled(coarse, x, gain)
+        result = self._frames.scaled(aim, x, gain)
         moved: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
             result, start_next, moved = contact.finish(result)
             x = x if scaled else start_next
         solved = time.perf_counter()
-        carried = self._frames.store(coarse, x)
-        carried = Carried(torch.as_tensor(world), carried.detail, carried.frames)
+        carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world))
         strain = edge_strain(self.levels[-1], result)
         telemetry = self._telemetry(module, result, coarse, reports) | chosen | {"strain": strain, "start": start}
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
@@ -154,9 +154,8 @@ class Group:
         }
         points = result.double().cpu().numpy() + origin
         points[self._fixed] = self._place_fixed @ world
-        spans = self.levels[-1].spans
         crosses = np.zeros(len(points), bool) if crossing is None else crossing.cpu().numpy()
-        own = [[each[span] for span in spans] for each in (points, crosses)]
+        own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
         return Solved(own[0], carried, telemetry, own[1]), strain["p99"]
 
     def energies(
@@ -193,16 +192,17 @@ class Group:
     ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
         """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
         world = np.concatenate([frame.points for frame in frames])
-        origin, module = world.mean(axis=0), self._forces_for(frames)[-1]
+        origin = world.mean(axis=0)
         coarse = self._tensor(world - origin)
-        return module.module(coarse), self._contact(touching, coarse, origin, frames), origin
+        contact = self._contact(touching, coarse, origin, frames)
+        aim = coarse if contact is None else contact.aim
+        return self._forces_for(frames)[-1].module(aim), contact, origin
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
         world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
         coarse = self._tensor((world - world.mean(dim=0)).numpy())
-        forces = self._forces_for(frames)
-        return [lasting.module(coarse) for lasting in forces], coarse
+        return [lasting.module(coarse) for lasting in self._forces_for(frames)], coarse
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)

@@ -20,7 +20,7 @@ from ..colliders.base import Nearest, Surface
 from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
-from .measure import DEEP, Pierced, penetration, pierced, pinched
+from .measure import DEEP, Pierced, depths, longest_ways, penetration, pierced, pinched
 from .room import room_above
 from .settings import ContactSettings
 
@@ -59,6 +59,7 @@ class _Track:
         at: Positions at which distances were found [m], shape (V, 3).
         known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
+        held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
         looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
     """
 
@@ -69,6 +70,7 @@ class _Track:
     at: Tensor
     known: Tensor
     longest: float
+    held: Tensor | None = None
     looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
 
     def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
@@ -100,7 +102,7 @@ class _Track:
             near = _at(found, within)
             way = self.surface.exit(asked[within], near)
             distance[within], point[within], outward[within] = way.distance, way.point, way.normal
-            kept[within] = ~pinched(near, way, self.longest)
+            kept[within] = ~pinched(near, way, longest_ways(self.longest, self.held, which[within]))
         away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
         outward = outward * self._outward(which).unsqueeze(1)
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
@@ -182,6 +184,27 @@ class LevelBodies:
         shifts = (out - x).norm(dim=1)
         far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
         return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
+
+    def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Free vertices moved to the least clearance, wherever bodies come through faces [m]."""
+        return self._out(x, torch.zeros_like(x[:, 0]))[0]
+
+    def within(self, x: Float[Tensor, "vertices 3"]) -> tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
+        """Vertices inside closed bodies at x [m], and those of them that are pinched."""
+        inside, held = (torch.zeros_like(self._level.free[:, 0]) for _ in range(2))
+        for track in self._tracks:
+            at = x + track.shift
+            signed = signed_distances(track.surface, at, self._level.edges, reach=self._reach)
+            signed = torch.where(track.offset.isfinite(), signed, signed.abs())
+            depth, pinned = depths(track.surface, at, signed, track.longest)
+            inside |= depth > 0
+            held |= pinned
+        return inside, held
+
+    def hold(self, held: Bool[Tensor, " vertices"] | None) -> None:
+        """From now on leave these vertices where they are between overlapping parts of a body."""
+        for track in self._tracks:
+            track.held = held
 
     def _out(self, x: Tensor, extra: Tensor) -> tuple[Tensor, int]:
         """Push out to the least clearance and more, body by body; the positions and the passes made.
@@ -292,7 +315,12 @@ class FrameBodies:
         return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
 
     def measure(
-        self, finest: Level, base: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+        self,
+        finest: Level,
+        base: Float[Tensor, "vertices 3"],
+        x: Float[Tensor, "vertices 3"],
+        *,
+        held: Bool[Tensor, " vertices"] | None = None,
     ) -> dict[str, object]:
         """What is in each body and what crosses it, before and after, as plain values.
 
@@ -300,6 +328,7 @@ class FrameBodies:
             finest: The finest level.
             base: The upsampled cage [m].
             x: The result [m].
+            held: Vertices that count as pinched between overlapping parts, however short the way out, or None.
         """
         bodies: dict[str, object] = {}
         for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
@@ -311,7 +340,7 @@ class FrameBodies:
             bodies[name] = {
                 "before": asdict(penetration(surface, finest, base + shift, before, longest=track.longest)),
                 "after": asdict(
-                    penetration(surface, finest, x + shift, after, longest=track.longest, crossings=through)
+                    penetration(surface, finest, x + shift, after, longest=track.longest, held=held, crossings=through)
                 ),
             }
         return {"bodies": bodies}

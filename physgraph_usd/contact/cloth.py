@@ -117,6 +117,7 @@ class ClothView:
 
     Attributes:
         tangled: Whether anything crossed where the term was asked for last.
+        allowed: What may cross in the end: the input, where another cage is followed; else None.
     """
 
     def __init__(
@@ -145,6 +146,7 @@ class ClothView:
         self._found: _Found | None = None
         self._looked: ClothState | None = None
         self.tangled = False
+        self.allowed: ClothState | None = None
         self._reach = float(thickness.max()) + (AHEAD if level.index else 1.0) * float(level.spacing.mean())
 
     @cached_property
@@ -255,9 +257,13 @@ class ClothView:
         return best
 
     def worse(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether more crosses than in the upsampled cage, in all or between garments."""
+        """Whether more crosses than may, in all or between garments."""
         state = self.look(x)
-        return state.crossings.count > 0 and self._excess(state, self.before) > 0
+        return state.crossings.count > 0 and self._excess(state, self.allowed or self.before) > 0
+
+    def round_crossings(self, x: Float[Tensor, "vertices 3"], *, rings: int) -> Bool[Tensor, " vertices"]:
+        """Vertices within some rings of what crosses at x [m]."""
+        return self._mesh.grown(self._corners(self.look(x).crossings), rings)
 
     def _excess(self, state: ClothState, good: ClothState) -> int:
         """By how much more crosses than in good positions, in all or between garments."""

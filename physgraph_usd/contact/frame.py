@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,11 +18,14 @@ from ..level import Level
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
 from .metric import HeldMetric
+from .repair import repaired_cage
 from .seams import Seams
 from .settings import ContactSettings
 
 FINISHES = 3
 """How often cloth is mended and pushed out of bodies in turn, while either undoes the other."""
+HOLDS = 6
+"""How often more of what is between overlapping parts of a body is left there, while pushing it out makes it cross."""
 Touch = Contact | SelfContact | Spheres | Seam
 """A term that stands for something near."""
 
@@ -91,17 +95,40 @@ class FrameContact:
             seams: What the input has at one place, or None when nothing is.
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
+        self._aim: Tensor | None = None
+        self._held: Tensor | None = None
         self._bodies, self._cloth = bodies, cloth
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
         self._views: dict[int, LevelContact] = {}
         self._seams = seams
 
+    @property
+    def aim(self) -> Float[Tensor, "coarse 3"]:
+        """The cage that the fine cloth follows [m]: the input, but where that is pinched or crosses."""
+        if self._aim is None:
+            self._aim = self._coarse
+            if self._cloth is not None and self._seams is None:
+                cage = self._levels[0]
+                bodies = None if self._bodies is None else self._bodies.at(cage, self._levels[-1])
+                view = self._cloth_at(cage, cage.base.apply(self._coarse))
+                self._aim = repaired_cage(
+                    cage,
+                    self._coarse,
+                    bodies=bodies,
+                    mesh=self._cloth.mesh(cage),
+                    gap=float(self._thickness.mean()),
+                    crosses=view is not None and view.before.crossings.count > 0,
+                )
+        return self._aim
+
     def at(self, level: Level) -> LevelContact:
         """The view of one level, the same at each call."""
         if level.index not in self._views:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
-            base = level.base.apply(self._coarse)
+            base = level.base.apply(self.aim)
             cloth = self._cloth_at(level, base)
+            if cloth is not None and level is self._levels[-1] and self._judge is not None:
+                cloth.allowed = self._judge.before
             seam = None if self._seams is None else self._seams.term(level, base)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
         return self._views[level.index]
@@ -110,7 +137,7 @@ class FrameContact:
     def crowded(self) -> bool:
         """Whether cloth is near cloth in the upsampled cage, at the finest level."""
         finest = self._levels[-1]
-        view, base = self.at(finest), finest.base.apply(self._coarse)
+        view, base = self.at(finest), finest.base.apply(self.aim)
         if view.cloth is None or view.cloth.term(base) is None:
             return False
         view.cloth = self._cloth_at(finest, base)  # One that has seen nothing yet: it keeps the sides it sees first.
@@ -136,7 +163,7 @@ class FrameContact:
         moved: dict[str, object] = {}
         mended = None
         if self._seams is not None:
-            x = self._seams.close(finest, finest.base.apply(self._coarse), x)
+            x = self._seams.close(finest, finest.base.apply(self.aim), x)
         for _ in range(FINISHES):
             x = x if view.cloth is None else view.cloth.mend(x).x
             mended = x if mended is None else mended
@@ -144,9 +171,40 @@ class FrameContact:
                 x, moved["projected"] = view.bodies.project(x)
             if view.cloth is None or view.bodies is None or not view.cloth.worse(x):
                 break
+        if view.cloth is not None and view.bodies is not None and mended is not None and view.cloth.worse(x):
+            x, moved["projected"] = self._least_crossed(view.cloth, view.bodies, mended, x, moved["projected"])
         if self._seams is not None:
-            x = self._seams.close(finest, finest.base.apply(self._coarse), x)
+            x = self._seams.close(finest, finest.base.apply(self.aim), x)
         return x, x if mended is None else mended, moved
+
+    def _least_crossed(
+        self, cloth: ClothView, bodies: LevelBodies, mended: Tensor, x: Tensor, told: object
+    ) -> tuple[Tensor, object]:
+        """Leave more of what is nearly pinched where it is, until pushing out the rest crosses no more than the input.
+
+        Between overlapping parts of a body there is no room: what is pushed out there piles up in the crease.
+        """
+        best = (cloth.look(x).crossings.count, x, told, self._held)
+        held, out = torch.zeros_like(self._levels[-1].free[:, 0]), x
+        for attempt in range(HOLDS):
+            held = held | cloth.round_crossings(out, rings=attempt)
+            bodies.hold(held)
+            out, moved = bodies.project(mended)
+            count = cloth.look(out).crossings.count
+            if count >= best[0]:
+                break
+            best = (count, out, moved, held)
+            if not cloth.worse(out):
+                break
+        self._held = best[3]
+        bodies.hold(self._held)
+        return best[1], best[2]
+
+    @cached_property
+    def _judge(self) -> ClothView | None:
+        """The finest level's cloth as the input has it, where another cage is followed; else None."""
+        finest = self._levels[-1]
+        return None if self.aim is self._coarse else self._cloth_at(finest, finest.base.apply(self._coarse))
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
         """What is in bodies and what crosses, before and after, as plain values, and vertices of cloth that crosses.
@@ -155,11 +213,11 @@ class FrameContact:
             x: The result [m].
         """
         finest = self._levels[-1]
-        view, crossing = self.at(finest), torch.zeros_like(finest.free[:, 0])
+        view, crossing = self._judge or self.at(finest).cloth, torch.zeros_like(finest.free[:, 0])
         said: dict[str, object] = {}
         if self._bodies is not None:
-            said |= self._bodies.measure(finest, finest.base.apply(self._coarse), x)
-        if view.cloth is not None:
-            cloth, crossing = view.cloth.measure(x)
+            said |= self._bodies.measure(finest, finest.base.apply(self._coarse), x, held=self._held)
+        if view is not None:
+            cloth, crossing = view.measure(x)
             said |= {"cloth": cloth} if cloth else {}
         return said, crossing

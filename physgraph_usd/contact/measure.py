@@ -53,6 +53,7 @@ def penetration(
     signed: Float[Tensor, " vertices"],
     *,
     longest: float,
+    held: Bool[Tensor, " vertices"] | None = None,
     crossings: int | None = None,
 ) -> Penetration:
     """Measure one garment group against one surface.
@@ -63,25 +64,31 @@ def penetration(
         x: Positions in the surface's coordinates [m].
         signed: Signed distances at x, lower bounds where they are positive [m].
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
+        held: Vertices that count as pinched there however short the way out, or None.
         crossings: How many edges pass through faces, where that is known.
     """
     free = level.free[:, 0]
-    depth, held = depths(surface, x, signed, longest)
-    deep = (depth > DEEP) & ~held
+    depth, stays = depths(surface, x, signed, longest, held=held)
+    deep = (depth > DEEP) & ~stays
     inside = int((deep & free).sum())
-    deepest = float((depth * (free & ~held)).max()) if len(depth) else 0.0
+    deepest = float((depth * (free & ~stays)).max()) if len(depth) else 0.0
     return Penetration(
         inside=inside,
         percent=round(100.0 * inside / max(int(free.sum()), 1), 4),
         deepest_mm=round(1e3 * deepest, 4),
         pinned=int((deep & ~free).sum()),
-        pinched=int((held & free).sum()),
+        pinched=int((stays & free).sum()),
         crossings=len(pierced(surface, level, x, signed.abs())) if crossings is None else crossings,
     )
 
 
 def depths(
-    surface: Surface, x: Float[Tensor, "vertices 3"], signed: Float[Tensor, " vertices"], longest: float
+    surface: Surface,
+    x: Float[Tensor, "vertices 3"],
+    signed: Float[Tensor, " vertices"],
+    longest: float,
+    *,
+    held: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
     """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched.
 
@@ -90,17 +97,26 @@ def depths(
         x: Positions in its coordinates [m].
         signed: Signed distances at x, lower bounds where they are positive [m].
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
+        held: Vertices that count as pinched there however short the way out, or None.
     """
-    depth, held = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
+    depth, stays = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
     within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
     if len(within):
         found = surface.closest(x[within], torch.full_like(signed[within], float("inf")))
         way = surface.exit(x[within], found)
-        depth[within], held[within] = way.distance, pinched(found, way, longest)
-    return depth, held
+        ways = longest_ways(longest, held, within)
+        depth[within], stays[within] = way.distance, pinched(found, way, ways)
+    return depth, stays
 
 
-def pinched(found: Nearest, way: Nearest, longest: float) -> Bool[Tensor, " points"]:
+def longest_ways(
+    longest: float, held: Bool[Tensor, " vertices"] | None, which: Int[Tensor, " some"]
+) -> float | Float[Tensor, " some"]:
+    """The longest way out that each of some vertices is sent [m]: none where it is held."""
+    return longest if held is None else longest * (~held[which]).to(torch.float32)
+
+
+def pinched(found: Nearest, way: Nearest, longest: float | Float[Tensor, " points"]) -> Bool[Tensor, " points"]:
     """Which points inside are between overlapping parts and too far from a way out.
 
     Args:

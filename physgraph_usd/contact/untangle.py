@@ -82,6 +82,21 @@ def cut_off(mesh: ClothMesh, crossings: Crossings) -> Bool[Tensor, " vertices"]:
         mesh: The cloth.
         crossings: What crosses.
     """
+    piece, off, _ = pieces_of(mesh, crossings)
+    return torch.as_tensor(off[piece], device=mesh.level.rest.device)
+
+
+def pieces_of(mesh: ClothMesh, crossings: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pieces into which contours cut the cloth.
+
+    Args:
+        mesh: The cloth.
+        crossings: What crosses.
+
+    Returns:
+        The piece of each vertex, which pieces are cut off (smaller than the largest of what hangs together without
+        crossings), and their areas [m^2].
+    """
     count = mesh.level.vertex_count
     ends = mesh.level.edges.cpu().numpy()
     kept = np.ones(len(ends), bool)
@@ -91,8 +106,7 @@ def cut_off(mesh: ClothMesh, crossings: Crossings) -> Bool[Tensor, " vertices"]:
     first = np.unique(piece, return_index=True)[1]
     largest = np.zeros(int(whole.max()) + 1)
     np.maximum.at(largest, whole[first], area)
-    off = area < largest[whole[first]]
-    return torch.as_tensor(off[piece], device=mesh.level.rest.device)
+    return piece, area < largest[whole[first]], area
 
 
 def _labels(ends: np.ndarray, count: int) -> np.ndarray:

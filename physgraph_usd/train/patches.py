@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import Delaunay
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..fabric import Fabric
@@ -50,6 +51,8 @@ class PatchConfig:
         most_vertices: Finest vertices beyond which a patch has one level less.
         reference_steps: Quasi-Newton steps a level behind the least energy known.
         touched: Part of the patches that rest on a body.
+        skinned: Part of the poses that are bent as linear blend skinning bends, sharply and losing length.
+        pulled: Part of the poses that are stretched along one direction.
     """
 
     count: int = 64
@@ -60,6 +63,8 @@ class PatchConfig:
     most_vertices: int = 4000
     reference_steps: int = 150
     touched: float = 0.0
+    skinned: float = 0.0
+    pulled: float = 0.0
 
 
 @dataclass(eq=False)
@@ -177,7 +182,7 @@ def _patch(config: PatchConfig, rng: np.random.Generator) -> Patch:
     while levels > 1 and len(rest) * 4**levels > config.most_vertices:
         levels -= 1
     garment = Garment("/Patch", mesh, rest, levels, False, bool(rng.random() < 0.3), one, one, one, one, pin)
-    points = _posed(rest, rng)
+    points = _posed(rest, rng, config)
     if rng.random() < 0.5 and pin.any():
         points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)
     frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
@@ -243,12 +248,14 @@ def _rolled(flat: np.ndarray, shape: str, rng: np.random.Generator) -> np.ndarra
     return np.stack([u, v, -height * square / size], axis=1)
 
 
-def _posed(rest: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Squeezed, sheared, twisted, bent and waved at random, then turned anywhere."""
+def _posed(rest: np.ndarray, rng: np.random.Generator, config: PatchConfig) -> np.ndarray:
+    """Squeezed or pulled, sheared, twisted, bent, waved and skinned at random, then turned anywhere."""
     centre, size = rest.mean(axis=0), float(np.ptp(rest, axis=0).max())
     frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     x = (rest - centre) @ frame / size
     squeeze = 1.0 + np.array([-rng.uniform(0.03, 0.3), rng.uniform(-0.15, 0.03), rng.uniform(-0.15, 0.03)])
+    if config.pulled and rng.random() < config.pulled:
+        squeeze[0] = rng.uniform(1.0, 1.3)
     x = x * squeeze[rng.permutation(3)]
     x[:, 0] += rng.normal(0.0, 0.08) * x[:, 1]
     turn = rng.normal(0.0, 0.7) * x[:, 1]
@@ -261,7 +268,18 @@ def _posed(rest: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         amplitude = rng.normal(size=3) * 0.03 * np.pi / np.linalg.norm(wave) * rng.random()
         x += np.sin(x @ wave + offset)[:, None] * amplitude
     x += rng.normal(size=x.shape) * 0.1 * rng.random() ** 2 / np.sqrt(len(x))
+    if config.skinned and rng.random() < config.skinned:
+        x = _skinned(x, rng)
     return x @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T * size
+
+
+def _skinned(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Bent about an axis by the mean of two poses, with weights that change over a narrow band; sizes are about 1."""
+    axis, across = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
+    pivot = x[rng.integers(len(x))]
+    weight = np.clip((x - pivot) @ across / rng.uniform(0.1, 0.5) + 0.5, 0.0, 1.0)[:, None]
+    turn = Rotation.from_rotvec(rng.uniform(0.5, 2.0) * axis)
+    return (1.0 - weight) * x + weight * (turn.apply(x - pivot) + pivot)
 
 
 def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:

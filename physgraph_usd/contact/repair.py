@@ -1,0 +1,106 @@
+"""The cage that the fine cloth follows where the input leaves it no room, or through itself.
+
+Two things no fine cloth can follow. Where parts of a skinned body overlap, the cage goes deep through both, and cloth
+that is pushed out of them tears. Where cages cross, the guide draws the fine cloth through itself again. There, and
+there only, the solve follows a repaired cage: cloth between overlapping parts is drawn taut from where it goes in to
+where it comes out, and pieces that crossed go back to their side. The report's figures still count from the input.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as splinalg
+import torch
+from jaxtyping import Bool, Float
+from scipy.sparse import csgraph
+from torch import Tensor
+
+from ..level import Level
+from .apart import drawn_apart
+from .bodies import LevelBodies
+from .cloth_mesh import ClothMesh
+
+WORTH = 0.9
+"""Part of the input's crossings under which a cage must come for the fine cloth to follow it."""
+FAIRINGS, PASSES = 3, 2
+"""How often drawn cloth is smoothed and pushed out in turn, and passes of the smoothing."""
+
+
+def repaired_cage(
+    cage: Level,
+    coarse: Float[Tensor, "coarse 3"],
+    *,
+    bodies: LevelBodies | None,
+    mesh: ClothMesh,
+    gap: float,
+    crosses: bool = True,
+) -> Float[Tensor, "coarse 3"]:
+    """The cage that the fine cloth is to follow; the input itself where nothing is pinched and nothing crosses.
+
+    Args:
+        cage: The cage's level.
+        coarse: Its positions [m].
+        bodies: The cage's view of the bodies, or None without.
+        mesh: The cage's faces.
+        gap: Distance at which cloth drawn apart lies [m].
+        crosses: Whether the input may cross itself.
+
+    Returns:
+        Positions [m].
+    """
+    taut = coarse if bodies is None else _drawn_taut(cage, coarse, bodies, mesh)
+    if not crosses and taut is coarse:
+        return coarse
+    out, before, after = drawn_apart(mesh, taut, gap=gap)
+    return out if after < WORTH * before or taut is not coarse else coarse
+
+
+def _drawn_taut(cage: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Tensor:
+    """Cloth between overlapping parts of a body as a taut membrane, and what can leave it outside."""
+    inside, held = bodies.within(x)
+    held &= cage.free[:, 0]
+    if not bool(held.any()):
+        return x
+    hidden = _patches_with(inside & cage.free[:, 0], held, mesh.beside)
+    around = mesh.grown(hidden, 1) & cage.free[:, 0]
+    out = _membrane(x, hidden, mesh.beside)
+    for _ in range(FAIRINGS):
+        out = bodies.push_out(_smoothed(out, around, mesh.beside))
+    return out
+
+
+def _patches_with(
+    some: Bool[Tensor, " vertices"], seeds: Bool[Tensor, " vertices"], beside: sp.csr_matrix
+) -> Bool[Tensor, " vertices"]:
+    """Of some vertices the connected patches that hold a seed."""
+    which = np.flatnonzero(some.cpu().numpy())
+    label = csgraph.connected_components(beside[which][:, which], directed=False)[1]
+    kept = np.isin(label, label[seeds.cpu().numpy()[which]])
+    out = torch.zeros_like(some)
+    out[torch.as_tensor(which[kept], device=some.device)] = True
+    return out
+
+
+def _membrane(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:
+    """Each vertex of a region at the mean of its neighbours; the rest is held."""
+    inner, rest = (np.flatnonzero(each.cpu().numpy()) for each in (where, ~where))
+    rows = sp.csr_matrix(sp.diags(np.asarray(beside.sum(axis=1)).ravel()) - beside)[inner]
+    touched = np.unique(csgraph.connected_components(beside, directed=False)[1][rest])
+    if not len(touched):
+        return x
+    points = x.double().cpu().numpy().copy()
+    points[inner] = splinalg.spsolve(sp.csc_matrix(rows[:, inner]), -rows[:, rest] @ points[rest])
+    out = torch.as_tensor(points).to(x)
+    return torch.where(out.isfinite(), out, x)
+
+
+def _smoothed(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:
+    """Half way to the mean of the neighbours, in some passes."""
+    which = np.flatnonzero(where.cpu().numpy())
+    rows = beside[which]
+    share = 1.0 / np.maximum(np.asarray(rows.sum(axis=1)), 1.0)
+    points = x.double().cpu().numpy().copy()
+    for _ in range(PASSES):
+        points[which] = 0.5 * (points[which] + share * (rows @ points))
+    return torch.as_tensor(points).to(x)
