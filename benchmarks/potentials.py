@@ -34,7 +34,7 @@ POSES = {
     "layers": (("*/Shirt",), (8.0, 16.0, 24.0)),
     "tshirt": ((), (36.0,)),
 }
-"""Garments, all when empty, and time codes of each sample; the short form takes every other one."""
+"""Garments, all when empty, and time codes of each sample."""
 LEVEL = 2
 ERG = 1e7
 """Ergs in a joule."""
@@ -107,8 +107,8 @@ def measure(short: bool) -> Found:
     rows: list[Row] = []
     steps = CONVERGED if short else LONG
     notes = [form(short, steps)]
-    for name, (_, times) in POSES.items():
-        sums = run(name, steps, times[::2] if short else times)
+    for name in POSES:
+        sums = run(name, steps)
         fall = sums[INPUT].whole - sums[LEAST].whole
         gap = {each: 100 * (found.whole - sums[LEAST].whole) / fall for each, found in sums.items()}
         rows += figures(name, sums, gap)
@@ -128,10 +128,9 @@ def measure(short: bool) -> Found:
 
 
 def form(short: bool, steps: int) -> str:
-    """What of the poses was measured, in words."""
-    taken = "The short form takes every other pose" if short else "The long form takes every pose"
-    other = f"; the long form takes every pose and {LONG}" if short else ""
-    return f"{taken} and {steps} steps at the finest level for the converged solve{other}."
+    """How far the converged solve went, in words."""
+    other = f", the long form {LONG}" if short else ""
+    return f"The converged solve takes {steps} steps at the finest level{other}."
 
 
 def figures(name: str, sums: dict[str, Sums], gap: dict[str, float]) -> list[Row]:
@@ -149,9 +148,10 @@ def figures(name: str, sums: dict[str, Sums], gap: dict[str, float]) -> list[Row
     ]
 
 
-def run(name: str, steps: int, times: Sequence[float]) -> dict[str, Sums]:
-    """Every method over poses of a sample, the converged solve with so many steps."""
-    shot = opened(name, LEVEL, POSES[name][0])
+def run(name: str, steps: int) -> dict[str, Sums]:
+    """Every method over the poses of a sample, the converged solve with so many steps."""
+    garments, times = POSES[name]
+    shot = opened(name, LEVEL, garments)
     single, double = problem_of(shot), problem_of(shot, torch.float64)
     sums: dict[str, Sums] = {}
     raw = Method(lambda: integrator_of(shipped_network("physgraph-paper")), nested=False)
