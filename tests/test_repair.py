@@ -73,6 +73,8 @@ class TestRepairedCage:
         told = next(iter(state.telemetry[0]["contact"]["bodies"].values()))
         assert told["before"]["inside"] + told["before"]["pinched"] > 50
         assert told["after"]["inside"] == 0
+        assert 5 < state.telemetry[0]["contact"]["repaired"]["vertices"] < 100
+        assert 1.0 < state.telemetry[0]["contact"]["repaired"]["largest_mm"] < 100.0
         hidden = np.linalg.norm(state.points[0][:, 1:], axis=1) < 0.03
         assert hidden.sum() > 5
         assert np.abs(state.points[0][hidden, 0]).max() < 0.03

@@ -161,6 +161,9 @@ class FrameContact:
         finest = self._levels[-1]
         view = self.at(finest)
         moved: dict[str, object] = {}
+        if self.aim is not self._coarse:
+            shift = (self.aim - self._coarse).norm(dim=1)
+            moved["repaired"] = {"vertices": int((shift > 0).sum()), "largest_mm": round(1e3 * float(shift.max()), 4)}
         mended = None
         if self._seams is not None:
             x = self._seams.close(finest, finest.base.apply(self.aim), x)

@@ -25,7 +25,7 @@ from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.scene import GarmentFrame
 
 EDGE = 0.05
-LONG = {"steps": 200, "tolerance": 1e-5}
+LONG = {"steps": 200, "tolerance": 1e-6}
 """Enough that what is left is the method's own fault."""
 
 
