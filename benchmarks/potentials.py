@@ -8,7 +8,8 @@ whose sleeves go deep into the body (`tshirt`). Fabric: k_s = 1e4 erg/cm^2, k_b 
 is our potential with these constants; what is told is the paper's area-mean one, of springs, hinges and weight. That
 falls with the square of the edges' length: totals of different meshes do not compare, their ratios do. Gravity counts
 from the mean height of the input. Gaps are of all that is minimised, guide and contact included. A vertex collides
-where it is less than 2 mm outside the body.
+where it is less than 2 mm outside the body. Inside counts all that is deeper than 0.1 mm, also what lies between
+overlapping parts of the body, where there is no outside and the report calls it pinched.
 """
 
 from __future__ import annotations
