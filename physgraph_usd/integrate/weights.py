@@ -22,7 +22,7 @@ from ..errors import WeightsError
 from .network import VECTORS, Physgraph, PhysgraphConfig
 from .paper_network import PaperConfig, PaperNetwork
 
-VERSION = "1"
+VERSION = "2"
 """Format of the file and meaning of the features; other versions are refused."""
 FOLDER = Path(__file__).resolve().parents[1] / "weights"
 """The weights that ship."""
