@@ -52,6 +52,8 @@ class LevelContact:
         if not terms:
             return plain
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
+        if self._held is None and not bool((stiff > 0).any()):
+            return plain  # Things are near, but nothing pushes yet.
         if self._held is None:
             self._held = HeldMetric(plain, stiff)
         elif not self._held.serves(stiff, tangled=self.tangled):
