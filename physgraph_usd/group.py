@@ -88,7 +88,7 @@ class Group:
         self._forces: list[LevelForces] = []
         self._stretch = 0.0
         # What an integrator records on CUDA lasts as long as the systems and itself.
-        self._recorded, self._integrators = device != "cpu", dict[bool, Integrator]()
+        self._systems_last, self._integrators = device != "cpu", dict[bool, Integrator]()
 
     def solve(
         self,
@@ -178,8 +178,11 @@ class Group:
         """
         modules, coarse = self.modules(frames)
         parts = zip(self.levels, self._forces_for(frames), modules, strict=True)
-        given = [(m, own.metric, {"free": v.free, "spacing": v.spacing, "level": v}) for v, own, m in parts]
-        return [System(m, metric, **shown, lasting=True) for m, metric, shown in given], coarse
+        systems = [
+            System(module, own.metric, free=level.free, spacing=level.spacing, level=level, lasting=True)
+            for level, own, module in parts
+        ]
+        return systems, coarse
 
     def use(self, settings: SolveSettings) -> None:
         """Solve the frames that follow in another way; levels and metrics are kept."""
@@ -308,12 +311,13 @@ class Group:
             if index > first and level.from_below is not None:
                 x = level.from_below.apply(x)
             module = lasting.module(coarse)
-            tied = predicted is not None and self._settings.temporal == "tether"
-            tie = (self._settings.tether, predicted) if tied and predicted is not None else None
+            tie = None
+            if predicted is not None and self._settings.temporal == "tether":
+                tie = (self._settings.tether, predicted)
             budget = self._settings.budget(len(self.levels) - 1 - index, clock, more=choice.steps)
             view = None if contact is None else contact.at(level)
             cold = predicted is None
-            if self._recorded:
+            if self._systems_last:
                 alone = lasting.lasting_system(coarse, tie)
             else:
                 terms = module if tie is None else ForceModule((*module.forces, lasting.tether(*tie)))

@@ -82,7 +82,7 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
     results = []
     for lasting in (False, True):
         group = group_of(mesh, rest, level=2, dtype=torch.float32, integrator=integrator)
-        monkeypatch.setattr(group, "_recorded", lasting)
+        monkeypatch.setattr(group, "_systems_last", lasting)
         kept, points = None, []
         for frame in frames:
             solved = group.solve(frame, kept, at=None)

@@ -16,6 +16,7 @@ from torch import Tensor
 from ..contact.settings import ContactSettings
 from ..forces.base import ForceModule
 from ..forces.contact import Contact, Planes
+from ..integrate.around import Around
 from ..integrate.base import System
 from ..integrate.metric import Metric
 from ..level import Level
@@ -61,20 +62,12 @@ class Body:
             base: The upsampled cage [m].
             span: The patch's vertices.
         """
-        normal = self.side * vertex_normals(level, base)[span]
+        normal = self.side * Around(level, base).normal[span]
         own = base[span]
         lift = self.height * torch.sin(own @ torch.as_tensor(self.wave).to(own) + self.phase)
         vertex = torch.arange(span.start, span.stop, dtype=torch.int32, device=base.device)
         planes = Planes(vertex, normal.contiguous(), (normal * own).sum(dim=1) + lift)
         return Contact(level, [planes], self.stiffness)
-
-
-def vertex_normals(level: Level, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-    """Unit normals at positions x [m], by the area of the triangles around each vertex."""
-    a, b, c = x[level.triangles.long()].unbind(dim=1)
-    across = torch.linalg.cross(b - a, c - a).repeat_interleave(3, dim=0)
-    total = torch.zeros_like(x).index_add_(0, level.triangles.long().reshape(-1), across)
-    return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
 
 
 def with_bodies(
