@@ -58,7 +58,7 @@ REAL: dict[str, tuple[list[str], list[str], float]] = {
     "02_makehuman_usdskel_dm.usdc": (["/shot/char/top", "/shot/char/shorts"], ["/shot/char/body"], 30.0),
 }
 """Real shots: garments, bodies and time code."""
-STEPS = {"quasi-newton": (2, 4, 8, 16), "quasi-newton-flat": (4, 16, 32, 64), "physgraph": (2, 8)}
+STEPS = {"quasi-newton": (2, 4, 8, 16), "quasi-newton-flat": (4, 16, 32, 48, 64), "physgraph": (2, 8)}
 DEFAULT, START, LEAST = "default", "start", "least"
 LEAST_STEPS = {"quasi-newton": 48, "quasi-newton-flat": 192}
 FAR = 2.0

@@ -302,6 +302,8 @@ class Group:
         if choice.learned not in self._integrators:
             self._integrators[choice.learned] = choice.integrator(self._settings.method.build)
         self._integrator = self._integrators[choice.learned]
+        if contact is not None and (choice.nested or warm):
+            contact.forget()  # The choice looked at the upsampled cage, which is not where the level starts.
         first = 0 if choice.nested else subdivisions
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []

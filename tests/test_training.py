@@ -180,6 +180,9 @@ def test_the_loss_counts_gaps_of_each_patch_relative_to_its_own_start():
     assert float(scaled) == pytest.approx(float(loss_of(energies, before, least, kind="log")))
     huge = loss_of(torch.tensor([[1e9, 1e9]]), before, least, kind="ratio")
     assert 10 < float(huge) < 30
+    falling = torch.tensor([[2.0], [1.5], [1.0]])
+    late = loss_of(falling, torch.tensor([3.0]), torch.tensor([1.0]), kind="ratio", late=2.0)
+    assert float(late) == pytest.approx((1 * 0.5 + 4 * 0.25 + 9 * 0.0) / 14)
 
 
 @pytest.mark.slow

@@ -136,14 +136,18 @@ class FrameContact:
         return self._views[level.index]
 
     @property
-    def crowded(self) -> bool:
-        """Whether cloth is near cloth in the upsampled cage, at the finest level."""
+    def crowding(self) -> float:
+        """Part of the finest vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
         finest = self._levels[-1]
         view, base = self.at(finest), finest.base.apply(self.aim)
-        if view.cloth is None or view.cloth.term(base) is None:
-            return False
-        view.cloth = self._cloth_at(finest, base)  # One that has seen nothing yet: it keeps the sides it sees first.
-        return True
+        term = None if view.cloth is None else view.cloth.term(base)
+        if term is None or view.cloth is None:
+            return 0.0
+        return 1.0 if view.cloth.tangled else float(term.near(finest).to(base).mean())
+
+    def forget(self) -> None:
+        """Look at the finest level as if it had never been looked at: its cloth keeps the sides that it sees first."""
+        self._views.pop(self._levels[-1].index, None)
 
     def _cloth_at(self, level: Level, base: Float[Tensor, "vertices 3"]) -> ClothView | None:
         """A new view of one level's cloth, upsampled to given positions [m]."""

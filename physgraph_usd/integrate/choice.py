@@ -23,6 +23,8 @@ from .weights import shipped_network
 
 LONGER = 4
 """Steps of the finest level alone over those that it takes after coarse ones."""
+CROWDED = 0.1
+"""Part of the vertices with cloth near them from which a cold frame goes through the levels."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ class Crowd(Protocol):
     """What is asked of contact."""
 
     @property
-    def crowded(self) -> bool:
-        """Whether cloth is near cloth in the upsampled cage."""
+    def crowding(self) -> float:
+        """Part of the vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
         ...
 
 
@@ -69,13 +71,16 @@ def choose(
     """
     if nested is not None:
         return Choice(nested and not warm)
-    learned = device != "cpu" and (contact is None or not contact.crowded)
+    asked = device != "cpu" or (not warm and subdivisions == 1)
+    crowding = contact.crowding if contact is not None and asked else 0.0
+    learned = device != "cpu" and not crowding
     who = "; physgraph, the quicker one on CUDA" if learned else ""
     if warm:
         return Choice(False, reason=who.removeprefix("; "), learned=learned)
     if subdivisions != 1:
         return Choice(True, reason=f"level by level: {subdivisions} subdivisions{who}", learned=learned)
-    if contact is not None and contact.crowded:
-        return Choice(True, reason="level by level: cloth lies near cloth")
-    reason = f"the finest level alone: one subdivision, and no cloth lies near cloth{who}"
+    if crowding > CROWDED:
+        return Choice(True, reason="level by level: cloth crosses cloth, or much of it lies near some")
+    near = "little" if crowding else "no"
+    reason = f"the finest level alone: one subdivision, and {near} cloth lies near cloth{who}"
     return Choice(False, LONGER, reason, learned)

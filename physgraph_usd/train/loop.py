@@ -47,6 +47,7 @@ class TrainConfig:
         segments: Most unrolls one after another on a patch; later ones start where the last one ended.
         through_forces: Gradients flow through forces too, by differences; else through displacements only (A19).
         loss: "ratio" or "log" of the gap, averaged over the steps (A18).
+        late: Weight of step k in that average, as the power of k: 0 counts all alike, more counts where an unroll ends.
         raw: Part of the starts that are the upsampled cage.
         middle: Part of the starts where an earlier unroll ended; the others come from a solved level below.
         own: Part of those that the network itself has solved; quasi-Newton the others.
@@ -68,6 +69,7 @@ class TrainConfig:
     segments: int = 3
     through_forces: bool = False
     loss: str = "log"
+    late: float = 0.0
     raw: float = 0.4
     middle: float = 0.15
     own: float = 0.5
@@ -185,7 +187,7 @@ class Trainer:
                 carry = integrator.step(system, carry)
             reached = torch.stack(system.energies)  # K P
             bundle.learn(index, reached.detach())
-            loss = loss_of(reached, before, bundle.least[index], kind=config.loss)
+            loss = loss_of(reached, before, bundle.least[index], kind=config.loss, late=config.late)
             if not bool(loss.isfinite()):
                 break
             (loss / segments).backward()
@@ -262,21 +264,26 @@ def loss_of(
     least: Float[Tensor, " patches"],
     *,
     kind: str,
+    late: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Mean over steps and patches of the gap, or of its logarithm, relative to the start.
+    """Mean over patches, weighted over steps, of the gap or of its logarithm, relative to the start.
 
     Args:
         energies: Energies of the steps [J].
         before: Energies at the start [J].
         least: Least energies known [J].
         kind: "ratio" or "log".
+        late: Power of k that weighs step k.
     """
     scale = torch.maximum(before - least, 1e-6 * before.abs()).clamp_min(1e-30)
     gap = (energies - least) / scale
     # Beyond the start's own gap only the logarithm counts: one patch that blows up must not outweigh the rest.
     if kind == "ratio":
-        return torch.where(gap < 1.0, gap, 1.0 + gap.clamp_min(1.0).log()).mean()
-    return (gap.clamp_min(0.0) + HARMLESS).log().mean()
+        told = torch.where(gap < 1.0, gap, 1.0 + gap.clamp_min(1.0).log())
+    else:
+        told = (gap.clamp_min(0.0) + HARMLESS).log()
+    weight = torch.arange(1, len(gap) + 1, dtype=gap.dtype, device=gap.device) ** late  # K
+    return (weight / weight.sum()) @ told.mean(dim=1)
 
 
 def detached(carry: Any) -> Any:

@@ -1,0 +1,67 @@
+"""Does the chart repeat? The order of methods at a gap of 3%, in several runs of the same chart.
+
+    python -m benchmarks.order [--shots flag,sleeve] [--runs 3] [--minutes 3]
+
+Each run is `physgraph-usd chart SAMPLE --level 1 --clock cpu --count 1` anew, in a folder of its own. A row a method,
+its milliseconds to the gap in each run; then whether the order is the same, and how far apart two methods are that
+change places.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+
+from physgraph_usd.chart.options import ChartOptions
+from physgraph_usd.chart.run import chart_shot
+from physgraph_usd.samples import write_sample
+
+from .rows import say, table
+
+GAP = 0.03
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a table a shot."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shots", default="flag,sleeve", help="samples")
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--minutes", type=float, default=3.0, help="of each run")
+    given = parser.parse_args(arguments)
+    for name in given.shots.split(","):
+        runs = [times(name, given.minutes) for _ in range(given.runs)]
+        say(f"\n{name}, level 1, milliseconds of one core to a gap of {GAP:.0%}\n")
+        say("\n".join(compared(runs)))
+
+
+def times(name: str, minutes: float) -> dict[str, float]:
+    """Milliseconds to the gap by method, the fastest first, of a chart made anew."""
+    with tempfile.TemporaryDirectory() as folder:
+        shot = write_sample(name, Path(folder))
+        options = ChartOptions(level=1, clock="cpu", count=1, budget_minutes=minutes)
+        return chart_shot(shot, Path(folder) / "chart", options).times_to(GAP)
+
+
+def compared(runs: Sequence[dict[str, float]]) -> list[str]:
+    """The table of some runs, and what their orders have in common."""
+    methods = sorted(set().union(*runs), key=lambda m: statistics.median(run.get(m, float("inf")) for run in runs))
+    rows = [[method, *(f"{run[method]:.0f}" if method in run else "-" for run in runs)] for method in methods]
+    lines = [table(("method", *(f"run {k + 1}" for k in range(len(runs)))), rows), ""]
+    swapped = [
+        (a, b, max(max(run[a], run[b]) / min(run[a], run[b]) for run in runs))
+        for a, b in combinations(methods, 2)
+        if all(a in run and b in run for run in runs) and len({run[a] < run[b] for run in runs}) > 1
+    ]
+    if len({tuple(run) for run in runs}) == 1:
+        return [*lines, f"the order is the same in {len(runs)} runs"]
+    told = [f"{a} and {b} change places: never further apart than a factor {far:.2f}" for a, b, far in swapped]
+    missing = [m for m in methods if 0 < sum(m in run for run in runs) < len(runs)]
+    return [*lines, "the order is not the same", *told, *(f"{m} gets there in some runs only" for m in missing)]
+
+
+if __name__ == "__main__":
+    main()
