@@ -81,14 +81,16 @@ class Around:
         self._tables.strains({3: vectors(self._x), 4: wp.from_torch(matrix, dtype=wide), 5: vectors(seen)})
         return matrix, seen
 
-    def smooth_rows(self, rows: Float[Tensor, "rows vertices 3"], which: tuple[int, ...]) -> None:
-        """Write the means over the neighbours of some vectors behind them.
+    @property
+    def positions(self) -> wp.array:
+        """The positions, for kernels."""
+        return vectors(self._x)
 
-        Args:
-            rows: Vectors, and at the end as many rows to write as there are means.
-            which: Rows whose means are wanted.
-        """
-        self._tables.means(rows.shape[0], which)({4: vectors(rows.reshape(-1, 3))})
+    @property
+    def mesh(self) -> tuple[wp.array, ...]:
+        """What lies around each vertex, for kernels: triangles from where, their other corners; edges from where, their
+        far ends."""
+        return self._tables.mesh
 
 
 def squashed(strain: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
@@ -112,30 +114,17 @@ class _Tables:
         def ints(values: np.ndarray, kind: Any = wp.int32) -> wp.array:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=device)
 
-        self._given = given = {"device": device, "lanes": level.lanes}
-        self.normals = Launch(
-            _NORMALS[dtype], count, [ints(corner.starts), ints(turned, wp.vec2i), x, x], **self._given
-        )
+        given = {"device": device, "lanes": level.lanes}
         lengths = level.rest_length.double().cpu().numpy()[end.element]
         rest = wp.array(lengths, dtype=SCALAR[dtype], device=device)
-        self._around = [ints(end.starts), ints(far)]
-        self.strains = Launch(_STRAINS[dtype], count, [*self._around, rest, x, wide, x], **given)
-        self._count, self._dtype, self._means = count, dtype, dict[tuple[int, ...], Launch]()
+        self.mesh = (ints(corner.starts), ints(turned, wp.vec2i), ints(end.starts), ints(far))
+        self.normals = Launch(_NORMALS[dtype], count, [*self.mesh[:2], x, x], **given)
+        self.strains = Launch(_STRAINS[dtype], count, [*self.mesh[2:], rest, x, wide, x], **given)
         degree = np.diff(end.starts)
         weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
         mean = sp.csr_matrix((weights, far, end.starts), shape=(count, count))
         self._mean = Stencil(mean, dtype=dtype, **given)
         self._back = Stencil(sp.csr_matrix(mean.T), dtype=dtype, **given)
-
-    def means(self, rows: int, which: tuple[int, ...]) -> Launch:
-        """The kernel that writes means of some of so many rows at their end."""
-        key = (rows, *which)
-        if key not in self._means:
-            numbers = wp.array(np.array(which, np.int32), dtype=wp.int32, device=self._given["device"])
-            x = vectors(torch.zeros((1, 3), dtype=self._dtype, device=self._given["device"]))
-            inputs = [*self._around, numbers, rows - len(which), x]
-            self._means[key] = Launch(_MEANS[self._dtype], self._count, inputs, **self._given)
-        return self._means[key]
 
     def smooth(self, vector: Tensor) -> Tensor:
         """Mean over the neighbours; gradients flow through."""
@@ -213,32 +202,14 @@ def _strains(
     seen[i] = v
 
 
-@wp.kernel
-def _means(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    far: wp.array(dtype=wp.int32),
-    which: wp.array(dtype=wp.int32),
-    behind: wp.int32,
-    rows: wp.array(dtype=Any),
-):
-    i = first + wp.tid()
-    count = starts.shape[0] - 1
-    for s in range(which.shape[0]):
-        total = rows[i] - rows[i]
-        for k in range(starts[i], starts[i + 1]):
-            total += rows[which[s] * count + far[k]]
-        rows[(behind + s) * count + i] = total / type(total[0])(wp.max(starts[i + 1] - starts[i], 1))
-
-
 def _arrays(t: torch.dtype, kinds: str) -> list[Any]:
-    """Types of a kernel's parameters: i integers, n a number, p pairs, s scalars, v vectors, m matrices."""
+    """Types of a kernel's parameters: i integers, p pairs, s scalars, v vectors, m matrices."""
     known: dict[str, Any] = {"i": wp.int32, "p": wp.vec2i, "s": SCALAR[t], "v": VECTOR[t]}
     known["m"] = wp.types.matrix(shape=(3, 3), dtype=SCALAR[t])
-    return [wp.int32, *(wp.int32 if kind == "n" else wp.array(dtype=known[kind]) for kind in kinds)]
+    return [wp.int32, *(wp.array(dtype=known[kind]) for kind in kinds)]
 
 
-_NORMALS, _STRAINS, _MEANS = (
+_NORMALS, _STRAINS = (
     {t: wp.overload(kernel, _arrays(t, kinds)) for t in VECTOR}
-    for kernel, kinds in ((_normals, "ipvv"), (_strains, "iisvmv"), (_means, "iiinv"))
+    for kernel, kinds in ((_normals, "ipvv"), (_strains, "iisvmv"))
 )

@@ -22,11 +22,9 @@ from torch import Tensor
 from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
 from .around import Around
+from .features import NORMAL, STRAIN, Parts, seeing
 from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of, pairs_of
 
-NORMAL, STRAIN = 1, 2
-"""Parts of a vector that the kernels take themselves; 0 is a row as it is: a whole vector or its mean."""
-Parts = tuple[tuple[int, int], ...]
 LOG_SCALE = 0.5 / math.log(10.0)
 LOG_OFFSET = 1.5
 """The networks see (log10 + 3) / 2 of a length."""
@@ -81,12 +79,16 @@ class FusedPhysgraph:
         self._at_lengths, self._at_cosines = 0.5 * LOG_SCALE * lengths, cosines.contiguous()
         self._layers = [torch.zeros((bias.numel(), vertices), device=device) for bias in self._biases]
         flat, spacing = vectors(self._rows.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
-        normal, strain = (wp.zeros(1, dtype=t, device=device) for t in (wp.vec3f, wp.mat33f))
+        normal = wp.zeros(vertices if NORMAL in self._kinds else 1, dtype=wp.vec3f, device=device)
+        strain, x, others = (wp.zeros(1, dtype=t, device=device) for t in (wp.mat33f, wp.vec3f, wp.vec2i))
+        number = wp.zeros(1, dtype=wp.int32, device=device)
         shared = [vertices, flat, spacing, normal, strain]
         given = {"device": device, "lanes": lanes}
         seen = [wp.from_torch(self._squares), wp.from_torch(self._cosines), vectors(self._scaled.reshape(-1, 3))]
         between = tuple((a, b) for a, b in self._pairs.T.tolist())
-        self._see = Launch(seeing(self._parts, between, config.means), vertices, [*shared, *seen], **given)
+        see = seeing(self._parts, between, self._smoothed, means=config.means)
+        self._see = Launch(see, vertices, [*shared, x, number, others, number, number, *seen], **given)
+        self._mesh: object = None
         ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
         self._combine = Launch(combining(self._parts), vertices, [*shared, *ends], **given)
 
@@ -109,12 +111,14 @@ class FusedPhysgraph:
         torch.stack(list(bases), out=self._rows[: len(self.bases)])
         changed = {2: wp.from_torch(spacing, requires_grad=False)}
         seen = around() if self._kinds & {NORMAL, STRAIN} or self._smoothed or self._config.strain else None
-        if seen is not None and self._smoothed:
-            seen.smooth_rows(self._rows, self._smoothed)
-        if seen is not None and NORMAL in self._kinds:
-            changed[3] = vectors(seen.normal)
         if seen is not None and STRAIN in self._kinds:
             changed[4] = wp.from_torch(seen.strain, dtype=wp.mat33f)
+        self._combine.change(changed)
+        if seen is not None:
+            changed[5] = seen.positions
+            if self._mesh is not seen.mesh:
+                self._mesh = seen.mesh
+                changed |= dict(enumerate(seen.mesh, start=6))
         self._see(changed)
         h = self._layers[0]
         bias = self._bias + self._clock * clock_of(step)
@@ -127,7 +131,7 @@ class FusedPhysgraph:
                 h[:, span] += self._from_means(span).unsqueeze(1)
         for bias, weight, out in zip(self._biases[1:], self._weights, self._layers[1:], strict=True):
             h = torch.addmm(bias.unsqueeze(1), weight, h.relu_(), out=out)
-        self._combine(changed)
+        self._combine({})
         return self._out
 
     def _from_means(self, span: slice) -> Float[Tensor, " width"]:
@@ -163,61 +167,6 @@ def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Par
     return wholes, smoothed, tuple(place(*each) for each in split)
 
 
-@wp.func
-def part_of(v: wp.vec3f, kind: wp.int32, normal: wp.vec3f, strain: wp.mat33f):
-    """A vector or its part."""
-    if kind == wp.static(NORMAL):
-        v = normal * wp.dot(v, normal)
-    if kind == wp.static(STRAIN):
-        v = strain * v
-    return v
-
-
-@functools.cache
-def seeing(parts: Parts, pairs: tuple[tuple[int, int], ...], means: bool) -> wp.Kernel:
-    """The kernel that finds the features of each vertex.
-
-    Args:
-        parts: Row and part of each vector.
-        pairs: The vectors between which there are cosines.
-        means: Whether it keeps the vectors in local edge lengths, for the garments' means.
-    """
-    units = wp.types.matrix(shape=(len(parts), 3), dtype=wp.float32)
-    floor = FLOOR**2
-    kinds = {kind for _, kind in parts}
-
-    @wp.kernel(module="unique")
-    def see(
-        first: wp.int32,
-        vertices: wp.int32,
-        v: wp.array(dtype=wp.vec3f),
-        spacing: wp.array(dtype=wp.float32),
-        normal: wp.array(dtype=wp.vec3f),
-        strain: wp.array(dtype=wp.mat33f),
-        squares: wp.array(dtype=wp.float32, ndim=2),
-        cosines: wp.array(dtype=wp.float32, ndim=2),
-        scaled: wp.array(dtype=wp.vec3f),
-    ):
-        i = first + wp.tid()
-        unit, across, along = units(), wp.vec3f(), wp.mat33f()
-        if wp.static(NORMAL in kinds):
-            across = normal[i]
-        if wp.static(STRAIN in kinds):
-            along = strain[i]
-        scale = wp.float32(1.0) / spacing[i]
-        for a in range(wp.static(len(parts))):
-            s = scale * part_of(v[wp.static(parts[a][0]) * vertices + i], wp.static(parts[a][1]), across, along)
-            if wp.static(means):
-                scaled[a * vertices + i] = s
-            square = wp.dot(s, s) + wp.float32(wp.static(floor))
-            squares[a, i] = square
-            unit[a] = s * (wp.float32(1.0) / wp.sqrt(square))
-        for p in range(wp.static(len(pairs))):
-            cosines[i, p] = wp.dot(unit[wp.static(pairs[p][0])], unit[wp.static(pairs[p][1])])
-
-    return see
-
-
 @functools.cache
 def combining(parts: Parts) -> wp.Kernel:
     """The kernel that combines vectors of which these are the rows and parts."""
@@ -237,13 +186,20 @@ def combining(parts: Parts) -> wp.Kernel:
     ):
         i = first + wp.tid()
         move, across, along = wp.vec3f(), wp.vec3f(), wp.mat33f()
+        lift = wp.float32(0.0)
         if wp.static(NORMAL in kinds):
             across = normal[i]
         if wp.static(STRAIN in kinds):
             along = strain[i]
         for a in range(wp.static(len(parts))):
-            s = part_of(v[wp.static(parts[a][0]) * vertices + i], wp.static(parts[a][1]), across, along)
-            move += coefficients[a, i] * s
+            s = v[wp.static(parts[a][0]) * vertices + i]
+            if wp.static(parts[a][1] == NORMAL):
+                lift += coefficients[a, i] * wp.dot(s, across)
+            elif wp.static(parts[a][1] == STRAIN):
+                move += coefficients[a, i] * (along * s)
+            else:
+                move += coefficients[a, i] * s
+        move += lift * across
         far, most = wp.length(move), longest * spacing[i]
         if far > most:
             move = move * (most / far)

@@ -43,11 +43,15 @@ class Launch:
             if b > a and command is not None:
                 self._commands.append(command)
 
-    def __call__(self, changed: Mapping[int, wp.array]) -> None:
-        """Run with some inputs replaced, by their place in ``inputs``."""
+    def change(self, changed: Mapping[int, wp.array]) -> None:
+        """Replace some inputs from now on, by their place in ``inputs``."""
         for command in self._commands:
             for place, array in changed.items():
                 command.set_param_at_index(place + 1, array)
+
+    def __call__(self, changed: Mapping[int, wp.array]) -> None:
+        """Run with some inputs replaced, by their place in ``inputs``."""
+        self.change(changed)
         if self._device is not None:
             stream = current_stream(self._device)
             for command in self._commands:

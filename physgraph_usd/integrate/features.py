@@ -1,0 +1,164 @@
+"""The kernel behind `fused.FusedPhysgraph` that sees: normals, means over the neighbours, lengths and cosines.
+
+One pass over the vertices, so that what a vertex gathers from its neighbours is still at hand when it is used. A normal
+part is a number times the normal; its length and cosines come from scalar products with that.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportIndexIssue=false
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from .network import FLOOR
+
+NORMAL, STRAIN = 1, 2
+"""Parts of a vector that the kernels take themselves; 0 is a row as it is: a whole vector or its mean."""
+Parts = tuple[tuple[int, int], ...]
+Pairs = tuple[tuple[int, int], ...]
+
+
+@functools.cache
+def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], *, means: bool) -> wp.Kernel:
+    """The kernel that finds the normal, the neighbours' means and the features of each vertex.
+
+    Args:
+        parts: Row and part of each vector.
+        pairs: The vectors between which there are cosines.
+        smoothed: Rows whose means over the neighbours are the last rows.
+        means: Whether it keeps the vectors in local edge lengths, for the garments' means.
+    """
+    rows = 1 + max(row for row, _ in parts)
+    own = (*((row, 0) for row in range(rows)), *(part for part in parts if part[1] == STRAIN))
+    place = tuple(own.index((row, 0 if kind == NORMAL else kind)) for row, kind in parts)
+    crosses = tuple(kind == NORMAL for _, kind in parts)
+    table = wp.types.matrix(shape=(len(own), 3), dtype=wp.float32)
+    column = wp.types.vector(length=len(own), dtype=wp.float32)
+    floor, strained = FLOOR**2, len(own) > rows
+    average, show = _averaging(smoothed, rows - len(smoothed)), _showing(place, crosses, pairs, means=means)
+
+    @wp.kernel(module="unique")
+    def see(
+        first: wp.int32,
+        vertices: wp.int32,
+        v: wp.array(dtype=wp.vec3f),
+        spacing: wp.array(dtype=wp.float32),
+        normal: wp.array(dtype=wp.vec3f),
+        strain: wp.array(dtype=wp.mat33f),
+        x: wp.array(dtype=wp.vec3f),
+        corners: wp.array(dtype=wp.int32),
+        others: wp.array(dtype=wp.vec2i),
+        ends: wp.array(dtype=wp.int32),
+        far: wp.array(dtype=wp.int32),
+        squares: wp.array(dtype=wp.float32, ndim=2),
+        cosines: wp.array(dtype=wp.float32, ndim=2),
+        scaled: wp.array(dtype=wp.vec3f),
+    ):
+        i = first + wp.tid()
+        across, along = wp.vec3f(), wp.mat33f()
+        if wp.static(any(crosses)):
+            across = normal_of(i, x, corners, others)
+            normal[i] = across
+        if wp.static(strained):
+            along = strain[i]
+        if wp.static(len(smoothed) > 0):
+            average(i, vertices, ends, far, v)
+        unit, square = table(), column()
+        scale = wp.float32(1.0) / spacing[i]
+        for u in range(wp.static(len(own))):
+            w = scale * v[wp.static(own[u][0]) * vertices + i]
+            if wp.static(own[u][1] == STRAIN):
+                w = along * w
+            square[u] = wp.dot(w, w) + wp.float32(wp.static(floor))
+            unit[u] = w * (wp.float32(1.0) / wp.sqrt(square[u]))
+        show(i, vertices, unit, square, across, squares, cosines, scaled)
+
+    return see
+
+
+@wp.func
+def normal_of(
+    i: wp.int32,
+    x: wp.array(dtype=wp.vec3f),
+    corners: wp.array(dtype=wp.int32),
+    others: wp.array(dtype=wp.vec2i),
+):
+    """Area-weighted unit normal of a vertex; zero where triangles have no area."""
+    total = wp.vec3f()
+    for k in range(corners[i], corners[i + 1]):
+        total += wp.cross(x[others[k][0]] - x[i], x[others[k][1]] - x[i])
+    return wp.normalize(total)
+
+
+def _averaging(smoothed: tuple[int, ...], wholes: int) -> Any:
+    """The function that writes the means over a vertex's neighbours of some rows behind the whole ones."""
+    means_of = wp.types.matrix(shape=(max(len(smoothed), 1), 3), dtype=wp.float32)
+
+    @wp.func
+    def average(
+        i: wp.int32,
+        vertices: wp.int32,
+        ends: wp.array(dtype=wp.int32),
+        far: wp.array(dtype=wp.int32),
+        v: wp.array(dtype=wp.vec3f),
+    ):
+        total = means_of()
+        for k in range(ends[i], ends[i + 1]):
+            for s in range(wp.static(len(smoothed))):
+                total[s] += v[wp.static(smoothed[s]) * vertices + far[k]]
+        share = wp.float32(1.0) / wp.float32(wp.max(ends[i + 1] - ends[i], 1))
+        for s in range(wp.static(len(smoothed))):
+            v[wp.static(wholes + s) * vertices + i] = share * total[s]
+
+    return average
+
+
+def _showing(place: tuple[int, ...], crosses: tuple[bool, ...], pairs: Pairs, *, means: bool) -> Any:
+    """The function that writes what the network sees of a vertex.
+
+    Args:
+        place: Of each vector, the unit vector that it is or is the normal part of.
+        crosses: Whether it is a normal part.
+        pairs: The vectors between which there are cosines.
+        means: Whether the vectors in local edge lengths are kept too.
+    """
+    every = wp.types.vector(length=len(place), dtype=wp.float32)
+    floor = FLOOR**2
+
+    @wp.func
+    def show(
+        i: wp.int32,
+        vertices: wp.int32,
+        unit: Any,
+        square: Any,
+        across: wp.vec3f,
+        squares: wp.array(dtype=wp.float32, ndim=2),
+        cosines: wp.array(dtype=wp.float32, ndim=2),
+        scaled: wp.array(dtype=wp.vec3f),
+    ):
+        sign = every()
+        for a in range(wp.static(len(place))):
+            u, size = unit[wp.static(place[a])], square[wp.static(place[a])]
+            if wp.static(crosses[a]):
+                height = wp.dot(u, across) * wp.sqrt(size)
+                size = height * height + wp.float32(wp.static(floor))
+                sign[a] = height / wp.sqrt(size)
+                u = sign[a] * across
+            squares[a, i] = size
+            if wp.static(means):
+                scaled[a * vertices + i] = wp.sqrt(size) * u
+        for p in range(wp.static(len(pairs))):
+            a, b = wp.static(pairs[p][0]), wp.static(pairs[p][1])
+            if wp.static(crosses[pairs[p][0]] and crosses[pairs[p][1]]):
+                cosines[i, p] = sign[a] * sign[b]
+            elif wp.static(crosses[pairs[p][0]]):
+                cosines[i, p] = sign[a] * wp.dot(unit[wp.static(place[pairs[p][1]])], across)
+            elif wp.static(crosses[pairs[p][1]]):
+                cosines[i, p] = sign[b] * wp.dot(unit[wp.static(place[pairs[p][0]])], across)
+            else:
+                cosines[i, p] = wp.dot(unit[wp.static(place[pairs[p][0]])], unit[wp.static(place[pairs[p][1]])])
+
+    return show
