@@ -298,7 +298,14 @@ class Group:
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
         """Walk the levels; a warm start goes straight to the finest. Also says why, where there was a choice."""
         subdivisions, warm = len(self.levels) - 1, predicted is not None
-        choice = choose(self._settings.method.nested, subdivisions, contact, warm=warm, device=self.levels[0].device)
+        choice = choose(
+            self._settings.method.nested,
+            subdivisions,
+            contact,
+            remaining=lambda: self._remaining(forces[0], coarse),
+            warm=warm,
+            device=self.levels[0].device,
+        )
         if choice.learned not in self._integrators:
             self._integrators[choice.learned] = choice.integrator(self._settings.method.build)
         self._integrator = self._integrators[choice.learned]
@@ -330,6 +337,13 @@ class Group:
             reports += made
             module = ForceModule((*module.forces, *touched))
         return x, reports, module, {"chosen": choice.reason} if choice.reason else {}
+
+    def _remaining(self, forces: LevelForces, coarse: Tensor) -> float:
+        """The cage's remaining move, in its edge lengths."""
+        level = self.levels[0]
+        system = System(forces.module(coarse), forces.metric, free=level.free, spacing=level.spacing, level=level)
+        force = system.energy_and_force(level.base.apply(coarse))[1]
+        return system.remaining_move(system.apply_metric_inverse(force))
 
     def _solve_level(
         self, alone: System, level: Level, *, x: Tensor, cold: bool, view: LevelContact | None, budget: Budget

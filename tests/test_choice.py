@@ -22,10 +22,15 @@ class Seen:
     crowding: float
 
 
+def moving() -> float:
+    """A cage far from rest."""
+    return 0.3
+
+
 @pytest.mark.parametrize("nested", [True, False])
 def test_a_method_that_says_how_is_taken_at_its_word(nested: bool):
-    assert choose(nested, 1, Seen(1.0)) == Choice(nested)
-    assert choose(nested, 1, None, warm=True) == Choice(False)
+    assert choose(nested, 1, Seen(1.0), remaining=moving) == Choice(nested)
+    assert choose(nested, 1, None, warm=True, remaining=moving) == Choice(False)
 
 
 @pytest.mark.parametrize(
@@ -42,7 +47,7 @@ def test_a_method_that_says_how_is_taken_at_its_word(nested: bool):
 def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart(
     subdivisions: int, contact: Seen | None, nested: bool
 ):
-    found = choose(None, subdivisions, contact)
+    found = choose(None, subdivisions, contact, remaining=moving)
     assert found.nested == nested
     assert found.steps == (1 if nested else LONGER)
     assert found.reason
@@ -51,12 +56,19 @@ def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart
 @pytest.mark.parametrize(("device", "contact", "learned"), [("cpu", None, False), ("cuda", None, True)])
 @pytest.mark.parametrize("warm", [False, True])
 def test_the_network_makes_the_steps_on_cuda(device: str, contact: Seen | None, learned: bool, warm: bool):
-    found = choose(None, 2, contact, warm=warm, device=device)
+    found = choose(None, 2, contact, warm=warm, device=device, remaining=moving)
     assert found.learned == learned
     assert ("physgraph" in found.reason) == learned
     assert found.integrator(QuasiNewton).name == ("physgraph" if learned else "quasi-newton")
-    assert not choose(None, 2, Seen(0.01), warm=warm, device=device).learned
-    assert not choose(True, 2, contact, warm=warm, device=device).learned
+    assert not choose(None, 2, Seen(0.01), warm=warm, device=device, remaining=moving).learned
+    assert not choose(True, 2, contact, warm=warm, device=device, remaining=moving).learned
+
+
+@pytest.mark.parametrize(("move", "crowding", "nested"), [(0.02, 0.0, False), (0.02, 0.5, True), (0.3, 0.0, True)])
+def test_a_cage_nearly_at_rest_is_passed_over(move: float, crowding: float, nested: bool):
+    for subdivisions in (2, 3):
+        assert choose(None, subdivisions, Seen(crowding), remaining=lambda: move).nested == nested
+        assert not choose(None, subdivisions, None, remaining=lambda: move, warm=True).nested
 
 
 def test_refine_leaves_it_open():

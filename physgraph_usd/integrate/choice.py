@@ -26,6 +26,9 @@ LONGER = 4
 CROWDED = 0.1
 """Part of the vertices with cloth near them from which a cold frame goes through the levels."""
 
+RESTING = 0.05
+"""Remaining move of the cage, in its edge lengths, under which it is nearly at rest."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -58,7 +61,13 @@ class Crowd(Protocol):
 
 
 def choose(
-    nested: bool | None, subdivisions: int, contact: Crowd | None, *, warm: bool = False, device: str = "cpu"
+    nested: bool | None,
+    subdivisions: int,
+    contact: Crowd | None,
+    *,
+    remaining: Callable[[], float],
+    warm: bool = False,
+    device: str = "cpu",
 ) -> Choice:
     """Choose for one frame.
 
@@ -66,21 +75,23 @@ def choose(
         nested: What the method asks for; None leaves it open.
         subdivisions: Number of levels above the cage.
         contact: The frame's contact, or None when nothing can touch; asked only where it matters.
+        remaining: Gives the cage's remaining move, in its edge lengths; asked only where it matters.
         warm: Whether the frame starts from the last one's detail.
         device: Where the frame is solved.
     """
     if nested is not None:
         return Choice(nested and not warm)
-    asked = device != "cpu" or (not warm and subdivisions == 1)
-    crowding = contact.crowding if contact is not None and asked else 0.0
+    alone = not warm and subdivisions > 0 and (subdivisions == 1 or remaining() < RESTING)
+    crowding = contact.crowding if contact is not None and (alone or device != "cpu") else 0.0
     learned = device != "cpu" and not crowding
     who = "; physgraph, the quicker one on CUDA" if learned else ""
     if warm:
         return Choice(False, reason=who.removeprefix("; "), learned=learned)
-    if subdivisions != 1:
-        return Choice(True, reason=f"level by level: {subdivisions} subdivisions{who}", learned=learned)
-    if crowding > CROWDED:
+    if crowding > CROWDED and alone:
         return Choice(True, reason="level by level: cloth crosses cloth, or much of it lies near some")
+    if not alone:
+        return Choice(True, reason=f"level by level: {subdivisions} subdivisions{who}", learned=learned)
+    why = "one subdivision" if subdivisions == 1 else "the cage is nearly at rest"
     near = "little" if crowding else "no"
-    reason = f"the finest level alone: one subdivision, and {near} cloth lies near cloth{who}"
+    reason = f"the finest level alone: {why}, and {near} cloth lies near cloth{who}"
     return Choice(False, LONGER, reason, learned)
