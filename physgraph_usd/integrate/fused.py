@@ -89,6 +89,7 @@ class FusedPhysgraph:
         see = seeing(self._parts, between, self._smoothed, means=config.means)
         self._see = Launch(see, vertices, [*shared, x, number, others, number, number, *seen], **given)
         self._mesh: object = None
+        self._spacing: Tensor | None = None
         ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
         self._combine = Launch(combining(self._parts), vertices, [*shared, *ends], **given)
 
@@ -109,7 +110,9 @@ class FusedPhysgraph:
             around: Gives the surroundings of the vertices; called where parts need them.
         """
         torch.stack(list(bases), out=self._rows[: len(self.bases)])
-        changed = {2: wp.from_torch(spacing, requires_grad=False)}
+        changed = {}
+        if self._spacing is not spacing:
+            self._spacing, changed[2] = spacing, wp.from_torch(spacing, requires_grad=False)
         seen = around() if self._kinds & {NORMAL, STRAIN} or self._smoothed or self._config.strain else None
         if seen is not None and STRAIN in self._kinds:
             changed[4] = wp.from_torch(seen.strain, dtype=wp.mat33f)

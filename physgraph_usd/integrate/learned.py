@@ -31,6 +31,7 @@ from .base import Carry, Surface, System
 from .fused import can_fuse, fused_physgraph
 from .network import Graph, Physgraph
 from .paper_network import PaperNetwork, Ways
+from .quasi_newton import Pair, two_loop
 from .recorded import FORCE, IMAGE, MOST_GARMENTS, SECANTS, Place, Recording
 
 NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
@@ -286,6 +287,10 @@ def secant_direction(
         pairs: Secants, oldest first.
         graph: Which vertex belongs to which garment.
     """
+    if pairs and graph.garments == 1 and not (force.is_cuda or force.requires_grad) and float(pairs[-1].inverse) > 0:
+        known = ((pair, float(pair.inverse)) for pair in pairs)
+        good = tuple(Pair(pair.move, pair.yields, pair.image, 1.0 / each) for pair, each in known if each > 0)
+        return two_loop(force, image, good)
     weights = []
     for pair in reversed(pairs):
         weight = pair.inverse * _dots(pair.move, force, graph)

@@ -68,7 +68,7 @@ class QuasiNewton:
     def step(self, system: System, carry: Carry) -> Carry:
         """One secant step with a backtracking line search; the energy never rises."""
         memory: _Memory = carry.memory
-        direction = _two_loop(carry.force, memory.image, memory.pairs)
+        direction = two_loop(carry.force, memory.image, memory.pairs)
         slope = _dot(carry.force, direction)
         if not slope > 0:
             direction, slope = memory.image, _dot(carry.force, memory.image)
@@ -140,8 +140,10 @@ def backtrack(
     return None
 
 
-def _two_loop(force: Tensor, preconditioned: Tensor, pairs: tuple[Pair, ...]) -> Tensor:
-    """The L-BFGS direction for a force, from its preconditioned image and the secant pairs."""
+def two_loop(
+    force: Float[Tensor, "vertices 3"], preconditioned: Float[Tensor, "vertices 3"], pairs: tuple[Pair, ...]
+) -> Float[Tensor, "vertices 3"]:
+    """The L-BFGS direction [m] for a force [N], from its preconditioned image [m] and the secant pairs."""
     if not pairs:
         return preconditioned
     weights = []
