@@ -20,6 +20,8 @@ CLOSED_IN = 0.5
 """Distance over rest distance above which such a neighbour is where it belongs."""
 SLOTS = 4
 """Faces kept for each edge that passes through some."""
+FAR = 1e30
+"""Corner of a box that holds nothing."""
 
 
 @wp.func
@@ -88,210 +90,373 @@ def belongs(distance: float, rest_distance: float, cosine: float):
     return wp.abs(cosine) < IN_PLANE and distance > CLOSED_IN * rest_distance
 
 
-@wp.kernel
-def faces_near(
-    first: wp.int32,
-    mesh: wp.uint64,
-    ask: wp.array(dtype=wp.int32),
-    reach: wp.array(dtype=wp.float32),
-    x: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    rest: wp.array(dtype=wp.vec3f),
-    triangles: wp.array(dtype=wp.vec3i),
-    starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
+@wp.func
+def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.vec3f):
+    """Whether two boxes meet."""
+    first = low[0] <= other_high[0] and low[1] <= other_high[1] and low[2] <= other_high[2]
+    return first and other_low[0] <= high[0] and other_low[1] <= high[1] and other_low[2] <= high[2]
+
+
+@wp.func
+def has(t: wp.vec3i, v: wp.int32):
+    """Whether a triangle has a vertex."""
+    return t[0] == v or t[1] == v or t[2] == v
+
+
+@wp.func
+def nearer(distance: float, part: wp.int32, best: float, known: wp.int32):
+    """Whether a part is nearer than the nearest known; of two as near the one with the lower number is."""
+    return distance < best or (distance == best and part < known)
+
+
+@wp.func
+def are_apart(
+    i: wp.int32,
+    j: wp.int32,
     garment: wp.array(dtype=wp.int32),
+    near_starts: wp.array(dtype=wp.int32),
+    near: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
+):
+    """Whether two clusters cannot touch: garments that do not feel one another, or near ones that do not turn over."""
+    if meets[garment[i] * garments + garment[j]] == 0:
+        return True
+    if turns[i] == 0 or turns[j] == 0:
+        for k in range(near_starts[i], near_starts[i + 1]):
+            if near[k] == j:
+                return True
+    return False
+
+
+@wp.kernel
+def cluster_boxes(
+    first: wp.int32,
+    x: wp.array(dtype=wp.vec3f),
+    faces: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    face_low: wp.array(dtype=wp.vec3f),
+    face_high: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    total: wp.array(dtype=wp.vec3f),
+):
+    """The boxes and unit normals of a cluster's faces, the box of all of them, and their areas along the normals."""
+    i = first + wp.tid()
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    area = wp.vec3f(0.0)
+    for k in range(faces[i], faces[i + 1]):
+        p, q, r = x[triangles[k][0]], x[triangles[k][1]], x[triangles[k][2]]
+        lower, upper = wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r))
+        own = wp.cross(q - p, r - p)
+        face_low[k] = lower
+        face_high[k] = upper
+        normal[k] = wp.normalize(own)
+        least = wp.min(least, lower)
+        most = wp.max(most, upper)
+        area += own
+    low[i] = least
+    high[i] = most
+    total[i] = area
+
+
+@wp.kernel
+def edge_boxes(
+    first: wp.int32,
+    x: wp.array(dtype=wp.vec3f),
+    first_edge: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=wp.vec2i),
+    edge_low: wp.array(dtype=wp.vec3f),
+    edge_high: wp.array(dtype=wp.vec3f),
+):
+    """The boxes of a cluster's edges."""
+    i = first + wp.tid()
+    for k in range(first_edge[i], first_edge[i + 1]):
+        a, b = x[edges[k][0]], x[edges[k][1]]
+        edge_low[k] = wp.min(a, b)
+        edge_high[k] = wp.max(a, b)
+
+
+@wp.kernel
+def faces_near(  # noqa: C901 - one query, each candidate refused as early as can be
+    first: wp.int32,
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    cluster_garment: wp.array(dtype=wp.int32),
+    near_starts: wp.array(dtype=wp.int32),
+    near: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    x: wp.array(dtype=wp.vec3f),
+    asked: wp.array(dtype=wp.bool),
+    reach: wp.array(dtype=wp.float32),
+    normal: wp.array(dtype=wp.vec3f),
+    rest: wp.array(dtype=wp.vec3f),
+    first_vertex: wp.array(dtype=wp.int32),
+    vertices: wp.array(dtype=wp.int32),
+    first_face: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    number: wp.array(dtype=wp.int32),
+    face_low: wp.array(dtype=wp.vec3f),
+    face_high: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
     face: wp.array(dtype=wp.vec2i),
     above: wp.array(dtype=wp.vec3f),
     below: wp.array(dtype=wp.vec3f),
 ):
-    """For each vertex asked, the closest face on either side within its reach, -1 where there is none."""
+    """For each vertex asked of a cluster, the closest face on either side within its reach, -1 where there is none."""
     i = first + wp.tid()
-    v = ask[i]
-    p, n = x[v], normal[v]
-    far = wp.float32(reach[v])
-    best_up = wp.float32(far)
-    best_down = wp.float32(far)
-    up = wp.int32(-1)
-    down = wp.int32(-1)
-    grow = wp.vec3f(far, far, far)
-    query = wp.mesh_query_aabb(mesh, p - grow, p + grow)
-    f = wp.int32(0)
-    while wp.mesh_query_aabb_next(query, f):
-        t = triangles[f]
-        if meets[garment[v] * garments + garment[t[0]]] == 0:
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(first_vertex[i], first_vertex[i + 1]):
+        v = vertices[k]
+        if asked[v]:
+            best[v] = wp.vec2f(reach[v], reach[v])
+            grow = wp.vec3f(reach[v])
+            least = wp.min(least, x[v] - grow)
+            most = wp.max(most, x[v] + grow)
+    if least[0] > most[0]:
+        return
+    query = wp.bvh_query_aabb(tree, least, most)
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        same = cluster_garment[i] == cluster_garment[j]
+        if are_apart(i, j, cluster_garment, near_starts, near, turns, meets, garments):
             continue
-        weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
-        way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
-        distance = wp.length(way)
-        if distance >= wp.max(best_up, best_down) or distance < LEAST:
-            continue
-        if is_beside(v, t[0], starts, ring) or is_beside(v, t[1], starts, ring) or is_beside(v, t[2], starts, ring):
-            continue
-        cosine = wp.dot(way, n) / distance
-        if garment[v] == garment[t[0]]:
-            at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
-            if belongs(distance, wp.length(at_rest), cosine):
+        for k in range(first_vertex[i], first_vertex[i + 1]):
+            v = vertices[k]
+            if not asked[v]:
                 continue
-        if cosine > 0.0:
-            if distance < best_up:
-                best_up = distance
-                up = f
-                above[i] = weight
-        elif distance < best_down:
-            best_down = distance
-            down = f
-            below[i] = weight
-    face[i] = wp.vec2i(up, down)
+            p = x[v]
+            limit = wp.max(best[v][0], best[v][1])
+            grow = wp.vec3f(limit)
+            if not overlap(p - grow, p + grow, low[j], high[j]):
+                continue
+            for m in range(first_face[j], first_face[j + 1]):
+                if not overlap(p - grow, p + grow, face_low[m], face_high[m]):
+                    continue
+                t = triangles[m]
+                if has(t, v):
+                    continue
+                weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
+                way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
+                distance = wp.length(way)
+                up, down = best[v][0], best[v][1]
+                if distance > wp.max(up, down) or distance < LEAST:
+                    continue
+                cosine = wp.dot(way, normal[v]) / distance
+                if same:
+                    at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
+                    if belongs(distance, wp.length(at_rest), cosine):
+                        continue
+                    if (
+                        is_beside(v, t[0], starts, ring)
+                        or is_beside(v, t[1], starts, ring)
+                        or is_beside(v, t[2], starts, ring)
+                    ):
+                        continue
+                if cosine > 0.0:
+                    if nearer(distance, number[m], up, face[v][0]):
+                        best[v] = wp.vec2f(distance, down)
+                        face[v] = wp.vec2i(number[m], face[v][1])
+                        above[v] = weight
+                elif nearer(distance, number[m], down, face[v][1]):
+                    best[v] = wp.vec2f(up, distance)
+                    face[v] = wp.vec2i(face[v][0], number[m])
+                    below[v] = weight
 
 
 @wp.kernel
 def edges_near(  # noqa: C901 - one query, each candidate refused as early as can be
     first: wp.int32,
-    mesh: wp.uint64,
-    ask: wp.array(dtype=wp.int32),
-    reach: wp.array(dtype=wp.float32),
-    x: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    rest: wp.array(dtype=wp.vec3f),
-    edges: wp.array(dtype=wp.vec2i),
-    sides: wp.array(dtype=wp.vec3i),
-    starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
-    garment: wp.array(dtype=wp.int32),
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    cluster_garment: wp.array(dtype=wp.int32),
+    near_starts: wp.array(dtype=wp.int32),
+    near: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    x: wp.array(dtype=wp.vec3f),
+    asked: wp.array(dtype=wp.bool),
+    reach: wp.array(dtype=wp.float32),
+    normal: wp.array(dtype=wp.vec3f),
+    rest: wp.array(dtype=wp.vec3f),
+    first_edge: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=wp.vec2i),
+    number: wp.array(dtype=wp.int32),
+    edge_low: wp.array(dtype=wp.vec3f),
+    edge_high: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
     other: wp.array(dtype=wp.vec2i),
     above: wp.array(dtype=wp.vec2f),
     below: wp.array(dtype=wp.vec2f),
 ):
-    """For each edge asked, the closest edge on either side within reach, inside both; -1 where there is none.
-
-    ``sides`` are the edges that each face owns, -1 for those that another face owns.
-    """
+    """For each edge with an end asked, the closest edge on either side within reach, inside both; -1 for none."""
     i = first + wp.tid()
-    e = ask[i]
-    a, b = edges[e][0], edges[e][1]
-    far = 0.5 * (reach[a] + reach[b])
-    n = wp.normalize(normal[a] + normal[b])
-    best_up = wp.float32(far)
-    best_down = wp.float32(far)
-    up = wp.int32(-1)
-    down = wp.int32(-1)
-    grow = wp.vec3f(far)
-    query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]) - grow, wp.max(x[a], x[b]) + grow)
-    f = wp.int32(0)
-    while wp.mesh_query_aabb_next(query, f):
-        for side in range(3):
-            g = sides[f][side]
-            c = edges[wp.max(g, 0)][0]
-            if g < 0 or g == e or meets[garment[a] * garments + garment[c]] == 0:
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(first_edge[i], first_edge[i + 1]):
+        a, b = edges[k][0], edges[k][1]
+        if asked[a] or asked[b]:
+            far = 0.5 * (reach[a] + reach[b])
+            e = number[k]
+            best[e] = wp.vec2f(far, far)
+            least = wp.min(least, edge_low[k] - wp.vec3f(far))
+            most = wp.max(most, edge_high[k] + wp.vec3f(far))
+    if least[0] > most[0]:
+        return
+    query = wp.bvh_query_aabb(tree, least, most)
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        same = cluster_garment[i] == cluster_garment[j]
+        if are_apart(i, j, cluster_garment, near_starts, near, turns, meets, garments):
+            continue
+        for k in range(first_edge[i], first_edge[i + 1]):
+            a, b = edges[k][0], edges[k][1]
+            if not (asked[a] or asked[b]):
                 continue
-            found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[edges[g][1]], 1.0e-12)
-            s, t, distance = found[0], found[1], found[2]
-            if not is_inside(s, t) or distance >= wp.max(best_up, best_down) or distance < LEAST:
+            e = number[k]
+            grow = wp.vec3f(wp.max(best[e][0], best[e][1]))
+            lower, upper = edge_low[k] - grow, edge_high[k] + grow
+            if not overlap(lower, upper, low[j], high[j]):
                 continue
-            if are_beside(edges[e], edges[g], starts, ring):
-                continue
-            cosine = wp.dot(between(x, edges[e], edges[g], s, t), n) / distance
-            if garment[a] == garment[c]:
-                if belongs(distance, wp.length(between(rest, edges[e], edges[g], s, t)), cosine):
+            for m in range(first_edge[j], first_edge[j + 1]):
+                if not overlap(lower, upper, edge_low[m], edge_high[m]):
                     continue
-            if cosine > 0.0:
-                if distance < best_up:
-                    best_up = distance
-                    up = g
-                    above[i] = wp.vec2f(s, t)
-            elif distance < best_down:
-                best_down = distance
-                down = g
-                below[i] = wp.vec2f(s, t)
-    other[i] = wp.vec2i(up, down)
+                c, d = edges[m][0], edges[m][1]
+                if a == c or a == d or b == c or b == d:
+                    continue
+                found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[d], 1.0e-12)
+                s, t, distance = found[0], found[1], found[2]
+                up, down = best[e][0], best[e][1]
+                if not is_inside(s, t) or distance > wp.max(up, down) or distance < LEAST:
+                    continue
+                way = between(x, edges[k], edges[m], s, t)
+                cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
+                if same:
+                    if belongs(distance, wp.length(between(rest, edges[k], edges[m], s, t)), cosine):
+                        continue
+                    if are_beside(edges[k], edges[m], starts, ring):
+                        continue
+                if cosine > 0.0:
+                    if nearer(distance, number[m], up, other[e][0]):
+                        best[e] = wp.vec2f(distance, down)
+                        other[e] = wp.vec2i(number[m], other[e][1])
+                        above[e] = wp.vec2f(s, t)
+                elif nearer(distance, number[m], down, other[e][1]):
+                    best[e] = wp.vec2f(up, distance)
+                    other[e] = wp.vec2i(other[e][0], number[m])
+                    below[e] = wp.vec2f(s, t)
 
 
 @wp.kernel
 def pierced(
     first: wp.int32,
-    mesh: wp.uint64,
-    ask: wp.array(dtype=wp.int32),
-    x: wp.array(dtype=wp.vec3f),
-    edges: wp.array(dtype=wp.vec2i),
-    triangles: wp.array(dtype=wp.vec3i),
-    garment: wp.array(dtype=wp.int32),
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    cluster_garment: wp.array(dtype=wp.int32),
+    near_starts: wp.array(dtype=wp.int32),
+    near: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
+    x: wp.array(dtype=wp.vec3f),
+    asked: wp.array(dtype=wp.bool),
+    first_edge: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=wp.vec2i),
+    edge_number: wp.array(dtype=wp.int32),
+    edge_low: wp.array(dtype=wp.vec3f),
+    edge_high: wp.array(dtype=wp.vec3f),
+    first_face: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    number: wp.array(dtype=wp.int32),
+    face_low: wp.array(dtype=wp.vec3f),
+    face_high: wp.array(dtype=wp.vec3f),
     count: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec4i),
 ):
-    """For each edge asked, how many faces it passes through, and the first of them."""
+    """For each edge of a cluster with an end asked, how many faces it passes through, and the first of them."""
     i = first + wp.tid()
-    a, b = edges[ask[i]][0], edges[ask[i]][1]
-    found = wp.vec4i(-1, -1, -1, -1)
-    total = wp.int32(0)
-    query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]), wp.max(x[a], x[b]))
-    f = wp.int32(0)
-    while wp.mesh_query_aabb_next(query, f):
-        t = triangles[f]
-        if a == t[0] or a == t[1] or a == t[2] or b == t[0] or b == t[1] or b == t[2]:
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(first_edge[i], first_edge[i + 1]):
+        a, b = edges[k][0], edges[k][1]
+        if asked[a] or asked[b]:
+            least = wp.min(least, edge_low[k])
+            most = wp.max(most, edge_high[k])
+    if least[0] > most[0]:
+        return
+    query = wp.bvh_query_aabb(tree, least, most)
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        if are_apart(i, j, cluster_garment, near_starts, near, turns, meets, garments):
             continue
-        if meets[garment[a] * garments + garment[t[0]]] == 0:
-            continue
-        if passes_through(x, edges[ask[i]], t):
-            if total < SLOTS:
-                found[total] = f
-            total += 1
-    count[i] = total
-    faces[i] = found
+        for k in range(first_edge[i], first_edge[i + 1]):
+            a, b = edges[k][0], edges[k][1]
+            if not (asked[a] or asked[b]):
+                continue
+            lower, upper = edge_low[k], edge_high[k]
+            if not overlap(lower, upper, low[j], high[j]):
+                continue
+            for m in range(first_face[j], first_face[j + 1]):
+                if not overlap(lower, upper, face_low[m], face_high[m]):
+                    continue
+                t = triangles[m]
+                if has(t, a) or has(t, b):
+                    continue
+                if passes_through(x, edges[k], t):
+                    e = edge_number[k]
+                    if count[e] < SLOTS:
+                        listed = faces[e]
+                        listed[count[e]] = number[m]
+                        faces[e] = listed
+                    count[e] = count[e] + 1
 
 
 @wp.kernel
-def patches_meet(
+def clusters_meet(
     first: wp.int32,
     tree: wp.uint64,
     low: wp.array(dtype=wp.vec3f),
     high: wp.array(dtype=wp.vec3f),
-    starts: wp.array(dtype=wp.int32),
-    near: wp.array(dtype=wp.int32),
     garment: wp.array(dtype=wp.int32),
+    near_starts: wp.array(dtype=wp.int32),
+    near: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
-    flag: wp.array(dtype=wp.int32),
+    reach: wp.float32,
+    first_face: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    busy: wp.array(dtype=wp.bool),
 ):
-    """Whether the box of a patch meets that of another patch that is no near neighbour of it."""
+    """Mark the corners of a cluster's faces where it may come nearer to another, or to itself, than a reach."""
     i = first + wp.tid()
-    query = wp.bvh_query_aabb(tree, low[i], high[i])
+    if low[i][0] > high[i][0]:
+        return
+    grow = wp.vec3f(reach)
+    query = wp.bvh_query_aabb(tree, low[i] - grow, high[i] + grow)
     j = wp.int32(0)
     found = wp.int32(0)
     while wp.bvh_query_next(query, j):
-        if found == 0 and meets[garment[i] * garments + garment[j]] == 1:
-            if not is_beside(i, j, starts, near):
-                found = 1
-    flag[i] = found
-
-
-@wp.func
-def area_of(x: wp.array(dtype=wp.vec3f), t: wp.vec3i):
-    """Twice the area of a triangle along its normal."""
-    return wp.cross(x[t[1]] - x[t[0]], x[t[2]] - x[t[0]])
-
-
-@wp.kernel
-def patch_areas(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    triangles: wp.array(dtype=wp.vec3i),
-    x: wp.array(dtype=wp.vec3f),
-    total: wp.array(dtype=wp.vec3f),
-):
-    """The area of each patch's triangles together, along their normals."""
-    i = first + wp.tid()
-    out = wp.vec3f(0.0)
-    for k in range(starts[i], starts[i + 1]):
-        out += area_of(x, triangles[members[k]])
-    total[i] = out
+        if found == 0 and not are_apart(i, j, garment, near_starts, near, turns, meets, garments):
+            found = 1
+    if found == 1:
+        for m in range(first_face[i], first_face[i + 1]):
+            for corner in range(3):
+                busy[triangles[m][corner]] = True
 
 
 @wp.kernel
@@ -300,14 +465,12 @@ def rings_turn(
     ring_starts: wp.array(dtype=wp.int32),
     ring: wp.array(dtype=wp.int32),
     starts: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    triangles: wp.array(dtype=wp.vec3i),
-    x: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
     total: wp.array(dtype=wp.vec3f),
     least: wp.float32,
     turns: wp.array(dtype=wp.int32),
 ):
-    """Whether a triangle of the ring of patches round each is farther from the ring's mean normal than a cosine."""
+    """Whether a face of the ring of clusters round each is farther from the ring's mean normal than a cosine."""
     i = first + wp.tid()
     mean = wp.vec3f(0.0)
     for k in range(ring_starts[i], ring_starts[i + 1]):
@@ -316,10 +479,8 @@ def rings_turn(
     found = wp.int32(0)
     for k in range(ring_starts[i], ring_starts[i + 1]):
         for m in range(starts[ring[k]], starts[ring[k] + 1]):
-            if found == 0:
-                area = area_of(x, triangles[members[m]])
-                if wp.dot(area, mean) <= least * wp.length(area):
-                    found = 1
+            if wp.dot(normal[m], mean) <= least:
+                found = 1
     turns[i] = found
 
 
