@@ -54,24 +54,22 @@ class Clusters:
         self.face_boxes, self._boxes = self._vectors(len(triangles), 2), self._vectors(count, 2)
         garment = np.zeros(count, np.int32)
         garment[cluster] = level.vertex_garment.cpu().numpy()
-        ring, near = (
-            [self._array(each.indptr), self._array(each.indices)]
-            for each in _rings(cluster[level.edges.cpu().numpy()], count)
-        )
+        rings = _rings(cluster[level.edges.cpu().numpy()], count)
+        ring = [self._array(rings.indptr), self._array(rings.indices)]
         normal, total = self._vectors(len(triangles), 1), self._vectors(count, 1)
-        over, turns = (wp.zeros(count, dtype=wp.int32, device=level.device) for _ in range(2))
+        turns, around = (wp.zeros(count, dtype=wp.int32, device=level.device) for _ in range(2))
         points = wp.from_torch(level.rest.to(torch.float32).contiguous(), dtype=wp.vec3f)
         boxes = [*self.faces[:2], *self.face_boxes, *normal, *self._boxes, *total]
         self._of_points = [self._launch(cluster_boxes, [points, *boxes])]
         cosine = wp.float32(math.cos(TURNED))
         self._of_normals = (
-            self._launch(rings_turn, [*ring, self.faces[0], *normal, *total, cosine, over]),
-            self._launch(any_of_ring, [*ring, over, turns]),
+            self._launch(rings_turn, [*ring, self.faces[0], *normal, *total, cosine, turns]),
+            self._launch(any_of_ring, [*ring, turns, around]),
         )
         self._of_points[0]({})
         self._tree = wp.Bvh(*self._boxes)
         table = self._array(np.asarray(meets).ravel())
-        self._shared = [self._tree.id, *self._boxes, self._array(garment), *near, turns, table, wp.int32(len(meets))]
+        self._shared = [self._tree.id, *self._boxes, self._array(garment), *ring, turns, around, table, wp.int32(len(meets))]
 
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions [m], float32."""
@@ -127,11 +125,10 @@ class ClusteredParts(Clusters):
         self.vertices = tuple(self._array(each) for each in _by_owner(cluster, self.count))
 
 
-def _rings(edges: np.ndarray, count: int) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-    """Which clusters are the same or joined by an edge, and which are so by at most two."""
+def _rings(edges: np.ndarray, count: int) -> sp.csr_matrix:
+    """Which clusters are the same or joined by an edge."""
     both = np.concatenate([edges, edges[:, ::-1], np.repeat(np.arange(count), 2).reshape(-1, 2)])
-    ring = sp.csr_matrix((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), shape=(count, count))
-    return ring, sp.csr_matrix(ring @ ring)
+    return sp.csr_matrix((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), shape=(count, count))
 
 
 def _gathered(beside: sp.csr_matrix) -> np.ndarray:

@@ -114,19 +114,28 @@ def are_apart(
     i: wp.int32,
     j: wp.int32,
     garment: wp.array(dtype=wp.int32),
-    near_starts: wp.array(dtype=wp.int32),
-    near: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
     turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
+    reach: wp.float32,
 ):
-    """Whether two clusters cannot touch: garments that do not feel one another, or near ones that do not turn over."""
+    """Whether two clusters cannot come nearer than a reach, by what feels what and by what does not turn over.
+
+    Those of a ring that does not turn over do not touch. They may come near: there, no ring round one may turn over.
+    """
     if meets[garment[i] * garments + garment[j]] == 0:
         return True
-    if turns[i] == 0 or turns[j] == 0:
-        for k in range(near_starts[i], near_starts[i + 1]):
-            if near[k] == j:
-                return True
+    if reach > 0.0 and around[i] + around[j] == 2:
+        return False
+    for k in range(ring_starts[i], ring_starts[i + 1]):
+        middle = ring[k]
+        if turns[middle] == 0:
+            for m in range(ring_starts[middle], ring_starts[middle + 1]):
+                if ring[m] == j:
+                    return True
     return False
 
 
@@ -187,13 +196,14 @@ def faces_near(  # noqa: C901 - one query, each candidate refused as early as ca
     low: wp.array(dtype=wp.vec3f),
     high: wp.array(dtype=wp.vec3f),
     cluster_garment: wp.array(dtype=wp.int32),
-    near_starts: wp.array(dtype=wp.int32),
-    near: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
     turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
     starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
     x: wp.array(dtype=wp.vec3f),
     asked: wp.array(dtype=wp.bool),
     reach: wp.array(dtype=wp.float32),
@@ -228,7 +238,7 @@ def faces_near(  # noqa: C901 - one query, each candidate refused as early as ca
     j = wp.int32(0)
     while wp.bvh_query_next(query, j):
         same = cluster_garment[i] == cluster_garment[j]
-        if are_apart(i, j, cluster_garment, near_starts, near, turns, meets, garments):
+        if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 1.0):
             continue
         for k in range(first_vertex[i], first_vertex[i + 1]):
             v = vertices[k]
@@ -257,9 +267,9 @@ def faces_near(  # noqa: C901 - one query, each candidate refused as early as ca
                     if belongs(distance, wp.length(at_rest), cosine):
                         continue
                     if (
-                        is_beside(v, t[0], starts, ring)
-                        or is_beside(v, t[1], starts, ring)
-                        or is_beside(v, t[2], starts, ring)
+                        is_beside(v, t[0], starts, beside)
+                        or is_beside(v, t[1], starts, beside)
+                        or is_beside(v, t[2], starts, beside)
                     ):
                         continue
                 if cosine > 0.0:
@@ -280,13 +290,14 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
     low: wp.array(dtype=wp.vec3f),
     high: wp.array(dtype=wp.vec3f),
     cluster_garment: wp.array(dtype=wp.int32),
-    near_starts: wp.array(dtype=wp.int32),
-    near: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
     turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
     starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
     x: wp.array(dtype=wp.vec3f),
     asked: wp.array(dtype=wp.bool),
     reach: wp.array(dtype=wp.float32),
@@ -320,7 +331,7 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
     j = wp.int32(0)
     while wp.bvh_query_next(query, j):
         same = cluster_garment[i] == cluster_garment[j]
-        if are_apart(i, j, cluster_garment, near_starts, near, turns, meets, garments):
+        if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 1.0):
             continue
         for k in range(first_edge[i], first_edge[i + 1]):
             a, b = edges[k][0], edges[k][1]
@@ -347,7 +358,7 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
                 if same:
                     if belongs(distance, wp.length(between(rest, edges[k], edges[m], s, t)), cosine):
                         continue
-                    if are_beside(edges[k], edges[m], starts, ring):
+                    if are_beside(edges[k], edges[m], starts, beside):
                         continue
                 if cosine > 0.0:
                     if nearer(distance, number[m], up, other[e][0]):
@@ -367,9 +378,10 @@ def pierced(
     low: wp.array(dtype=wp.vec3f),
     high: wp.array(dtype=wp.vec3f),
     cluster_garment: wp.array(dtype=wp.int32),
-    near_starts: wp.array(dtype=wp.int32),
-    near: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
     turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
     x: wp.array(dtype=wp.vec3f),
@@ -401,7 +413,7 @@ def pierced(
     query = wp.bvh_query_aabb(tree, least, most)
     j = wp.int32(0)
     while wp.bvh_query_next(query, j):
-        if are_apart(i, j, cluster_garment, near_starts, near, turns, meets, garments):
+        if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 0.0):
             continue
         for k in range(first_edge[i], first_edge[i + 1]):
             a, b = edges[k][0], edges[k][1]
@@ -432,9 +444,10 @@ def clusters_meet(
     low: wp.array(dtype=wp.vec3f),
     high: wp.array(dtype=wp.vec3f),
     garment: wp.array(dtype=wp.int32),
-    near_starts: wp.array(dtype=wp.int32),
-    near: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
     turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
     reach: wp.float32,
@@ -451,7 +464,7 @@ def clusters_meet(
     j = wp.int32(0)
     found = wp.int32(0)
     while wp.bvh_query_next(query, j):
-        if found == 0 and not are_apart(i, j, garment, near_starts, near, turns, meets, garments):
+        if found == 0 and not are_apart(i, j, garment, ring_starts, ring, turns, around, meets, garments, reach):
             found = 1
     if found == 1:
         for m in range(first_face[i], first_face[i + 1]):
@@ -467,7 +480,7 @@ def rings_turn(
     starts: wp.array(dtype=wp.int32),
     normal: wp.array(dtype=wp.vec3f),
     total: wp.array(dtype=wp.vec3f),
-    least: wp.float32,
+    turned: wp.float32,
     turns: wp.array(dtype=wp.int32),
 ):
     """Whether a face of the ring of clusters round each is farther from the ring's mean normal than a cosine."""
@@ -476,12 +489,11 @@ def rings_turn(
     for k in range(ring_starts[i], ring_starts[i + 1]):
         mean += total[ring[k]]
     mean = wp.normalize(mean)
-    found = wp.int32(0)
+    least = wp.float32(1.0)
     for k in range(ring_starts[i], ring_starts[i + 1]):
         for m in range(starts[ring[k]], starts[ring[k] + 1]):
-            if wp.dot(normal[m], mean) <= least:
-                found = 1
-    turns[i] = found
+            least = wp.min(least, wp.dot(normal[m], mean))
+    turns[i] = wp.where(least > turned, 0, 1)
 
 
 @wp.kernel
@@ -492,7 +504,7 @@ def any_of_ring(
     flag: wp.array(dtype=wp.int32),
     out: wp.array(dtype=wp.int32),
 ):
-    """Whether a patch of the ring round each is flagged."""
+    """Whether a cluster of the ring round each is flagged."""
     i = first + wp.tid()
     found = wp.int32(0)
     for k in range(ring_starts[i], ring_starts[i + 1]):
