@@ -12,12 +12,14 @@ import scipy.sparse as sp
 import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csgraph
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges
 from .clusters import ClusteredParts
-from .proximity import edges_near, faces_near, pierced
+from .proximity import clusters_beside, edges_near, faces_near, pierced, vertex_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,11 @@ class Crossings:
     edge: Int[Tensor, " crossings"]
     face: Int[Tensor, " crossings"]
     count: int
+
+    @property
+    def all_listed(self) -> bool:
+        """Whether no edge passes through more faces than are listed."""
+        return self.count == len(self.edge)
 
 
 class ClothMesh:
@@ -82,25 +89,45 @@ class ClothMesh:
             "ring": wp.array(self.beside.indices.astype(np.int32), dtype=wp.int32, device=level.device),
         }
 
+        corner = np.argsort(triangles.ravel(), kind="stable")
+        starts = np.concatenate([[0], np.cumsum(np.bincount(triangles.ravel(), minlength=level.vertex_count))])
+        about = [wp.array(each.astype(np.int32), dtype=wp.int32, device=level.device) for each in (starts, corner // 3)]
+        about.append(wp.array(triangles, dtype=wp.vec3i, device=level.device))
+        points = [_vectors(each) for each in (self._position, self._normal)]
+        self._find_normals = Launch(
+            vertex_normals, level.vertex_count, [*about, *points], device=level.device, lanes=level.lanes
+        )
+        self._has_normals = False
+        self._at: tuple[Tensor, int] | None = None
+
     @cached_property
     def within_two(self) -> sp.csr_matrix:
         """Which vertices are at most two edges apart."""
         return sp.csr_matrix(self.beside @ self.beside + self.beside)
 
+    @cached_property
+    def whole(self) -> np.ndarray:
+        """What each vertex hangs together with: a number of each piece, shape (V,)."""
+        return joined_by(self.level.edges.cpu().numpy(), self.level.vertex_count)
+
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """Take positions [m]; what is asked afterwards is asked of them."""
+        """Take positions [m]; what is asked afterwards is asked of them.
+
+        Nothing is done for the tensor taken last, unless it was written to since.
+        """
+        if self._at is not None and self._at[0] is x and self._at[1] == x._version:
+            return
+        self._at = x, x._version
         self._position.copy_(x)
         self._clusters.move(self._position)
+        self._has_normals = False
 
     def normals(self) -> Float[Tensor, "vertices 3"]:
         """Unit vertex normals of the authored winding."""
-        corner = self._position[self.triangles]
-        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        total = torch.zeros_like(self._position)
-        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
-        for i in range(3):
-            total.index_put_((self.triangles[:, i],), area, accumulate=True)
-        return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
+        if not self._has_normals:
+            self._find_normals({})
+            self._has_normals = True
+        return self._normal
 
     def pairs(self, busy: Bool[Tensor, " vertices"], reach: Float[Tensor, " vertices"]) -> Pairs:
         """The closest parts above and below what is busy.
@@ -112,7 +139,7 @@ class ClothMesh:
         Returns:
             Vertex-face pairs, then edge-edge pairs; an edge-edge pair occurs once.
         """
-        self._normal.copy_(self.normals())
+        self.normals()
         limit = reach.to(torch.float32).contiguous()
         of_faces = self._vertex_face(busy, limit)
         # An edge near another has a vertex near a face, or next to one that is.
@@ -129,11 +156,30 @@ class ClothMesh:
         count = torch.zeros(len(self.level.edges), dtype=torch.int32, device=busy.device)
         faces = torch.empty((len(count), 4), dtype=torch.int32, device=busy.device)
         clusters, inputs = self._clusters, [_vectors(self._position), _flags(busy)]
-        inputs += [ *clusters.edges, *clusters.edge_boxes, *clusters.faces, *clusters.face_boxes]
+        inputs += [*clusters.edges, *clusters.edge_boxes, *clusters.faces, *clusters.face_boxes]
         clusters.run(pierced, [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
         edge = torch.nonzero(count).squeeze(1)
         listed = torch.nonzero(torch.arange(4, device=edge.device) < count[edge].unsqueeze(1))
         return Crossings(edge[listed[:, 0]], faces[edge].long()[listed[:, 0], listed[:, 1]], int(count.sum()))
+
+    def crossings_since(
+        self, known: Crossings, moved: Bool[Tensor, " vertices"], busy: Bool[Tensor, " vertices"]
+    ) -> Crossings:
+        """What crosses now, by what crossed before some vertices moved: only what lies beside those is asked.
+
+        Args:
+            known: What crossed, all of it listed.
+            moved: Vertices that have moved since.
+            busy: As `crossings` takes it.
+        """
+        near, clusters = moved.clone(), self._clusters
+        clusters.run(clusters_beside, [_flags(moved), *clusters.faces[:2], _flags(near)])
+        found = self.crossings(near & busy)
+        ends = self.level.edges.long()[known.edge]
+        kept = ~near[ends].any(dim=1) & ~moved[self.triangles[known.face]].any(dim=1)
+        edge, face = torch.cat([known.edge[kept], found.edge]), torch.cat([known.face[kept], found.face])
+        order = torch.argsort(edge, stable=True)
+        return Crossings(edge[order], face[order], found.count + int(kept.sum()))
 
     def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
         """Vertices at most some edges away from given ones."""
@@ -198,6 +244,12 @@ class ClothMesh:
         """What both proximity kernels are told first."""
         moving = [_vectors(self._position), _flags(asked), wp.from_torch(reach), _vectors(self._normal)]
         return [self._static["starts"], self._static["ring"], *moving, self._static["rest"]]
+
+
+def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
+    """The piece of each of some vertices, by the edges that hold them together, shape (V,)."""
+    graph = sp.coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return csgraph.connected_components(graph, directed=False)[1]
 
 
 def _adjacency(edges: np.ndarray, count: int) -> sp.csr_matrix:

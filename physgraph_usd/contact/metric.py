@@ -28,28 +28,37 @@ MISSING, MISSING_TANGLED = 0.9, 0.3
 """Part of the stiffness of what touches that a metric may lack before it is made anew, and the same while cloth crosses
 cloth and what pushes changes sides. What it has too much does no harm: what touched once in a level's rounds touches
 again; and a new metric costs a factor and drops what was learned of the curvature."""
-REFACTORED = 60_000
-"""Vertices up to which a level's factor takes up the stiffness of what touches."""
+REFACTORED, FEW = 60_000, 0.05
+"""Vertices up to which a level's factor takes up the stiffness of what touches, and the part of them that must be
+touched: a factor costs as much as a dozen steps."""
 
 
 class HeldMetric:
     """A level's metric while something touches its cloth."""
 
-    def __init__(self, plain: Metric, stiff: Float[Tensor, " vertices"]) -> None:
+    def __init__(
+        self, plain: Metric, stiff: Float[Tensor, " vertices"], *, known: HeldMetric | None = None
+    ) -> None:
         """Take up a stiffness.
 
         Args:
             plain: The level's metric.
             stiff: K [N/m].
+            known: The level's held metric before, whose factor serves on while it has enough of K.
         """
         self.stiff = stiff
-        self._smooth = plain.plus(stiff) if len(stiff) <= REFACTORED else plain
+        if known is not None and _lack(stiff, known._in_factor) <= MISSING:
+            self._smooth, self._in_factor = known._smooth, known._in_factor
+        elif len(stiff) <= REFACTORED and float((stiff > 0).to(stiff).mean()) > FEW:
+            self._smooth, self._in_factor = plain.plus(stiff), stiff
+        else:
+            self._smooth, self._in_factor = plain, torch.zeros_like(stiff)
         self._rough = (ROUGH / (plain.diagonal.to(stiff) + stiff)).unsqueeze(1)
 
     def serves(self, stiff: Float[Tensor, " vertices"], *, tangled: bool = False) -> bool:
         """Whether it holds enough of another stiffness [N/m]."""
         most = MISSING_TANGLED if tangled else MISSING
-        return float((stiff - self.stiff).clamp_min(0.0).sum()) <= most * float(stiff.sum())
+        return _lack(stiff, self.stiff) <= most
 
     @property
     def diagonal(self) -> Float[Tensor, " vertices"]:
@@ -63,3 +72,8 @@ class HeldMetric:
     def smooth(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """(H0 + K)^-1 F [m], by which the remaining move is judged."""
         return self._smooth.solve(force)
+
+
+def _lack(stiff: Tensor, held: Tensor) -> float:
+    """The part of a stiffness that another one lacks."""
+    return float((stiff - held).clamp_min(0.0).sum()) / max(float(stiff.sum()), 1e-30)

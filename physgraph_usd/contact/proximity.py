@@ -473,6 +473,41 @@ def clusters_meet(
 
 
 @wp.kernel
+def clusters_beside(
+    first: wp.int32,
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    garment: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    given: wp.array(dtype=wp.bool),
+    first_face: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    beside: wp.array(dtype=wp.bool),
+):
+    """Mark the corners of the faces of all clusters whose boxes meet that of one with a face at a given vertex."""
+    i = first + wp.tid()
+    found = wp.int32(0)
+    for m in range(first_face[i], first_face[i + 1]):
+        for corner in range(3):
+            if given[triangles[m][corner]]:
+                found = 1
+    if found == 0:
+        return
+    query = wp.bvh_query_aabb(tree, low[i], high[i])
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        for m in range(first_face[j], first_face[j + 1]):
+            for corner in range(3):
+                beside[triangles[m][corner]] = True
+
+
+@wp.kernel
 def rings_turn(
     first: wp.int32,
     ring_starts: wp.array(dtype=wp.int32),
@@ -510,3 +545,21 @@ def any_of_ring(
     for k in range(ring_starts[i], ring_starts[i + 1]):
         found = wp.max(found, flag[ring[k]])
     out[i] = found
+
+
+@wp.kernel
+def vertex_normals(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    x: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+):
+    """The unit normal of each vertex: its faces' areas along their normals together."""
+    i = first + wp.tid()
+    total = wp.vec3f(0.0)
+    for k in range(starts[i], starts[i + 1]):
+        t = triangles[faces[k]]
+        total += wp.cross(x[t[1]] - x[t[0]], x[t[2]] - x[t[0]])
+    normal[i] = wp.normalize(total)
