@@ -28,9 +28,10 @@ MISSING, MISSING_TANGLED = 0.9, 0.3
 """Part of the stiffness of what touches that a metric may lack before it is made anew, and the same while cloth crosses
 cloth and what pushes changes sides. What it has too much does no harm: what touched once in a level's rounds touches
 again; and a new metric costs a factor and drops what was learned of the curvature."""
-REFACTORED, FEW = 60_000, 0.05
-"""Vertices up to which a level's factor takes up the stiffness of what touches, and the part of them that must be
-touched: a factor costs as much as a dozen steps."""
+REFACTORED = 60_000
+"""Vertices up to which a level's factor takes up the stiffness of what touches."""
+IN_FACTOR = 0.6
+"""Part of the stiffness that the factor of a metric made anew may lack: the diagonal costs nothing."""
 
 
 class HeldMetric:
@@ -47,9 +48,9 @@ class HeldMetric:
             known: The level's held metric before, whose factor serves on while it has enough of K.
         """
         self.stiff = stiff
-        if known is not None and _lack(stiff, known._in_factor) <= MISSING:
+        if known is not None and _lack(stiff, known._in_factor) <= IN_FACTOR:
             self._smooth, self._in_factor = known._smooth, known._in_factor
-        elif len(stiff) <= REFACTORED and float((stiff > 0).to(stiff).mean()) > FEW:
+        elif len(stiff) <= REFACTORED:
             self._smooth, self._in_factor = plain.plus(stiff), stiff
         else:
             self._smooth, self._in_factor = plain, torch.zeros_like(stiff)
