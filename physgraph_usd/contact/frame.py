@@ -57,7 +57,7 @@ class LevelContact:
         if self._held is None:
             self._held = HeldMetric(plain, stiff)
         elif not self._held.serves(stiff, tangled=self.tangled):
-            self._held = HeldMetric(plain, torch.maximum(stiff, self._held.stiff), known=self._held)
+            self._held = HeldMetric(plain, torch.maximum(stiff, self._held.stiff))
         return self._held
 
     @property

@@ -30,36 +30,26 @@ cloth and what pushes changes sides. What it has too much does no harm: what tou
 again; and a new metric costs a factor and drops what was learned of the curvature."""
 REFACTORED = 60_000
 """Vertices up to which a level's factor takes up the stiffness of what touches."""
-IN_FACTOR = 0.6
-"""Part of the stiffness that the factor of a metric made anew may lack: the diagonal costs nothing."""
 
 
 class HeldMetric:
     """A level's metric while something touches its cloth."""
 
-    def __init__(
-        self, plain: Metric, stiff: Float[Tensor, " vertices"], *, known: HeldMetric | None = None
-    ) -> None:
+    def __init__(self, plain: Metric, stiff: Float[Tensor, " vertices"]) -> None:
         """Take up a stiffness.
 
         Args:
             plain: The level's metric.
             stiff: K [N/m].
-            known: The level's held metric before, whose factor serves on while it has enough of K.
         """
         self.stiff = stiff
-        if known is not None and _lack(stiff, known._in_factor) <= IN_FACTOR:
-            self._smooth, self._in_factor = known._smooth, known._in_factor
-        elif len(stiff) <= REFACTORED:
-            self._smooth, self._in_factor = plain.plus(stiff), stiff
-        else:
-            self._smooth, self._in_factor = plain, torch.zeros_like(stiff)
+        self._smooth = plain.plus(stiff) if len(stiff) <= REFACTORED else plain
         self._rough = (ROUGH / (plain.diagonal.to(stiff) + stiff)).unsqueeze(1)
 
     def serves(self, stiff: Float[Tensor, " vertices"], *, tangled: bool = False) -> bool:
         """Whether it holds enough of another stiffness [N/m]."""
         most = MISSING_TANGLED if tangled else MISSING
-        return _lack(stiff, self.stiff) <= most
+        return float((stiff - self.stiff).clamp_min(0.0).sum()) <= most * float(stiff.sum())
 
     @property
     def diagonal(self) -> Float[Tensor, " vertices"]:
@@ -73,8 +63,3 @@ class HeldMetric:
     def smooth(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """(H0 + K)^-1 F [m], by which the remaining move is judged."""
         return self._smooth.solve(force)
-
-
-def _lack(stiff: Tensor, held: Tensor) -> float:
-    """The part of a stiffness that another one lacks."""
-    return float((stiff - held).clamp_min(0.0).sum()) / max(float(stiff.sum()), 1e-30)
