@@ -14,6 +14,8 @@ from ..mesh.piercing import passes_through
 
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
+POINT = 1e-12
+"""Square of the length under which an edge is a point [m^2]."""
 IN_PLANE = 0.5
 """Cosine to the normal under which a neighbour lies in the plane of the cloth rather than above or below it."""
 CLOSED_IN = 0.5
@@ -73,9 +75,21 @@ def are_beside(e: wp.vec2i, g: wp.vec2i, starts: wp.array(dtype=wp.int32), ring:
 
 
 @wp.func
-def is_inside(s: float, t: float):
-    """Whether both places are inside their edges."""
-    return s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
+def places_inside(a: wp.vec3f, b: wp.vec3f, c: wp.vec3f, d: wp.vec3f):
+    """Where along two edges they are closest, if inside both; else a negative place (Ericson 2005, 5.1.9)."""
+    along, other, way = b - a, d - c, a - c
+    length, width, both = wp.dot(along, along), wp.dot(other, other), wp.dot(along, other)
+    first, second = wp.dot(along, way), wp.dot(other, way)
+    whole = length * width - both * both
+    part = both * second - first * width
+    none = wp.vec2f(-1.0, -1.0)
+    if part <= 0.0 or part >= whole or wp.min(length, width) <= POINT:
+        return none
+    s = part / whole
+    t = (both * s + second) / width
+    if t <= 0.0 or t >= 1.0:
+        return none
+    return wp.vec2f(s, t)
 
 
 @wp.func
@@ -348,12 +362,15 @@ def edges_near(  # noqa: C901 - one query, each candidate refused as early as ca
                 c, d = edges[m][0], edges[m][1]
                 if a == c or a == d or b == c or b == d:
                     continue
-                found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[d], 1.0e-12)
-                s, t, distance = found[0], found[1], found[2]
-                up, down = best[e][0], best[e][1]
-                if not is_inside(s, t) or distance > wp.max(up, down) or distance < LEAST:
+                places = places_inside(x[a], x[b], x[c], x[d])
+                s, t = places[0], places[1]
+                if s < 0.0:
                     continue
                 way = between(x, edges[k], edges[m], s, t)
+                distance = wp.length(way)
+                up, down = best[e][0], best[e][1]
+                if distance > wp.max(up, down) or distance < LEAST:
+                    continue
                 cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
                 if same:
                     if belongs(distance, wp.length(between(rest, edges[k], edges[m], s, t)), cosine):
