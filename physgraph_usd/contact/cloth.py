@@ -168,7 +168,7 @@ class ClothView:
         """Find what crosses; where few vertices have moved since what is known, only beside them."""
         busy = self._regions.busy(x, 0.0)
         if not bool(busy.any()):
-            return ClothState(x, _nothing(x), near=False, version=x._version)
+            return ClothState(x, Crossings.none(x.device), near=False, version=x._version)
         self._mesh.move(x)
         if known is not None and known.version == known.x._version and known.crossings.all_listed:
             moved = (x != known.x).any(dim=1)
@@ -217,7 +217,7 @@ class ClothView:
         Pairs found before serve again while hardly anything has moved; where nothing crossed at the start of a level,
         only its end is looked at again.
         """
-        known, none = self._found, _nothing(x)
+        known, none = self._found, Crossings.none(x.device)
         if known is not None and not self.tangled:
             moved = (x - known.x).norm(dim=1) > STALE * self._level.spacing
             if float(moved.to(x.dtype).mean()) < FEW:
@@ -377,12 +377,6 @@ class ClothView:
         cosine = (out * normal).sum(dim=1) * self._lasting.outward[owner]
         cosine = torch.where(first_is_outer, cosine, -cosine)
         return cosine < -FRONTAL
-
-
-def _nothing(x: Tensor) -> Crossings:
-    """No crossings."""
-    none = torch.zeros(0, dtype=torch.int64, device=x.device)
-    return Crossings(none, none, 0)
 
 
 def _swapped(

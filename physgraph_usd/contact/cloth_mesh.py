@@ -18,8 +18,9 @@ from torch import Tensor
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges
+from .cluster_kernels import clusters_beside
 from .clusters import ClusteredParts
-from .proximity import clusters_beside, edges_near, faces_near, pierced, vertex_normals
+from .proximity import edges_near, faces_near, pierced, vertex_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,12 @@ class Crossings:
     edge: Int[Tensor, " crossings"]
     face: Int[Tensor, " crossings"]
     count: int
+
+    @staticmethod
+    def none(device: torch.device) -> Crossings:
+        """No crossings."""
+        empty = torch.zeros(0, dtype=torch.int64, device=device)
+        return Crossings(empty, empty, 0)
 
     @property
     def all_listed(self) -> bool:

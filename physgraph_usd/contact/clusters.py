@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.lanes import Launch
-from .proximity import any_of_ring, cluster_boxes, edge_boxes, rings_turn
+from .cluster_kernels import any_of_ring, cluster_boxes, edge_boxes, rings_turn
 
 TURNED = math.radians(85.0)
 """Angle from a piece's mean normal beyond which it may touch itself."""
@@ -70,7 +70,16 @@ class Clusters:
         self._at: tuple[Tensor, int] | None = None
         self._tree = wp.Bvh(*self._boxes)
         table = self._array(np.asarray(meets).ravel())
-        self._shared = [self._tree.id, *self._boxes, self._array(garment), *ring, turns, around, table, wp.int32(len(meets))]
+        self._shared = [
+            self._tree.id,
+            *self._boxes,
+            self._array(garment),
+            *ring,
+            turns,
+            around,
+            table,
+            wp.int32(len(meets)),
+        ]
 
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions [m], float32; nothing is done for the tensor taken last, unless it was written to since."""
