@@ -18,9 +18,9 @@ from torch import Tensor
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges
-from .cluster_kernels import clusters_beside
+from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
-from .proximity import edges_near, faces_near, pierced, vertex_normals
+from .proximity import edges_near, faces_near, vertex_normals
 
 
 @dataclass(frozen=True, eq=False)

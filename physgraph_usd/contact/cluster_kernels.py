@@ -1,4 +1,4 @@
-"""What clusters of faces know of themselves, their boxes and how far they turn over, and which of them may meet."""
+"""What clusters of faces know of themselves, which of them may meet, and which edges pass through which faces."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false
@@ -6,8 +6,18 @@ from __future__ import annotations
 
 import warp as wp
 
+from ..mesh.piercing import passes_through
+
 FAR = 1e30
 """Corner of a box that holds nothing."""
+SLOTS = 4
+"""Faces kept for each edge that passes through some."""
+
+
+@wp.func
+def has(t: wp.vec3i, v: wp.int32):
+    """Whether a triangle has a vertex."""
+    return t[0] == v or t[1] == v or t[2] == v
 
 
 @wp.func
@@ -205,3 +215,69 @@ def any_of_ring(
     for k in range(ring_starts[i], ring_starts[i + 1]):
         found = wp.max(found, flag[ring[k]])
     out[i] = found
+
+
+@wp.kernel
+def pierced(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
+    first: wp.int32,
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    cluster_garment: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    x: wp.array(dtype=wp.vec3f),
+    asked: wp.array(dtype=wp.bool),
+    first_edge: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=wp.vec2i),
+    edge_number: wp.array(dtype=wp.int32),
+    edge_low: wp.array(dtype=wp.vec3f),
+    edge_high: wp.array(dtype=wp.vec3f),
+    first_face: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    number: wp.array(dtype=wp.int32),
+    face_low: wp.array(dtype=wp.vec3f),
+    face_high: wp.array(dtype=wp.vec3f),
+    count: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec4i),
+):
+    """For each edge of a cluster with an end asked, how many faces it passes through, and the first of them."""
+    i = first + wp.tid()
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(first_edge[i], first_edge[i + 1]):
+        a, b = edges[k][0], edges[k][1]
+        if asked[a] or asked[b]:
+            least = wp.min(least, edge_low[k])
+            most = wp.max(most, edge_high[k])
+    if least[0] > most[0]:
+        return
+    query = wp.bvh_query_aabb(tree, least, most)
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 0.0):
+            continue
+        for k in range(first_edge[i], first_edge[i + 1]):
+            a, b = edges[k][0], edges[k][1]
+            if not (asked[a] or asked[b]):
+                continue
+            lower, upper = edge_low[k], edge_high[k]
+            if not overlap(lower, upper, low[j], high[j]):
+                continue
+            for m in range(first_face[j], first_face[j + 1]):
+                if not overlap(lower, upper, face_low[m], face_high[m]):
+                    continue
+                t = triangles[m]
+                if has(t, a) or has(t, b):
+                    continue
+                if passes_through(x, edges[k], t):
+                    e = edge_number[k]
+                    if count[e] < SLOTS:
+                        listed = faces[e]
+                        listed[count[e]] = number[m]
+                        faces[e] = listed
+                    count[e] = count[e] + 1

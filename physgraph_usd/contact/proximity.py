@@ -1,4 +1,4 @@
-"""Which parts of the cloth are near which, and which edges pass through which faces: one hierarchy a level.
+"""Which parts of the cloth are near which, asked by clusters of faces.
 
 Queries are exact for what is asked: the closest face above and below a vertex, the closest edge above and below an
 edge. Parts that share a corner, or are one edge apart, are no pairs.
@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..mesh.piercing import passes_through
-from .cluster_kernels import FAR, are_apart, overlap
+from .cluster_kernels import FAR, are_apart, has, overlap
 
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
@@ -21,8 +20,6 @@ IN_PLANE = 0.5
 """Cosine to the normal under which a neighbour lies in the plane of the cloth rather than above or below it."""
 CLOSED_IN = 0.5
 """Distance over rest distance above which such a neighbour is where it belongs."""
-SLOTS = 4
-"""Faces kept for each edge that passes through some."""
 
 
 @wp.func
@@ -104,12 +101,6 @@ def belongs(distance: float, rest_distance: float, cosine: float):
 
 
 @wp.func
-def has(t: wp.vec3i, v: wp.int32):
-    """Whether a triangle has a vertex."""
-    return t[0] == v or t[1] == v or t[2] == v
-
-
-@wp.func
 def share_an_end(e: wp.vec2i, g: wp.vec2i):
     """Whether two edges meet at a vertex."""
     return e[0] == g[0] or e[0] == g[1] or e[1] == g[0] or e[1] == g[1]
@@ -121,8 +112,72 @@ def nearer(distance: float, part: wp.int32, best: float, known: wp.int32):
     return distance < best or (distance == best and part < known)
 
 
+@wp.func
+def box_of_vertices(
+    begin: wp.int32,
+    end: wp.int32,
+    vertices: wp.array(dtype=wp.int32),
+    asked: wp.array(dtype=wp.bool),
+    reach: wp.array(dtype=wp.float32),
+    x: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
+):
+    """The box within reach of the vertices asked, for which nothing is known from now on."""
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(begin, end):
+        v = vertices[k]
+        if asked[v]:
+            best[v] = wp.vec2f(reach[v], reach[v])
+            least = wp.min(least, x[v] - wp.vec3f(reach[v]))
+            most = wp.max(most, x[v] + wp.vec3f(reach[v]))
+    return least, most
+
+
+@wp.func
+def is_own_face(
+    v: wp.int32,
+    t: wp.vec3i,
+    weight: wp.vec3f,
+    distance: float,
+    cosine: float,
+    rest: wp.array(dtype=wp.vec3f),
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+):
+    """Whether a face of the same garment is next to the vertex, or in its plane, where it belongs."""
+    at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
+    if belongs(distance, wp.length(at_rest), cosine):
+        return True
+    if is_beside(v, t[0], starts, beside) or is_beside(v, t[1], starts, beside):
+        return True
+    return is_beside(v, t[2], starts, beside)
+
+
+@wp.func
+def keep_nearest(
+    v: wp.int32,
+    part: wp.int32,
+    distance: float,
+    cosine: float,
+    best: wp.array(dtype=wp.vec2f),
+    found: wp.array(dtype=wp.vec2i),
+):
+    """Note a part that is nearer than what is known on its side: 1 above, -1 below, 0 where it is not."""
+    if cosine > 0.0:
+        if nearer(distance, part, best[v][0], found[v][0]):
+            best[v] = wp.vec2f(distance, best[v][1])
+            found[v] = wp.vec2i(part, found[v][1])
+            return 1
+    elif nearer(distance, part, best[v][1], found[v][1]):
+        best[v] = wp.vec2f(best[v][0], distance)
+        found[v] = wp.vec2i(found[v][0], part)
+        return -1
+    return 0
+
+
 @wp.kernel
-def faces_near(  # noqa: C901, PLR0912, PLR0915 - one query, each candidate refused as early as can be
+def faces_near(  # noqa: C901 - one query, each candidate refused as early as can be
     first: wp.int32,
     tree: wp.uint64,
     low: wp.array(dtype=wp.vec3f),
@@ -155,15 +210,8 @@ def faces_near(  # noqa: C901, PLR0912, PLR0915 - one query, each candidate refu
 ):
     """For each vertex asked of a cluster, the closest face on either side within its reach, -1 where there is none."""
     i = first + wp.tid()
-    least = wp.vec3f(FAR)
-    most = wp.vec3f(-FAR)
-    for k in range(first_vertex[i], first_vertex[i + 1]):
-        v = vertices[k]
-        if asked[v]:
-            best[v] = wp.vec2f(reach[v], reach[v])
-            grow = wp.vec3f(reach[v])
-            least = wp.min(least, x[v] - grow)
-            most = wp.max(most, x[v] + grow)
+    begin, end = first_vertex[i], first_vertex[i + 1]
+    least, most = box_of_vertices(begin, end, vertices, asked, reach, x, best)
     if least[0] > most[0]:
         return
     query = wp.bvh_query_aabb(tree, least, most)
@@ -172,51 +220,75 @@ def faces_near(  # noqa: C901, PLR0912, PLR0915 - one query, each candidate refu
         same = cluster_garment[i] == cluster_garment[j]
         if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 1.0):
             continue
-        for k in range(first_vertex[i], first_vertex[i + 1]):
+        for k in range(begin, end):
             v = vertices[k]
-            if not asked[v]:
-                continue
-            p = x[v]
-            limit = wp.max(best[v][0], best[v][1])
-            grow = wp.vec3f(limit)
-            if not overlap(p - grow, p + grow, low[j], high[j]):
+            grow = wp.vec3f(wp.max(best[v][0], best[v][1]))
+            if not asked[v] or not overlap(x[v] - grow, x[v] + grow, low[j], high[j]):
                 continue
             for m in range(first_face[j], first_face[j + 1]):
-                if not overlap(p - grow, p + grow, face_low[m], face_high[m]):
-                    continue
                 t = triangles[m]
-                if has(t, v):
+                if not overlap(x[v] - grow, x[v] + grow, face_low[m], face_high[m]) or has(t, v):
                     continue
-                weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
-                way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
+                weight = closest_on_triangle(x[v], x[t[0]], x[t[1]], x[t[2]])
+                way = x[v] - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
                 distance = wp.length(way)
-                up, down = best[v][0], best[v][1]
-                if distance > wp.max(up, down) or distance < LEAST:
+                if distance > wp.max(best[v][0], best[v][1]) or distance < LEAST:
                     continue
                 cosine = wp.dot(way, normal[v]) / distance
                 if same:
-                    at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
-                    if belongs(distance, wp.length(at_rest), cosine):
+                    if is_own_face(v, t, weight, distance, cosine, rest, starts, beside):
                         continue
-                    if (
-                        is_beside(v, t[0], starts, beside)
-                        or is_beside(v, t[1], starts, beside)
-                        or is_beside(v, t[2], starts, beside)
-                    ):
-                        continue
-                if cosine > 0.0:
-                    if nearer(distance, number[m], up, face[v][0]):
-                        best[v] = wp.vec2f(distance, down)
-                        face[v] = wp.vec2i(number[m], face[v][1])
-                        above[v] = weight
-                elif nearer(distance, number[m], down, face[v][1]):
-                    best[v] = wp.vec2f(up, distance)
-                    face[v] = wp.vec2i(face[v][0], number[m])
+                side = keep_nearest(v, number[m], distance, cosine, best, face)
+                if side > 0:
+                    above[v] = weight
+                elif side < 0:
                     below[v] = weight
 
 
+@wp.func
+def box_of_edges(
+    begin: wp.int32,
+    end: wp.int32,
+    edges: wp.array(dtype=wp.vec2i),
+    number: wp.array(dtype=wp.int32),
+    asked: wp.array(dtype=wp.bool),
+    reach: wp.array(dtype=wp.float32),
+    edge_low: wp.array(dtype=wp.vec3f),
+    edge_high: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
+):
+    """The box within reach of the edges with an end asked, for which nothing is known from now on."""
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(begin, end):
+        a, b = edges[k][0], edges[k][1]
+        if asked[a] or asked[b]:
+            far = 0.5 * (reach[a] + reach[b])
+            best[number[k]] = wp.vec2f(far, far)
+            least = wp.min(least, edge_low[k] - wp.vec3f(far))
+            most = wp.max(most, edge_high[k] + wp.vec3f(far))
+    return least, most
+
+
+@wp.func
+def is_own_edge(
+    e: wp.vec2i,
+    g: wp.vec2i,
+    places: wp.vec2f,
+    distance: float,
+    cosine: float,
+    rest: wp.array(dtype=wp.vec3f),
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+):
+    """Whether an edge of the same garment is next to another, or in its plane, where it belongs."""
+    if belongs(distance, wp.length(between(rest, e, g, places[0], places[1])), cosine):
+        return True
+    return are_beside(e, g, starts, beside)
+
+
 @wp.kernel
-def edges_near(  # noqa: C901, PLR0912, PLR0915 - one query, each candidate refused as early as can be
+def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
     first: wp.int32,
     tree: wp.uint64,
     low: wp.array(dtype=wp.vec3f),
@@ -247,16 +319,8 @@ def edges_near(  # noqa: C901, PLR0912, PLR0915 - one query, each candidate refu
 ):
     """For each edge with an end asked, the closest edge on either side within reach, inside both; -1 for none."""
     i = first + wp.tid()
-    least = wp.vec3f(FAR)
-    most = wp.vec3f(-FAR)
-    for k in range(first_edge[i], first_edge[i + 1]):
-        a, b = edges[k][0], edges[k][1]
-        if asked[a] or asked[b]:
-            far = 0.5 * (reach[a] + reach[b])
-            e = number[k]
-            best[e] = wp.vec2f(far, far)
-            least = wp.min(least, edge_low[k] - wp.vec3f(far))
-            most = wp.max(most, edge_high[k] + wp.vec3f(far))
+    begin, end = first_edge[i], first_edge[i + 1]
+    least, most = box_of_edges(begin, end, edges, number, asked, reach, edge_low, edge_high, best)
     if least[0] > most[0]:
         return
     query = wp.bvh_query_aabb(tree, least, most)
@@ -265,111 +329,31 @@ def edges_near(  # noqa: C901, PLR0912, PLR0915 - one query, each candidate refu
         same = cluster_garment[i] == cluster_garment[j]
         if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 1.0):
             continue
-        for k in range(first_edge[i], first_edge[i + 1]):
-            a, b = edges[k][0], edges[k][1]
+        for k in range(begin, end):
+            a, b, e = edges[k][0], edges[k][1], number[k]
             if not (asked[a] or asked[b]):
                 continue
-            e = number[k]
             grow = wp.vec3f(wp.max(best[e][0], best[e][1]))
             lower, upper = edge_low[k] - grow, edge_high[k] + grow
             if not overlap(lower, upper, low[j], high[j]):
                 continue
             for m in range(first_edge[j], first_edge[j + 1]):
-                if not overlap(lower, upper, edge_low[m], edge_high[m]):
+                if not overlap(lower, upper, edge_low[m], edge_high[m]) or share_an_end(edges[k], edges[m]):
                     continue
-                c, d = edges[m][0], edges[m][1]
-                if share_an_end(edges[k], edges[m]):
-                    continue
-                places = places_inside(x[a], x[b], x[c], x[d])
-                s, t = places[0], places[1]
-                if s < 0.0:
-                    continue
-                way = between(x, edges[k], edges[m], s, t)
+                places = places_inside(x[a], x[b], x[edges[m][0]], x[edges[m][1]])
+                way = between(x, edges[k], edges[m], places[0], places[1])
                 distance = wp.length(way)
-                up, down = best[e][0], best[e][1]
-                if distance > wp.max(up, down) or distance < LEAST:
+                if places[0] < 0.0 or distance > wp.max(best[e][0], best[e][1]) or distance < LEAST:
                     continue
                 cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
                 if same:
-                    if belongs(distance, wp.length(between(rest, edges[k], edges[m], s, t)), cosine):
+                    if is_own_edge(edges[k], edges[m], places, distance, cosine, rest, starts, beside):
                         continue
-                    if are_beside(edges[k], edges[m], starts, beside):
-                        continue
-                if cosine > 0.0:
-                    if nearer(distance, number[m], up, other[e][0]):
-                        best[e] = wp.vec2f(distance, down)
-                        other[e] = wp.vec2i(number[m], other[e][1])
-                        above[e] = wp.vec2f(s, t)
-                elif nearer(distance, number[m], down, other[e][1]):
-                    best[e] = wp.vec2f(up, distance)
-                    other[e] = wp.vec2i(other[e][0], number[m])
-                    below[e] = wp.vec2f(s, t)
-
-
-@wp.kernel
-def pierced(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
-    first: wp.int32,
-    tree: wp.uint64,
-    low: wp.array(dtype=wp.vec3f),
-    high: wp.array(dtype=wp.vec3f),
-    cluster_garment: wp.array(dtype=wp.int32),
-    ring_starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
-    turns: wp.array(dtype=wp.int32),
-    around: wp.array(dtype=wp.int32),
-    meets: wp.array(dtype=wp.int32),
-    garments: wp.int32,
-    x: wp.array(dtype=wp.vec3f),
-    asked: wp.array(dtype=wp.bool),
-    first_edge: wp.array(dtype=wp.int32),
-    edges: wp.array(dtype=wp.vec2i),
-    edge_number: wp.array(dtype=wp.int32),
-    edge_low: wp.array(dtype=wp.vec3f),
-    edge_high: wp.array(dtype=wp.vec3f),
-    first_face: wp.array(dtype=wp.int32),
-    triangles: wp.array(dtype=wp.vec3i),
-    number: wp.array(dtype=wp.int32),
-    face_low: wp.array(dtype=wp.vec3f),
-    face_high: wp.array(dtype=wp.vec3f),
-    count: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec4i),
-):
-    """For each edge of a cluster with an end asked, how many faces it passes through, and the first of them."""
-    i = first + wp.tid()
-    least = wp.vec3f(FAR)
-    most = wp.vec3f(-FAR)
-    for k in range(first_edge[i], first_edge[i + 1]):
-        a, b = edges[k][0], edges[k][1]
-        if asked[a] or asked[b]:
-            least = wp.min(least, edge_low[k])
-            most = wp.max(most, edge_high[k])
-    if least[0] > most[0]:
-        return
-    query = wp.bvh_query_aabb(tree, least, most)
-    j = wp.int32(0)
-    while wp.bvh_query_next(query, j):
-        if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 0.0):
-            continue
-        for k in range(first_edge[i], first_edge[i + 1]):
-            a, b = edges[k][0], edges[k][1]
-            if not (asked[a] or asked[b]):
-                continue
-            lower, upper = edge_low[k], edge_high[k]
-            if not overlap(lower, upper, low[j], high[j]):
-                continue
-            for m in range(first_face[j], first_face[j + 1]):
-                if not overlap(lower, upper, face_low[m], face_high[m]):
-                    continue
-                t = triangles[m]
-                if has(t, a) or has(t, b):
-                    continue
-                if passes_through(x, edges[k], t):
-                    e = edge_number[k]
-                    if count[e] < SLOTS:
-                        listed = faces[e]
-                        listed[count[e]] = number[m]
-                        faces[e] = listed
-                    count[e] = count[e] + 1
+                side = keep_nearest(e, number[m], distance, cosine, best, other)
+                if side > 0:
+                    above[e] = places
+                elif side < 0:
+                    below[e] = places
 
 
 @wp.kernel
