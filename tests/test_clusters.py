@@ -46,7 +46,7 @@ class TestClusters:
     def test_each_hangs_together_and_is_of_one_garment(self):
         level = levels_of(named(square(3), "A"), named(square(4), "B"))[-1]
         parts = parts_of(level)
-        first, vertices = (each.numpy() for each in parts.vertices)
+        first, vertices = (np.asarray(each.numpy(), dtype=np.int64) for each in parts.vertices)
         beside = _adjacency(level.edges.numpy(), level.vertex_count)
         for a, b in pairwise(first):
             own = vertices[a:b]
@@ -59,7 +59,7 @@ class TestClusters:
         parts, x = parts_of(level), placed(level, crumpled)
         for _ in range(2):
             parts.move(x)
-            numbers = parts.faces[2].numpy()
+            numbers = np.asarray(parts.faces[2].numpy(), dtype=np.int64)
             corners = x.numpy()[level.triangles.numpy()[numbers]]
             np.testing.assert_array_equal(parts.face_boxes[0].numpy(), corners.min(axis=1))
             np.testing.assert_array_equal(parts.face_boxes[1].numpy(), corners.max(axis=1))
