@@ -44,6 +44,8 @@ AHEAD = 0.5
 """How much farther than the thickness it is looked for pairs above the cage, in mean edges: the move of a round."""
 STALE, FEW = 0.2, 1e-3
 """Pairs are found anew once more than this part of the vertices has moved by more than so many edges."""
+LOCAL = 0.2
+"""Part of the vertices that may have moved for crossings to be looked for beside those only."""
 OUT = 0.5
 """How far crossing parts are moved past one another in a round, in mean edges."""
 FRONTAL = 0.3
@@ -58,11 +60,13 @@ class ClothState:
         x: Positions [m].
         crossings: What crosses there.
         near: Whether any parts are near enough to cross.
+        version: How often x had been written to.
     """
 
     x: Float[Tensor, "vertices 3"]
     crossings: Crossings
     near: bool = True
+    version: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,17 +159,22 @@ class ClothView:
         return self.look(self._base)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ClothState:
-        """Find what crosses at x; the answer is kept for the same tensor."""
-        if self._looked is None or self._looked.x is not x:
-            self._looked = self._look(x)
+        """Find what crosses at x; the answer is kept for the same tensor, unless it was written to since."""
+        if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
+            self._looked = self._look(x, self._looked)
         return self._looked
 
-    def _look(self, x: Tensor) -> ClothState:
+    def _look(self, x: Tensor, known: ClothState | None) -> ClothState:
+        """Find what crosses; where few vertices have moved since what is known, only beside them."""
         busy = self._regions.busy(x, 0.0)
         if not bool(busy.any()):
-            return ClothState(x, _nothing(x), near=False)
+            return ClothState(x, Crossings.none(x.device), near=False, version=x._version)
         self._mesh.move(x)
-        return ClothState(x, self._mesh.crossings(busy))
+        if known is not None and known.version == known.x._version and known.crossings.all_listed:
+            moved = (x != known.x).any(dim=1)
+            if float(moved.to(x.dtype).mean()) < LOCAL:
+                return ClothState(x, self._mesh.crossings_since(known.crossings, moved, busy), version=x._version)
+        return ClothState(x, self._mesh.crossings(busy), version=x._version)
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | Spheres | None:
         """The force between parts that are near one another, or None where no parts are.
@@ -208,7 +217,7 @@ class ClothView:
         Pairs found before serve again while hardly anything has moved; where nothing crossed at the start of a level,
         only its end is looked at again.
         """
-        known, none = self._found, _nothing(x)
+        known, none = self._found, Crossings.none(x.device)
         if known is not None and not self.tangled:
             moved = (x - known.x).norm(dim=1) > STALE * self._level.spacing
             if float(moved.to(x.dtype).mean()) < FEW:
@@ -217,8 +226,8 @@ class ClothView:
         if not bool(busy.any()):
             self._found = None
             return None, none
+        crossings = self.look(x).crossings if self._sides is None or self.tangled else none
         self._mesh.move(x)
-        crossings = self._mesh.crossings(busy) if self._sides is None or self.tangled else none
         pairs = self._mesh.pairs(busy, torch.full_like(self._level.spacing, self._reach))
         self._found = _Found(x, pairs)
         return pairs, crossings
@@ -249,10 +258,12 @@ class ClothView:
             back = torch.zeros_like(zone)
             back[corners[new].reshape(-1)] = True
             if attempt < SMOOTHINGS:
-                shift = self._smoothed(shift, self._mesh.grown(back, attempt + 1), passes=4 << attempt)
+                new_shift = self._smoothed(shift, self._mesh.grown(back, attempt + 1), passes=4 << attempt)
             else:
-                shift = shift * self._falling_off(back, attempt - SMOOTHINGS + 1)
-            state = self.look(good.x + shift)
+                new_shift = shift * self._falling_off(back, attempt - SMOOTHINGS + 1)
+            # What is not mended keeps its place to the last bit, and need not be looked at again.
+            still = (new_shift == shift).all(dim=1, keepdim=True)
+            shift, state = new_shift, self.look(torch.where(still, state.x, good.x + new_shift))
             best = min(best, state, key=lambda each: (self._excess(each, good), each.crossings.count))
         return best
 
@@ -330,7 +341,9 @@ class ClothView:
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
         distance = at_input.norm(dim=1)
         turned = (normal * at_start).sum(dim=1) < -TURNED * at_start.norm(dim=1)
-        wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), turned ^ swapped)
+        wrong = turned ^ swapped
+        if bool(ordered.any()):
+            wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), wrong)
         normal = torch.where(wrong.unsqueeze(1), -normal, normal)
         thickness = self._thickness[garment].mean(dim=1)
         offset = torch.minimum(thickness, torch.maximum(distance, LEAST_OFFSET * thickness))
@@ -364,12 +377,6 @@ class ClothView:
         cosine = (out * normal).sum(dim=1) * self._lasting.outward[owner]
         cosine = torch.where(first_is_outer, cosine, -cosine)
         return cosine < -FRONTAL
-
-
-def _nothing(x: Tensor) -> Crossings:
-    """No crossings."""
-    none = torch.zeros(0, dtype=torch.int64, device=x.device)
-    return Crossings(none, none, 0)
 
 
 def _swapped(

@@ -12,12 +12,15 @@ import scipy.sparse as sp
 import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csgraph
 from torch import Tensor
 
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges
-from .proximity import edges_near, faces_near, pierced
+from .cluster_kernels import clusters_beside, pierced
+from .clusters import ClusteredParts
+from .proximity import edges_near, faces_near, vertex_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,17 @@ class Crossings:
     face: Int[Tensor, " crossings"]
     count: int
 
+    @staticmethod
+    def none(device: torch.device) -> Crossings:
+        """No crossings."""
+        empty = torch.zeros(0, dtype=torch.int64, device=device)
+        return Crossings(empty, empty, 0)
+
+    @property
+    def all_listed(self) -> bool:
+        """Whether no edge passes through more faces than are listed."""
+        return self.count == len(self.edge)
+
 
 class ClothMesh:
     """The faces and edges of a level in a hierarchy that moves with them.
@@ -74,40 +88,53 @@ class ClothMesh:
         self._position = level.rest.to(torch.float32).contiguous().clone()
         self._normal = torch.zeros_like(self._position)
         self.triangles = level.triangles.long()
-        self._sides = _owned_sides(edges, triangles)
+        self._clusters = ClusteredParts(level, self.beside, _owned_sides(edges, triangles), meets=meets)
         self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
         self._static = {
             "rest": _vectors(level.rest.to(torch.float32).contiguous()),
-            "edges": wp.array(edges, dtype=wp.vec2i, device=level.device),
-            "triangles": wp.array(triangles, dtype=wp.vec3i, device=level.device),
-            "sides": wp.array(self._sides, dtype=wp.vec3i, device=level.device),
             "starts": wp.array(self.beside.indptr.astype(np.int32), dtype=wp.int32, device=level.device),
             "ring": wp.array(self.beside.indices.astype(np.int32), dtype=wp.int32, device=level.device),
-            "garment": wp.from_torch(level.vertex_garment.contiguous()),
-            "meets": wp.array(np.asarray(meets).astype(np.int32).ravel(), dtype=wp.int32, device=level.device),
         }
-        indices = wp.array(triangles.ravel(), dtype=wp.int32, device=level.device)
-        self._mesh = wp.Mesh(points=_vectors(self._position), indices=indices)
+
+        corner = np.argsort(triangles.ravel(), kind="stable")
+        starts = np.concatenate([[0], np.cumsum(np.bincount(triangles.ravel(), minlength=level.vertex_count))])
+        about = [wp.array(each.astype(np.int32), dtype=wp.int32, device=level.device) for each in (starts, corner // 3)]
+        about.append(wp.array(triangles, dtype=wp.vec3i, device=level.device))
+        points = [_vectors(each) for each in (self._position, self._normal)]
+        self._find_normals = Launch(
+            vertex_normals, level.vertex_count, [*about, *points], device=level.device, lanes=level.lanes
+        )
+        self._has_normals = False
+        self._at: tuple[Tensor, int] | None = None
 
     @cached_property
     def within_two(self) -> sp.csr_matrix:
         """Which vertices are at most two edges apart."""
         return sp.csr_matrix(self.beside @ self.beside + self.beside)
 
+    @cached_property
+    def whole(self) -> np.ndarray:
+        """What each vertex hangs together with: a number of each piece, shape (V,)."""
+        return joined_by(self.level.edges.cpu().numpy(), self.level.vertex_count)
+
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """Take positions [m]; what is asked afterwards is asked of them."""
+        """Take positions [m]; what is asked afterwards is asked of them.
+
+        Nothing is done for the tensor taken last, unless it was written to since.
+        """
+        if self._at is not None and self._at[0] is x and self._at[1] == x._version:
+            return
+        self._at = x, x._version
         self._position.copy_(x)
-        self._mesh.refit()
+        self._clusters.move(self._position)
+        self._has_normals = False
 
     def normals(self) -> Float[Tensor, "vertices 3"]:
         """Unit vertex normals of the authored winding."""
-        corner = self._position[self.triangles]
-        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        total = torch.zeros_like(self._position)
-        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
-        for i in range(3):
-            total.index_put_((self.triangles[:, i],), area, accumulate=True)
-        return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
+        if not self._has_normals:
+            self._find_normals({})
+            self._has_normals = True
+        return self._normal
 
     def pairs(self, busy: Bool[Tensor, " vertices"], reach: Float[Tensor, " vertices"]) -> Pairs:
         """The closest parts above and below what is busy.
@@ -119,15 +146,13 @@ class ClothMesh:
         Returns:
             Vertex-face pairs, then edge-edge pairs; an edge-edge pair occurs once.
         """
-        self._normal.copy_(self.normals())
+        self.normals()
         limit = reach.to(torch.float32).contiguous()
-        of_faces = self._vertex_face(torch.nonzero(busy).squeeze(1).to(torch.int32), limit)
+        of_faces = self._vertex_face(busy, limit)
         # An edge near another has a vertex near a face, or next to one that is.
         close = torch.zeros_like(busy)
         close[of_faces[0].reshape(-1)] = True
-        close = self.grown(close, 1)
-        ends = self.level.edges.long()
-        of_edges = self._edge_edge(torch.nonzero(close[ends].any(dim=1)).squeeze(1).to(torch.int32), limit)
+        of_edges = self._edge_edge(self.grown(close, 1), limit)
         face = torch.zeros(len(of_faces[0]) + len(of_edges[0]), dtype=torch.bool, device=busy.device)
         face[: len(of_faces[0])] = True
         corners, weight = (torch.cat(both) for both in zip(of_faces, of_edges, strict=True))
@@ -135,16 +160,33 @@ class ClothMesh:
 
     def crossings(self, busy: Bool[Tensor, " vertices"]) -> Crossings:
         """Edges with a busy end that pass through faces."""
-        ends = self.level.edges.long()
-        ask = torch.nonzero(busy[ends].any(dim=1)).squeeze(1).to(torch.int32)
-        count = torch.zeros(len(ask), dtype=torch.int32, device=ask.device)
-        faces = torch.full((len(ask), 4), -1, dtype=torch.int32, device=ask.device)
-        if len(ask):
-            arrays = [self._static[name] for name in ("edges", "triangles", "garment", "meets")]
-            inputs = [wp.from_torch(ask), _vectors(self._position), *arrays, wp.int32(self._garments)]
-            self._run(pierced, len(ask), [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
-        listed = torch.nonzero(faces >= 0)
-        return Crossings(ask.long()[listed[:, 0]], faces.long()[listed[:, 0], listed[:, 1]], int(count.sum()))
+        count = torch.zeros(len(self.level.edges), dtype=torch.int32, device=busy.device)
+        faces = torch.empty((len(count), 4), dtype=torch.int32, device=busy.device)
+        clusters, inputs = self._clusters, [_vectors(self._position), _flags(busy)]
+        inputs += [*clusters.edges, *clusters.edge_boxes, *clusters.faces, *clusters.face_boxes]
+        clusters.run(pierced, [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
+        edge = torch.nonzero(count).squeeze(1)
+        listed = torch.nonzero(torch.arange(4, device=edge.device) < count[edge].unsqueeze(1))
+        return Crossings(edge[listed[:, 0]], faces[edge].long()[listed[:, 0], listed[:, 1]], int(count.sum()))
+
+    def crossings_since(
+        self, known: Crossings, moved: Bool[Tensor, " vertices"], busy: Bool[Tensor, " vertices"]
+    ) -> Crossings:
+        """What crosses now, by what crossed before some vertices moved: only what lies beside those is asked.
+
+        Args:
+            known: What crossed, all of it listed.
+            moved: Vertices that have moved since.
+            busy: As `crossings` takes it.
+        """
+        near, clusters = moved.clone(), self._clusters
+        clusters.run(clusters_beside, [_flags(moved), *clusters.faces[:2], _flags(near)])
+        found = self.crossings(near & busy)
+        ends = self.level.edges.long()[known.edge]
+        kept = ~near[ends].any(dim=1) & ~moved[self.triangles[known.face]].any(dim=1)
+        edge, face = torch.cat([known.edge[kept], found.edge]), torch.cat([known.face[kept], found.face])
+        order = torch.argsort(edge, stable=True)
+        return Crossings(edge[order], face[order], found.count + int(kept.sum()))
 
     def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
         """Vertices at most some edges away from given ones."""
@@ -165,32 +207,36 @@ class ClothMesh:
         np.add.at(table, (ends.min(axis=1), ends.max(axis=1)), 1)
         return table
 
-    def _vertex_face(self, ask: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+    def _vertex_face(self, asked: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
         """Corners and weights of the pairs of a vertex and a face."""
-        face = torch.full((len(ask), 2), -1, dtype=torch.int32, device=ask.device)
-        either = [torch.zeros((len(ask), 3), dtype=torch.float32, device=ask.device) for _ in range(2)]
-        if len(ask):
-            outputs = [wp.from_torch(face, dtype=wp.vec2i), *[_vectors(each) for each in either]]
-            self._run(faces_near, len(ask), [*self._asked(ask, reach, "triangles"), *outputs])
+        face = torch.full((len(asked), 2), -1, dtype=torch.int32, device=asked.device)
+        best = torch.empty((len(asked), 2), dtype=torch.float32, device=asked.device)
+        either = [torch.empty((len(asked), 3), dtype=torch.float32, device=asked.device) for _ in range(2)]
+        clusters = self._clusters
+        inputs = [*self._asked(asked, reach), *clusters.vertices, *clusters.faces, *clusters.face_boxes]
+        outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(face, dtype=wp.vec2i)]
+        clusters.run(faces_near, [*inputs, *outputs, *[_vectors(each) for each in either]])
         corners, weights = [], []
         for side, weight in enumerate(either):
             found = torch.nonzero(face[:, side] >= 0).squeeze(1)
             three = self.triangles[face[found, side].long()]
-            corners.append(torch.cat([ask[found].long().unsqueeze(1), three], dim=1))
+            corners.append(torch.cat([found.unsqueeze(1), three], dim=1))
             weights.append(torch.cat([torch.ones_like(weight[found, :1]), -weight[found]], dim=1))
         return torch.cat(corners), torch.cat(weights)
 
-    def _edge_edge(self, ask: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners and weights of the pairs of two edges."""
-        other = torch.full((len(ask), 2), -1, dtype=torch.int32, device=ask.device)
-        either = [torch.zeros((len(ask), 2), dtype=torch.float32, device=ask.device) for _ in range(2)]
-        if len(ask):
-            outputs = [wp.from_torch(other, dtype=wp.vec2i), *[wp.from_torch(each, dtype=wp.vec2f) for each in either]]
-            self._run(edges_near, len(ask), [*self._asked(ask, reach, "edges", "sides"), *outputs])
+    def _edge_edge(self, asked: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """Corners and weights of the pairs of two edges, of which one has an end that is asked."""
+        count = len(self.level.edges)
+        other = torch.full((count, 2), -1, dtype=torch.int32, device=asked.device)
+        best, *either = (torch.empty((count, 2), dtype=torch.float32, device=asked.device) for _ in range(3))
+        pairs = [wp.from_torch(other, dtype=wp.vec2i), *[wp.from_torch(each, dtype=wp.vec2f) for each in either]]
+        inputs = [*self._asked(asked, reach), *self._clusters.edges, *self._clusters.edge_boxes]
+        inputs.append(wp.from_torch(best, dtype=wp.vec2f))
+        self._clusters.run(edges_near, [*inputs, *pairs])
         first, second, along = [], [], []
         for side, place in enumerate(either):
             found = torch.nonzero(other[:, side] >= 0).squeeze(1)
-            first.append(ask[found].long())
+            first.append(found)
             second.append(other[found, side].long())
             along.append(place[found])
         a, b, st = torch.cat(first), torch.cat(second), torch.cat(along)
@@ -201,14 +247,16 @@ class ClothMesh:
         ends = self.level.edges.long()
         return torch.cat([ends[a], ends[b]], dim=1), torch.stack([1 - s, s, t - 1, -t], dim=1)
 
-    def _asked(self, ask: Tensor, reach: Tensor, *elements: str) -> list[object]:
+    def _asked(self, asked: Tensor, reach: Tensor) -> list[object]:
         """What both proximity kernels are told first."""
-        moving = [_vectors(self._position), _vectors(self._normal), self._static["rest"]]
-        lasting = [self._static[name] for name in (*elements, "starts", "ring", "garment", "meets")]
-        return [wp.from_torch(ask), wp.from_torch(reach), *moving, *lasting, wp.int32(self._garments)]
+        moving = [_vectors(self._position), _flags(asked), wp.from_torch(reach), _vectors(self._normal)]
+        return [self._static["starts"], self._static["ring"], *moving, self._static["rest"]]
 
-    def _run(self, kernel: wp.Kernel, count: int, inputs: list[object]) -> None:
-        Launch(kernel, count, [self._mesh.id, *inputs], device=self.level.device, lanes=self.level.lanes)({})
+
+def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
+    """The piece of each of some vertices, by the edges that hold them together, shape (V,)."""
+    graph = sp.coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return csgraph.connected_components(graph, directed=False)[1]
 
 
 def _adjacency(edges: np.ndarray, count: int) -> sp.csr_matrix:
@@ -241,3 +289,7 @@ def _opposite(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 def _vectors(tensor: Tensor) -> wp.array:
     return wp.from_torch(tensor, dtype=wp.vec3f, requires_grad=False)
+
+
+def _flags(mask: Tensor) -> wp.array:
+    return wp.from_torch(mask.contiguous())

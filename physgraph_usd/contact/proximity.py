@@ -1,4 +1,4 @@
-"""Which parts of the cloth are near which, and which edges pass through which faces: one hierarchy a level.
+"""Which parts of the cloth are near which, asked by clusters of faces.
 
 Queries are exact for what is asked: the closest face above and below a vertex, the closest edge above and below an
 edge. Parts that share a corner, or are one edge apart, are no pairs.
@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..mesh.piercing import passes_through
+from .cluster_kernels import FAR, are_apart, has, overlap
 
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
+POINT = 1e-12
+"""Square of the length under which an edge is a point [m^2]."""
 IN_PLANE = 0.5
 """Cosine to the normal under which a neighbour lies in the plane of the cloth rather than above or below it."""
 CLOSED_IN = 0.5
 """Distance over rest distance above which such a neighbour is where it belongs."""
-SLOTS = 4
-"""Faces kept for each edge that passes through some."""
 
 
 @wp.func
@@ -71,9 +71,21 @@ def are_beside(e: wp.vec2i, g: wp.vec2i, starts: wp.array(dtype=wp.int32), ring:
 
 
 @wp.func
-def is_inside(s: float, t: float):
-    """Whether both places are inside their edges."""
-    return s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
+def places_inside(a: wp.vec3f, b: wp.vec3f, c: wp.vec3f, d: wp.vec3f):
+    """Where along two edges they are closest, if inside both; else a negative place (Ericson 2005, 5.1.9)."""
+    along, other, way = b - a, d - c, a - c
+    length, width, both = wp.dot(along, along), wp.dot(other, other), wp.dot(along, other)
+    first, second = wp.dot(along, way), wp.dot(other, way)
+    whole = length * width - both * both
+    part = both * second - first * width
+    none = wp.vec2f(-1.0, -1.0)
+    if part <= 0.0 or part >= whole or wp.min(length, width) <= POINT:
+        return none
+    s = part / whole
+    t = (both * s + second) / width
+    if t <= 0.0 or t >= 1.0:
+        return none
+    return wp.vec2f(s, t)
 
 
 @wp.func
@@ -88,252 +100,275 @@ def belongs(distance: float, rest_distance: float, cosine: float):
     return wp.abs(cosine) < IN_PLANE and distance > CLOSED_IN * rest_distance
 
 
-@wp.kernel
-def faces_near(
-    first: wp.int32,
-    mesh: wp.uint64,
-    ask: wp.array(dtype=wp.int32),
+@wp.func
+def share_an_end(e: wp.vec2i, g: wp.vec2i):
+    """Whether two edges meet at a vertex."""
+    return e[0] == g[0] or e[0] == g[1] or e[1] == g[0] or e[1] == g[1]
+
+
+@wp.func
+def nearer(distance: float, part: wp.int32, best: float, known: wp.int32):
+    """Whether a part is nearer than the nearest known; of two as near the one with the lower number is."""
+    return distance < best or (distance == best and part < known)
+
+
+@wp.func
+def box_of_vertices(
+    begin: wp.int32,
+    end: wp.int32,
+    vertices: wp.array(dtype=wp.int32),
+    asked: wp.array(dtype=wp.bool),
     reach: wp.array(dtype=wp.float32),
     x: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
+):
+    """The box within reach of the vertices asked, for which nothing is known from now on."""
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(begin, end):
+        v = vertices[k]
+        if asked[v]:
+            best[v] = wp.vec2f(reach[v], reach[v])
+            least = wp.min(least, x[v] - wp.vec3f(reach[v]))
+            most = wp.max(most, x[v] + wp.vec3f(reach[v]))
+    return least, most
+
+
+@wp.func
+def is_own_face(
+    v: wp.int32,
+    t: wp.vec3i,
+    weight: wp.vec3f,
+    distance: float,
+    cosine: float,
     rest: wp.array(dtype=wp.vec3f),
-    triangles: wp.array(dtype=wp.vec3i),
     starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
-    garment: wp.array(dtype=wp.int32),
-    meets: wp.array(dtype=wp.int32),
-    garments: wp.int32,
-    face: wp.array(dtype=wp.vec2i),
-    above: wp.array(dtype=wp.vec3f),
-    below: wp.array(dtype=wp.vec3f),
+    beside: wp.array(dtype=wp.int32),
 ):
-    """For each vertex asked, the closest face on either side within its reach, -1 where there is none."""
-    i = first + wp.tid()
-    v = ask[i]
-    p, n = x[v], normal[v]
-    far = wp.float32(reach[v])
-    best_up = wp.float32(far)
-    best_down = wp.float32(far)
-    up = wp.int32(-1)
-    down = wp.int32(-1)
-    grow = wp.vec3f(far, far, far)
-    query = wp.mesh_query_aabb(mesh, p - grow, p + grow)
-    f = wp.int32(0)
-    while wp.mesh_query_aabb_next(query, f):
-        t = triangles[f]
-        if meets[garment[v] * garments + garment[t[0]]] == 0:
-            continue
-        weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
-        way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
-        distance = wp.length(way)
-        if distance >= wp.max(best_up, best_down) or distance < LEAST:
-            continue
-        if is_beside(v, t[0], starts, ring) or is_beside(v, t[1], starts, ring) or is_beside(v, t[2], starts, ring):
-            continue
-        cosine = wp.dot(way, n) / distance
-        if garment[v] == garment[t[0]]:
-            at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
-            if belongs(distance, wp.length(at_rest), cosine):
-                continue
-        if cosine > 0.0:
-            if distance < best_up:
-                best_up = distance
-                up = f
-                above[i] = weight
-        elif distance < best_down:
-            best_down = distance
-            down = f
-            below[i] = weight
-    face[i] = wp.vec2i(up, down)
+    """Whether a face of the same garment is next to the vertex, or in its plane, where it belongs."""
+    at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
+    if belongs(distance, wp.length(at_rest), cosine):
+        return True
+    if is_beside(v, t[0], starts, beside) or is_beside(v, t[1], starts, beside):
+        return True
+    return is_beside(v, t[2], starts, beside)
+
+
+@wp.func
+def keep_nearest(
+    v: wp.int32,
+    part: wp.int32,
+    distance: float,
+    cosine: float,
+    best: wp.array(dtype=wp.vec2f),
+    found: wp.array(dtype=wp.vec2i),
+):
+    """Note a part that is nearer than what is known on its side: 1 above, -1 below, 0 where it is not."""
+    if cosine > 0.0:
+        if nearer(distance, part, best[v][0], found[v][0]):
+            best[v] = wp.vec2f(distance, best[v][1])
+            found[v] = wp.vec2i(part, found[v][1])
+            return 1
+    elif nearer(distance, part, best[v][1], found[v][1]):
+        best[v] = wp.vec2f(best[v][0], distance)
+        found[v] = wp.vec2i(found[v][0], part)
+        return -1
+    return 0
 
 
 @wp.kernel
-def edges_near(  # noqa: C901 - one query, each candidate refused as early as can be
-    first: wp.int32,
-    mesh: wp.uint64,
-    ask: wp.array(dtype=wp.int32),
-    reach: wp.array(dtype=wp.float32),
-    x: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    rest: wp.array(dtype=wp.vec3f),
-    edges: wp.array(dtype=wp.vec2i),
-    sides: wp.array(dtype=wp.vec3i),
-    starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
-    garment: wp.array(dtype=wp.int32),
-    meets: wp.array(dtype=wp.int32),
-    garments: wp.int32,
-    other: wp.array(dtype=wp.vec2i),
-    above: wp.array(dtype=wp.vec2f),
-    below: wp.array(dtype=wp.vec2f),
-):
-    """For each edge asked, the closest edge on either side within reach, inside both; -1 where there is none.
-
-    ``sides`` are the edges that each face owns, -1 for those that another face owns.
-    """
-    i = first + wp.tid()
-    e = ask[i]
-    a, b = edges[e][0], edges[e][1]
-    far = 0.5 * (reach[a] + reach[b])
-    n = wp.normalize(normal[a] + normal[b])
-    best_up = wp.float32(far)
-    best_down = wp.float32(far)
-    up = wp.int32(-1)
-    down = wp.int32(-1)
-    grow = wp.vec3f(far)
-    query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]) - grow, wp.max(x[a], x[b]) + grow)
-    f = wp.int32(0)
-    while wp.mesh_query_aabb_next(query, f):
-        for side in range(3):
-            g = sides[f][side]
-            c = edges[wp.max(g, 0)][0]
-            if g < 0 or g == e or meets[garment[a] * garments + garment[c]] == 0:
-                continue
-            found = wp.closest_point_edge_edge(x[a], x[b], x[c], x[edges[g][1]], 1.0e-12)
-            s, t, distance = found[0], found[1], found[2]
-            if not is_inside(s, t) or distance >= wp.max(best_up, best_down) or distance < LEAST:
-                continue
-            if are_beside(edges[e], edges[g], starts, ring):
-                continue
-            cosine = wp.dot(between(x, edges[e], edges[g], s, t), n) / distance
-            if garment[a] == garment[c]:
-                if belongs(distance, wp.length(between(rest, edges[e], edges[g], s, t)), cosine):
-                    continue
-            if cosine > 0.0:
-                if distance < best_up:
-                    best_up = distance
-                    up = g
-                    above[i] = wp.vec2f(s, t)
-            elif distance < best_down:
-                best_down = distance
-                down = g
-                below[i] = wp.vec2f(s, t)
-    other[i] = wp.vec2i(up, down)
-
-
-@wp.kernel
-def pierced(
-    first: wp.int32,
-    mesh: wp.uint64,
-    ask: wp.array(dtype=wp.int32),
-    x: wp.array(dtype=wp.vec3f),
-    edges: wp.array(dtype=wp.vec2i),
-    triangles: wp.array(dtype=wp.vec3i),
-    garment: wp.array(dtype=wp.int32),
-    meets: wp.array(dtype=wp.int32),
-    garments: wp.int32,
-    count: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec4i),
-):
-    """For each edge asked, how many faces it passes through, and the first of them."""
-    i = first + wp.tid()
-    a, b = edges[ask[i]][0], edges[ask[i]][1]
-    found = wp.vec4i(-1, -1, -1, -1)
-    total = wp.int32(0)
-    query = wp.mesh_query_aabb(mesh, wp.min(x[a], x[b]), wp.max(x[a], x[b]))
-    f = wp.int32(0)
-    while wp.mesh_query_aabb_next(query, f):
-        t = triangles[f]
-        if a == t[0] or a == t[1] or a == t[2] or b == t[0] or b == t[1] or b == t[2]:
-            continue
-        if meets[garment[a] * garments + garment[t[0]]] == 0:
-            continue
-        if passes_through(x, edges[ask[i]], t):
-            if total < SLOTS:
-                found[total] = f
-            total += 1
-    count[i] = total
-    faces[i] = found
-
-
-@wp.kernel
-def patches_meet(
+def faces_near(  # noqa: C901 - one query, each candidate refused as early as can be
     first: wp.int32,
     tree: wp.uint64,
     low: wp.array(dtype=wp.vec3f),
     high: wp.array(dtype=wp.vec3f),
-    starts: wp.array(dtype=wp.int32),
-    near: wp.array(dtype=wp.int32),
-    garment: wp.array(dtype=wp.int32),
+    cluster_garment: wp.array(dtype=wp.int32),
+    ring_starts: wp.array(dtype=wp.int32),
+    ring: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
-    flag: wp.array(dtype=wp.int32),
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+    x: wp.array(dtype=wp.vec3f),
+    asked: wp.array(dtype=wp.bool),
+    reach: wp.array(dtype=wp.float32),
+    normal: wp.array(dtype=wp.vec3f),
+    rest: wp.array(dtype=wp.vec3f),
+    first_vertex: wp.array(dtype=wp.int32),
+    vertices: wp.array(dtype=wp.int32),
+    first_face: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    number: wp.array(dtype=wp.int32),
+    face_low: wp.array(dtype=wp.vec3f),
+    face_high: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
+    face: wp.array(dtype=wp.vec2i),
+    above: wp.array(dtype=wp.vec3f),
+    below: wp.array(dtype=wp.vec3f),
 ):
-    """Whether the box of a patch meets that of another patch that is no near neighbour of it."""
+    """For each vertex asked of a cluster, the closest face on either side within its reach, -1 where there is none."""
     i = first + wp.tid()
-    query = wp.bvh_query_aabb(tree, low[i], high[i])
+    begin, end = first_vertex[i], first_vertex[i + 1]
+    least, most = box_of_vertices(begin, end, vertices, asked, reach, x, best)
+    if least[0] > most[0]:
+        return
+    query = wp.bvh_query_aabb(tree, least, most)
     j = wp.int32(0)
-    found = wp.int32(0)
     while wp.bvh_query_next(query, j):
-        if found == 0 and meets[garment[i] * garments + garment[j]] == 1:
-            if not is_beside(i, j, starts, near):
-                found = 1
-    flag[i] = found
+        same = cluster_garment[i] == cluster_garment[j]
+        if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 1.0):
+            continue
+        for k in range(begin, end):
+            v = vertices[k]
+            grow = wp.vec3f(wp.max(best[v][0], best[v][1]))
+            if not asked[v] or not overlap(x[v] - grow, x[v] + grow, low[j], high[j]):
+                continue
+            for m in range(first_face[j], first_face[j + 1]):
+                t = triangles[m]
+                if not overlap(x[v] - grow, x[v] + grow, face_low[m], face_high[m]) or has(t, v):
+                    continue
+                weight = closest_on_triangle(x[v], x[t[0]], x[t[1]], x[t[2]])
+                way = x[v] - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
+                distance = wp.length(way)
+                if distance > wp.max(best[v][0], best[v][1]) or distance < LEAST:
+                    continue
+                cosine = wp.dot(way, normal[v]) / distance
+                if same:
+                    if is_own_face(v, t, weight, distance, cosine, rest, starts, beside):
+                        continue
+                side = keep_nearest(v, number[m], distance, cosine, best, face)
+                if side > 0:
+                    above[v] = weight
+                elif side < 0:
+                    below[v] = weight
 
 
 @wp.func
-def area_of(x: wp.array(dtype=wp.vec3f), t: wp.vec3i):
-    """Twice the area of a triangle along its normal."""
-    return wp.cross(x[t[1]] - x[t[0]], x[t[2]] - x[t[0]])
-
-
-@wp.kernel
-def patch_areas(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    triangles: wp.array(dtype=wp.vec3i),
-    x: wp.array(dtype=wp.vec3f),
-    total: wp.array(dtype=wp.vec3f),
+def box_of_edges(
+    begin: wp.int32,
+    end: wp.int32,
+    edges: wp.array(dtype=wp.vec2i),
+    number: wp.array(dtype=wp.int32),
+    asked: wp.array(dtype=wp.bool),
+    reach: wp.array(dtype=wp.float32),
+    edge_low: wp.array(dtype=wp.vec3f),
+    edge_high: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
 ):
-    """The area of each patch's triangles together, along their normals."""
-    i = first + wp.tid()
-    out = wp.vec3f(0.0)
-    for k in range(starts[i], starts[i + 1]):
-        out += area_of(x, triangles[members[k]])
-    total[i] = out
+    """The box within reach of the edges with an end asked, for which nothing is known from now on."""
+    least = wp.vec3f(FAR)
+    most = wp.vec3f(-FAR)
+    for k in range(begin, end):
+        a, b = edges[k][0], edges[k][1]
+        if asked[a] or asked[b]:
+            far = 0.5 * (reach[a] + reach[b])
+            best[number[k]] = wp.vec2f(far, far)
+            least = wp.min(least, edge_low[k] - wp.vec3f(far))
+            most = wp.max(most, edge_high[k] + wp.vec3f(far))
+    return least, most
+
+
+@wp.func
+def is_own_edge(
+    e: wp.vec2i,
+    g: wp.vec2i,
+    places: wp.vec2f,
+    distance: float,
+    cosine: float,
+    rest: wp.array(dtype=wp.vec3f),
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+):
+    """Whether an edge of the same garment is next to another, or in its plane, where it belongs."""
+    if belongs(distance, wp.length(between(rest, e, g, places[0], places[1])), cosine):
+        return True
+    return are_beside(e, g, starts, beside)
 
 
 @wp.kernel
-def rings_turn(
+def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
     first: wp.int32,
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    cluster_garment: wp.array(dtype=wp.int32),
     ring_starts: wp.array(dtype=wp.int32),
     ring: wp.array(dtype=wp.int32),
-    starts: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    triangles: wp.array(dtype=wp.vec3i),
-    x: wp.array(dtype=wp.vec3f),
-    total: wp.array(dtype=wp.vec3f),
-    least: wp.float32,
     turns: wp.array(dtype=wp.int32),
+    around: wp.array(dtype=wp.int32),
+    meets: wp.array(dtype=wp.int32),
+    garments: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+    x: wp.array(dtype=wp.vec3f),
+    asked: wp.array(dtype=wp.bool),
+    reach: wp.array(dtype=wp.float32),
+    normal: wp.array(dtype=wp.vec3f),
+    rest: wp.array(dtype=wp.vec3f),
+    first_edge: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=wp.vec2i),
+    number: wp.array(dtype=wp.int32),
+    edge_low: wp.array(dtype=wp.vec3f),
+    edge_high: wp.array(dtype=wp.vec3f),
+    best: wp.array(dtype=wp.vec2f),
+    other: wp.array(dtype=wp.vec2i),
+    above: wp.array(dtype=wp.vec2f),
+    below: wp.array(dtype=wp.vec2f),
 ):
-    """Whether a triangle of the ring of patches round each is farther from the ring's mean normal than a cosine."""
+    """For each edge with an end asked, the closest edge on either side within reach, inside both; -1 for none."""
     i = first + wp.tid()
-    mean = wp.vec3f(0.0)
-    for k in range(ring_starts[i], ring_starts[i + 1]):
-        mean += total[ring[k]]
-    mean = wp.normalize(mean)
-    found = wp.int32(0)
-    for k in range(ring_starts[i], ring_starts[i + 1]):
-        for m in range(starts[ring[k]], starts[ring[k] + 1]):
-            if found == 0:
-                area = area_of(x, triangles[members[m]])
-                if wp.dot(area, mean) <= least * wp.length(area):
-                    found = 1
-    turns[i] = found
+    begin, end = first_edge[i], first_edge[i + 1]
+    least, most = box_of_edges(begin, end, edges, number, asked, reach, edge_low, edge_high, best)
+    if least[0] > most[0]:
+        return
+    query = wp.bvh_query_aabb(tree, least, most)
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        same = cluster_garment[i] == cluster_garment[j]
+        if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 1.0):
+            continue
+        for k in range(begin, end):
+            a, b, e = edges[k][0], edges[k][1], number[k]
+            if not (asked[a] or asked[b]):
+                continue
+            grow = wp.vec3f(wp.max(best[e][0], best[e][1]))
+            lower, upper = edge_low[k] - grow, edge_high[k] + grow
+            if not overlap(lower, upper, low[j], high[j]):
+                continue
+            for m in range(first_edge[j], first_edge[j + 1]):
+                if not overlap(lower, upper, edge_low[m], edge_high[m]) or share_an_end(edges[k], edges[m]):
+                    continue
+                places = places_inside(x[a], x[b], x[edges[m][0]], x[edges[m][1]])
+                way = between(x, edges[k], edges[m], places[0], places[1])
+                distance = wp.length(way)
+                if places[0] < 0.0 or distance > wp.max(best[e][0], best[e][1]) or distance < LEAST:
+                    continue
+                cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
+                if same:
+                    if is_own_edge(edges[k], edges[m], places, distance, cosine, rest, starts, beside):
+                        continue
+                side = keep_nearest(e, number[m], distance, cosine, best, other)
+                if side > 0:
+                    above[e] = places
+                elif side < 0:
+                    below[e] = places
 
 
 @wp.kernel
-def any_of_ring(
+def vertex_normals(
     first: wp.int32,
-    ring_starts: wp.array(dtype=wp.int32),
-    ring: wp.array(dtype=wp.int32),
-    flag: wp.array(dtype=wp.int32),
-    out: wp.array(dtype=wp.int32),
+    starts: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.int32),
+    triangles: wp.array(dtype=wp.vec3i),
+    x: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
 ):
-    """Whether a patch of the ring round each is flagged."""
+    """The unit normal of each vertex: its faces' areas along their normals together."""
     i = first + wp.tid()
-    found = wp.int32(0)
-    for k in range(ring_starts[i], ring_starts[i + 1]):
-        found = wp.max(found, flag[ring[k]])
-    out[i] = found
+    total = wp.vec3f(0.0)
+    for k in range(starts[i], starts[i + 1]):
+        t = triangles[faces[k]]
+        total += wp.cross(x[t[1]] - x[t[0]], x[t[2]] - x[t[0]])
+    normal[i] = wp.normalize(total)

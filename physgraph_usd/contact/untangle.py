@@ -23,15 +23,13 @@ pieces turn round.
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Bool, Float
-from scipy.sparse import csgraph
 from torch import Tensor
 
 from ..forces.self_contact import Gaps
 from ..level import Level
-from .cloth_mesh import ClothMesh, Crossings
+from .cloth_mesh import ClothMesh, Crossings, joined_by
 
 GRAZING = 0.2
 """Least |N.E|: an edge that lies almost in the face would be sent far along the normal."""
@@ -101,18 +99,12 @@ def pieces_of(mesh: ClothMesh, crossings: Crossings) -> tuple[np.ndarray, np.nda
     ends = mesh.level.edges.cpu().numpy()
     kept = np.ones(len(ends), bool)
     kept[crossings.edge.cpu().numpy()] = False
-    whole, piece = (_labels(ends[which], count) for which in (np.ones(len(ends), bool), kept))
+    whole, piece = mesh.whole, joined_by(ends[kept], count)
     area = np.bincount(piece, mesh.level.vertex_area.double().cpu().numpy())
     first = np.unique(piece, return_index=True)[1]
     largest = np.zeros(int(whole.max()) + 1)
     np.maximum.at(largest, whole[first], area)
     return piece, area < largest[whole[first]], area
-
-
-def _labels(ends: np.ndarray, count: int) -> np.ndarray:
-    """Piece of each vertex, by the edges that hold it."""
-    graph = sp.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    return csgraph.connected_components(graph, directed=False)[1]
 
 
 def gaps_out(
