@@ -20,7 +20,7 @@ from ..colliders.base import Nearest, Surface
 from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
-from .measure import DEEP, Pierced, depths, longest_ways, penetration, pierced, pinched
+from .measure import DEEP, Pierced, depths, penetration, pierced, pinched
 from .room import room_above
 from .settings import ContactSettings
 
@@ -71,6 +71,7 @@ class _Track:
     known: Tensor
     longest: float
     held: Tensor | None = None
+    lost: Tensor | None = None
     looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
 
     def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
@@ -102,7 +103,11 @@ class _Track:
             near = _at(found, within)
             way = self.surface.exit(asked[within], near)
             distance[within], point[within], outward[within] = way.distance, way.point, way.normal
-            kept[within] = ~pinched(near, way, longest_ways(self.longest, self.held, which[within]))
+            held = None if self.held is None else self.held[which[within]]
+            lost = None if self.lost is None else self.lost[which[within]]
+            kept[within] = ~pinched(
+                self.surface, asked[within], near, way, longest=self.longest, held=held, lost=lost
+            )
         away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
         outward = outward * self._outward(which).unsqueeze(1)
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
@@ -200,6 +205,11 @@ class LevelBodies:
             inside |= depth > 0
             held |= pinned
         return inside, held
+
+    def lose(self, lost: Bool[Tensor, " vertices"]) -> None:
+        """From now on send these vertices of cloth between overlapping parts out of a body by short ways only."""
+        for track in self._tracks:
+            track.lost = lost
 
     def hold(self, held: Bool[Tensor, " vertices"] | None) -> None:
         """From now on leave these vertices where they are between overlapping parts of a body."""

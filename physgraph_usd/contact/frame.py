@@ -18,7 +18,7 @@ from ..level import Level
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
 from .metric import HeldMetric
-from .repair import repaired_cage
+from .repair import hidden_between, repaired_cage
 from .seams import Seams
 from .settings import ContactSettings
 
@@ -128,6 +128,8 @@ class FrameContact:
         if level.index not in self._views:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
+            if bodies is not None and self._cloth is not None and self.aim is not self._coarse:
+                bodies.lose(hidden_between(level, base, bodies, self._cloth.mesh(level)))
             cloth = self._cloth_at(level, base)
             if cloth is not None and level is self._levels[-1] and self._judge is not None:
                 cloth.allowed = self._judge.before
