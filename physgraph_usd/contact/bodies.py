@@ -270,9 +270,9 @@ class LevelBodies:
         for track in self._tracks:
             moved = (x - track.at).norm(dim=1)
             found = track.pierced(self._level, x, (track.known.abs() - moved).clamp_min(0.0))
-            held = ~self._level.free[:, 0] & (track.known < 0)
+            held = track.known < 0
             for corners in (self._level.edges.long()[found.edges], self._level.triangles.long()[found.triangles]):
-                # What a pin holds inside comes out at no height.
+                # What a pin or no room holds inside comes out at no height.
                 out[corners[~held[corners].any(dim=1)].reshape(-1)] = True
         return out
 

@@ -191,6 +191,7 @@ class FrameContact:
 
         Between overlapping parts of a body there is no room: what is pushed out there piles up in the crease.
         """
+        least = cloth.look(mended).crossings.count
         best = (cloth.look(x).crossings.count, x, told, self._held)
         held, out = torch.zeros_like(self._levels[-1].free[:, 0]), x
         for attempt in range(HOLDS):
@@ -198,10 +199,9 @@ class FrameContact:
             bodies.hold(held)
             out, moved = bodies.project(mended)
             count = cloth.look(out).crossings.count
-            if count >= best[0]:
-                break
-            best = (count, out, moved, held)
-            if not cloth.worse(out):
+            if count < best[0]:
+                best = (count, out, moved, held)
+            if count <= least:
                 break
         self._held = best[3]
         bodies.hold(self._held)
