@@ -20,6 +20,7 @@ from ..colliders.base import Nearest, Surface
 from ..colliders.sign import MARGIN, behind, signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
+from .corners import lift_over
 from .measure import DEEP, Pierced, depths, penetration, pierced, pinched
 from .room import room_above
 from .settings import ContactSettings
@@ -167,12 +168,11 @@ class LevelBodies:
             return None
         return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form)
 
-    def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, int | float]]:
+    def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], int]:
         """Move free vertices that are under the least clearance to it, and farther where a body comes through a face.
 
         Returns:
-            Positions [m]; x itself when none had to move; and how many moved, how far at most [mm] and in how many
-            passes.
+            Positions [m]; x itself when none had to move; and the passes that it took.
         """
         extra = torch.zeros_like(x[:, 0])
         out, passes = self._out(x, extra)
@@ -186,9 +186,12 @@ class LevelBodies:
             extra = torch.where(through & ~stuck, extra + LIFT * self._reach, extra)
             out = torch.where(stuck.unsqueeze(1), out, lifted)
             passes += more
-        shifts = (out - x).norm(dim=1)
-        far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
-        return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
+        for _ in range(self._settings.corners):
+            lifted = self._over_corners(out)
+            if lifted is out:
+                break
+            out, passes = lifted, passes + 1
+        return out, passes
 
     def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Free vertices moved to the least clearance, wherever bodies come through faces [m]."""
@@ -256,6 +259,36 @@ class LevelBodies:
         room = room_above(track.surface, foot, normal, reach=reach, lanes=self._level.lanes)
         return torch.minimum(wanted, 0.5 * room)
 
+    def _over_corners(self, x: Tensor) -> Tensor:
+        """Corners of faces that closed bodies come through moved towards where they do not; x itself without such."""
+        out = x
+        for track in self._tracks:
+            faces = self._pierced_faces(track, out) if track.surface.closed else []
+            if len(faces):
+                least = self._settings.clearance * track.offset
+                out = out + lift_over(track.surface, self._level, out + track.shift, faces, clearance=least)
+        if out is x:
+            return x
+        out = self.push_out(out)
+        stuck = self._depth(out) > self._depth(x).clamp_min(DEEP)
+        return torch.where(stuck.unsqueeze(1), x, out)
+
+    def _pierced_faces(self, track: _Track, x: Tensor) -> Tensor:
+        """Faces that a body comes through though none of their corners is left inside it."""
+        found = track.pierced(self._level, x, (track.known.abs() - (x - track.at).norm(dim=1)).clamp_min(0.0))
+        triangles, ends = self._level.triangles.long(), self._level.edges.long()[found.edges]
+        hit = torch.zeros(len(triangles), dtype=torch.bool, device=x.device)
+        hit[found.triangles] = True
+        if len(ends):
+            around = torch.zeros_like(self._level.free[:, 0])
+            around[ends.reshape(-1)] = True
+            near = torch.nonzero(around[triangles].sum(dim=1) >= 2).squeeze(1)  # noqa: PLR2004 - both ends of an edge
+            sides = triangles[near][:, [[0, 1], [1, 2], [2, 0]]].sort(dim=2).values
+            key, known = sides[..., 0] * len(x) + sides[..., 1], ends.sort(dim=1).values
+            hit[near[torch.isin(key, known[:, 0] * len(x) + known[:, 1]).any(dim=1)]] = True
+        stays = (track.known < 0) | ~track.offset.isfinite()
+        return torch.nonzero(hit & ~stays[triangles].any(dim=1)).squeeze(1)
+
     def _depth(self, x: Tensor) -> Tensor:
         """How deep each vertex is in the deepest body [m]."""
         out = torch.zeros_like(x[:, 0])
@@ -275,6 +308,13 @@ class LevelBodies:
                 # What a pin or no room holds inside comes out at no height.
                 out[corners[~held[corners].any(dim=1)].reshape(-1)] = True
         return out
+
+
+def moves(x: Float[Tensor, "vertices 3"], out: Float[Tensor, "vertices 3"], passes: int) -> dict[str, int | float]:
+    """How many vertices moved from x to other positions [m], how far at most [mm] and in how many passes."""
+    shifts = (out - x).norm(dim=1)
+    far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
+    return {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
 
 
 @dataclass(eq=False)

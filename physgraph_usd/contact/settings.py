@@ -22,6 +22,7 @@ class ContactSettings:
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
         lifts: How often it moves cloth farther out where a body comes through it.
+        corners: How often it lifts cloth over what still comes through faces.
         measured: Whether what is off is measured all the same.
     """
 
@@ -34,7 +35,8 @@ class ContactSettings:
     rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
-    lifts: int = 5
+    lifts: int = 0
+    corners: int = 10
     measured: bool = False
 
     @property
