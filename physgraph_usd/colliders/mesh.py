@@ -174,7 +174,12 @@ class MeshSurface:
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
             asked = x.to(torch.float32).contiguous()
-            self._run(_winding, self.mesh, len(x), [_vectors(asked), wp.float32(far), wp.float32(parts - 0.5), wp.from_torch(side)])
+            self._run(
+                _winding,
+                self.mesh,
+                len(x),
+                [_vectors(asked), wp.float32(far), wp.float32(parts - 0.5), wp.from_torch(side)],
+            )
         return side < 0
 
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:

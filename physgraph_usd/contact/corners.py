@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..colliders.base import Surface
+from ..colliders.sign import behind
 from ..level import Level
 
 ORDER = 6
@@ -24,18 +25,20 @@ def lift_over(
     triangles: Int[Tensor, " triangles"],
     *,
     clearance: Float[Tensor, " vertices"],
+    start: Float[Tensor, " vertices"],
 ) -> Float[Tensor, "vertices 3"]:
     """How far to move vertices so that the deepest point of each of some faces comes out, or most of the way [m].
 
     The point is moved to its clearance, by the least move of the face's free corners; a corner of several faces takes
-    their mean.
+    the longest of theirs.
 
     Args:
-        surface: A closed surface.
+        surface: The surface.
         level: The level.
         x: Positions in the surface's coordinates [m].
         triangles: The faces that the surface comes through.
         clearance: Distance to keep [m].
+        start: Side on which vertices belong, of open surfaces: 1 their normals', -1 the other, 0 undecided.
 
     Returns:
         Moves [m].
@@ -43,7 +46,8 @@ def lift_over(
     corners = level.triangles.long()[triangles]
     grid = _grid(x)
     points = torch.einsum("pk,tkd->tpd", grid, x[corners])
-    signed, away = _away(surface, points.reshape(-1, 3))
+    sides = start[corners[:, :1]].expand(-1, len(grid)).reshape(-1)
+    signed, away = _away(surface, points.reshape(-1, 3), sides)
     signed, away = signed.reshape(points.shape[:2]), away.reshape(points.shape)
     each = torch.arange(len(corners), device=x.device)
     deepest = signed.argmin(dim=1)
@@ -61,15 +65,20 @@ def lift_over(
     return best
 
 
-def _away(surface: Surface, points: Float[Tensor, "points 3"]) -> tuple[Tensor, Tensor]:
-    """Signed distances [m] and unit directions out of a closed surface."""
+def _away(surface: Surface, points: Float[Tensor, "points 3"], start: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distances [m] and unit directions out of a closed surface, or to the side of an open one."""
     found = surface.closest(points, torch.full_like(points[:, 0], float("inf")))
-    side = found.side.clone()
+    open_side = torch.where(behind(found, start), -1.0, 1.0).to(found.side)
+    side = found.side.clone() if surface.closed else open_side
     ask = side == 0
     if bool(ask.any()):
         side[ask] = 1.0 - 2.0 * surface.inside(points[ask]).to(side)
     away = (points - found.point) * side.unsqueeze(1)
-    away = torch.where((found.distance > LEAST).unsqueeze(1), away, found.normal)
+    away = torch.where(
+        (found.distance > LEAST).unsqueeze(1),
+        away,
+        found.normal * torch.where(start < 0, -1.0, 1.0).to(points).unsqueeze(1),
+    )
     return found.distance * side, torch.nn.functional.normalize(away, dim=1, eps=1e-30)
 
 

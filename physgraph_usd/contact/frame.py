@@ -18,15 +18,15 @@ from ..level import Level
 from .bodies import FrameBodies, LevelBodies, moves
 from .cloth import ClothContact, ClothView
 from .cloth_mesh import ClothMesh
-from .metric import HeldMetric
 from .last_resort import taken_back
+from .metric import HeldMetric
 from .repair import hidden_between, repaired_cage
 from .seams import Seams
 from .settings import ContactSettings
 from .squeeze import squeezed
 
 FINISHES = 3
-"""How often cloth is pushed along, mended and pushed out of bodies in turn, while more crosses than before bodies pushed."""
+"""How often cloth is pushed along, mended and pushed out in turn, while more crosses than before bodies pushed."""
 SQUEEZED = 2.0
 """Distance to which cloth is moved apart then, in thicknesses: what bodies push moves faces, whose middles sag."""
 HOLDS = 6

@@ -21,8 +21,7 @@ class ContactSettings:
         rounds: How often in a level's steps closest points are found anew.
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
-        lifts: How often it moves cloth farther out where a body comes through it.
-        corners: How often it lifts cloth over what still comes through faces.
+        lifts: How often it moves faces outwards that a body comes through.
         measured: Whether what is off is measured all the same.
     """
 
@@ -35,8 +34,7 @@ class ContactSettings:
     rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
-    lifts: int = 0
-    corners: int = 10
+    lifts: int = 10
     measured: bool = False
 
     @property
