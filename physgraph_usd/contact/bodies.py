@@ -29,6 +29,9 @@ from .track import Track
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
 
+STALLED = 6
+"""How often faces that a body comes through are moved in vain, once none more comes clear."""
+
 
 @dataclass(frozen=True, eq=False)
 class Touching:
@@ -74,11 +77,13 @@ class LevelBodies:
             Positions [m]; x itself when none had to move; and the passes that it took.
         """
         out, passes = self._out(x)
+        least, stalled = len(self._level.triangles) + 1, 0
         for _ in range(self._settings.lifts):
-            lifted = self._over_corners(out)
-            if lifted is out:
+            lifted, faces = self._over_corners(out)
+            stalled = 0 if faces < least else stalled + 1
+            if not faces or stalled > STALLED:
                 break
-            out, passes = lifted, passes + 1
+            out, passes, least = lifted, passes + 1, min(faces, least)
         return out, passes
 
     def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
@@ -147,20 +152,21 @@ class LevelBodies:
         room = room_above(track.surface, foot, normal, reach=reach, lanes=self._level.lanes)
         return torch.minimum(wanted, 0.5 * room)
 
-    def _over_corners(self, x: Tensor) -> Tensor:
-        """Corners of faces that bodies come through moved towards where they do not; x itself without such."""
-        out = x
+    def _over_corners(self, x: Tensor) -> tuple[Tensor, int]:
+        """Corners of faces that bodies come through moved towards where they do not, and how many there are."""
+        out, count = x, 0
         for track in self._tracks:
             faces = self._pierced_faces(track, out)
+            count += len(faces)
             if len(faces):
                 least = self._settings.clearance * track.offset
                 at = out + track.shift
                 out = out + lift_over(track.surface, self._level, at, faces, clearance=least, start=track.side)
-        if out is x:
-            return x
+        if not count:
+            return x, 0
         out = self.push_out(out)
         stuck = self._depth(out) > self._depth(x).clamp_min(DEEP)
-        return torch.where(stuck.unsqueeze(1), x, out)
+        return torch.where(stuck.unsqueeze(1), x, out), count
 
     def _pierced_faces(self, track: Track, x: Tensor) -> Tensor:
         """Faces that a body comes through though none of their corners is left inside it."""

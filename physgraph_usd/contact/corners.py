@@ -14,6 +14,8 @@ ORDER = 6
 """Parts into which the sides of a face are cut where it is looked how deep it is."""
 LEAST_LIFT = 0.5
 """Least move of that point, in clearances."""
+OVER = 1.25
+"""Its move over what would do if the way out did not turn: fewer goes."""
 LEAST = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
 
@@ -54,7 +56,7 @@ def lift_over(
     weight = grid[deepest] * level.free[corners, 0]
     kept = (grid[deepest] * clearance[corners]).sum(dim=1)
     # What comes through between the points is at least near one.
-    lack = torch.maximum(kept - signed[each, deepest], LEAST_LIFT * kept)
+    lack = OVER * torch.maximum(kept - signed[each, deepest], LEAST_LIFT * kept)
     share = weight / weight.square().sum(dim=1, keepdim=True).clamp_min(1e-9)
     move = share.unsqueeze(2) * (lack.unsqueeze(1) * away[each, deepest]).unsqueeze(1)
     best, length = torch.zeros_like(x), torch.zeros_like(x[:, 0])
@@ -74,11 +76,8 @@ def _away(surface: Surface, points: Float[Tensor, "points 3"], start: Tensor) ->
     if bool(ask.any()):
         side[ask] = 1.0 - 2.0 * surface.inside(points[ask]).to(side)
     away = (points - found.point) * side.unsqueeze(1)
-    away = torch.where(
-        (found.distance > LEAST).unsqueeze(1),
-        away,
-        found.normal * torch.where(start < 0, -1.0, 1.0).to(points).unsqueeze(1),
-    )
+    outward = found.normal * torch.where(start < 0, -1.0, 1.0).to(points).unsqueeze(1)
+    away = torch.where((found.distance > LEAST).unsqueeze(1), away, outward)
     return found.distance * side, torch.nn.functional.normalize(away, dim=1, eps=1e-30)
 
 

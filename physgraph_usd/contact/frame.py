@@ -197,18 +197,18 @@ class FrameContact:
         least = cloth.look(mended).crossings.count
         if cloth.look(x).crossings.count <= least:
             return x
-        best = (cloth.look(x).crossings.count, x, self._held)
+        best = ((cloth.worse(x), cloth.look(x).crossings.count), x, self._held)
         held, out = torch.zeros_like(self._levels[-1].free[:, 0]), x
         for attempt in range(HOLDS):
             for _ in range(FINISHES):
                 out = self._pushed_along(bodies, mended, out)
-                count = cloth.look(out).crossings.count
-                if count < best[0]:
-                    best = (count, out, self._held)
-                if count <= least:
+                found = (cloth.worse(out), cloth.look(out).crossings.count)
+                if found < best[0]:
+                    best = (found, out, self._held)
+                if found <= (False, least):
                     return out
                 out = bodies.project(cloth.mend(out).x)[0]
-            if not cloth.worse(best[1]):
+            if not best[0][0]:
                 break
             held = held | cloth.round_crossings(best[1], rings=attempt)
             self._hold(bodies, held)

@@ -34,7 +34,7 @@ class ContactSettings:
     rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
-    lifts: int = 10
+    lifts: int = 40
     measured: bool = False
 
     @property

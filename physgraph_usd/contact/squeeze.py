@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .cloth_mesh import ClothMesh, Pairs
 
-TURNS = 12
+TURNS = 24
 """How often pairs and bodies push in turn."""
 AROUND = 2
 """Rings round what bodies moved whose pairs are looked at."""
