@@ -29,7 +29,7 @@ from .track import Track
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
 
-STALLED = 6
+STALLED = 10
 """How often faces that a body comes through are moved in vain, once none more comes clear."""
 
 
@@ -77,14 +77,16 @@ class LevelBodies:
             Positions [m]; x itself when none had to move; and the passes that it took.
         """
         out, passes = self._out(x)
-        least, stalled = len(self._level.triangles) + 1, 0
+        best, least, stalled = out, len(self._level.triangles) + 1, 0
         for _ in range(self._settings.lifts):
             lifted, faces = self._over_corners(out)
-            stalled = 0 if faces < least else stalled + 1
+            if faces < least:
+                best, least, stalled = out, faces, 0
+            stalled += 1
             if not faces or stalled > STALLED:
                 break
-            out, passes, least = lifted, passes + 1, min(faces, least)
-        return out, passes
+            out, passes = lifted, passes + 1
+        return best, passes
 
     def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Free vertices moved to the least clearance, wherever bodies come through faces [m]."""
@@ -165,6 +167,7 @@ class LevelBodies:
         if not count:
             return x, 0
         out = self.push_out(out)
+        # What another body is in the way of stays where it is.
         stuck = self._depth(out) > self._depth(x).clamp_min(DEEP)
         return torch.where(stuck.unsqueeze(1), x, out), count
 
@@ -182,6 +185,10 @@ class LevelBodies:
             key, known = sides[..., 0] * len(x) + sides[..., 1], ends.sort(dim=1).values
             hit[near[torch.isin(key, known[:, 0] * len(x) + known[:, 1]).any(dim=1)]] = True
         stays = (track.known < 0) | ~track.offset.isfinite()
+        for other in self._tracks:  # Between two bodies there is no room to lift anything.
+            if other is not track:
+                moved = (x - other.at).norm(dim=1)
+                stays |= other.known - moved < 2.0 * self._settings.clearance * other.offset
         return torch.nonzero(hit & ~stays[triangles].any(dim=1)).squeeze(1)
 
     def _depth(self, x: Tensor) -> Tensor:
