@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -102,7 +104,7 @@ class TestLastResort:
         )
         noise = torch.as_tensor(np.random.default_rng(4).normal(size=(len(base), 3))) * size * EDGE
         out, _, _ = contact.finish(base + noise)
-        told = contact.measure(out)[0]["cloth"]
+        told: Any = contact.measure(out)[0]["cloth"]
         before = len(crossings(Soup.of(levels[-1], base)))
         assert told["before"]["crossings"] == before
         assert told["after"]["crossings"] == len(crossings(Soup.of(levels[-1], out))) <= before

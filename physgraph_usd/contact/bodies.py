@@ -29,7 +29,7 @@ from .track import Track
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
 
-STALLED = 10
+STALLED = 6
 """How often faces that a body comes through are moved in vain, once none more comes clear."""
 
 

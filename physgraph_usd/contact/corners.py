@@ -14,7 +14,7 @@ ORDER = 6
 """Parts into which the sides of a face are cut where it is looked how deep it is."""
 LEAST_LIFT = 0.5
 """Least move of that point, in clearances."""
-OVER = 1.0
+OVER = 1.25
 """Its move over what would do if the way out did not turn: fewer goes."""
 LEAST = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""

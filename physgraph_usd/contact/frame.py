@@ -198,7 +198,7 @@ class FrameContact:
         if cloth.look(x).crossings.count <= least:
             return x
         best = ((cloth.worse(x), cloth.look(x).crossings.count), x, self._held)
-        held, out = torch.zeros_like(self._levels[-1].free[:, 0]), x
+        held, out, pushed = torch.zeros_like(self._levels[-1].free[:, 0]), x, x
         for attempt in range(HOLDS):
             for _ in range(FINISHES):
                 out = self._pushed_along(bodies, mended, out)
@@ -212,7 +212,10 @@ class FrameContact:
                 break
             held = held | cloth.round_crossings(best[1], rings=attempt)
             self._hold(bodies, held)
-            out = bodies.project(mended)[0]
+            before, out = pushed, bodies.project(mended)[0]
+            if torch.equal(out, before):
+                break  # None of them is between overlapping parts.
+            pushed = out
         self._hold(bodies, best[2])
         return best[1]
 
@@ -227,14 +230,15 @@ class FrameContact:
         bodies.hold(held)
 
     def _not_worse(self, cloth: ClothView, bodies: LevelBodies | None, mended: Tensor, x: Tensor) -> Tensor:
-        """The last resort where more crosses than in the input: cloth goes back, and out of bodies if it then may."""
-        x = taken_back(cloth, self._cloth_mesh, x, (cloth.look(mended), cloth.allowed or cloth.before))
+        """The last resort where more crosses than in the input: cloth goes back, but not into bodies."""
+        back = taken_back(cloth, self._cloth_mesh, x, (cloth.look(mended), cloth.allowed or cloth.before))
         if bodies is None:
-            return x
-        out = bodies.project(x)[0]
+            return back
+        out = bodies.project(back)[0]
         if cloth.worse(out):
-            out = self._pushed_along(bodies, x, out)
-        return x if cloth.worse(out) else out
+            out = self._pushed_along(bodies, back, out)
+        # Skin through cloth shows more than cloth through cloth: what cannot have both stays out of the body.
+        return min(x, out, key=lambda each: (cloth.worse(each), cloth.look(each).crossings.count))
 
     @cached_property
     def _cloth_mesh(self) -> ClothMesh:

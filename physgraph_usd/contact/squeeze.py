@@ -14,6 +14,8 @@ TURNS = 24
 """How often pairs and bodies push in turn."""
 AROUND = 2
 """Rings round what bodies moved whose pairs are looked at."""
+REACH = 2.0
+"""How far off pairs are looked for at most, in mean edges."""
 FLAT = 1e-7
 """Distance under which two parts have no direction from one to the other [m]."""
 
@@ -42,7 +44,7 @@ def squeezed(
         Positions [m].
     """
     shift = (x - start).norm(dim=1)
-    reach = gap + 2.0 * float(shift.max())
+    reach = gap + min(2.0 * float(shift.max()), REACH * float(mesh.level.spacing.mean()))
     mesh.move(start)
     pairs = mesh.pairs(mesh.grown(shift > 0, AROUND), torch.full_like(shift, reach))
     if not len(pairs.corners):
