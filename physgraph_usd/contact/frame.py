@@ -203,10 +203,13 @@ class FrameContact:
             for _ in range(FINISHES):
                 out = self._pushed_along(bodies, mended, out)
                 found = (cloth.worse(out), cloth.look(out).crossings.count)
-                if found < best[0]:
+                better = found < best[0]
+                if better:
                     best = (found, out, self._held)
                 if found <= (False, least):
                     return out
+                if not better:
+                    break
                 out = bodies.project(cloth.mend(out).x)[0]
             if not best[0][0]:
                 break

@@ -16,6 +16,8 @@ AROUND = 2
 """Rings round what bodies moved whose pairs are looked at."""
 REACH = 2.0
 """How far off pairs are looked for at most, in mean edges."""
+FAR = 4.0
+"""Move by bodies, in mean edges, from which nothing is pushed along: sides at the start then say nothing."""
 FLAT = 1e-7
 """Distance under which two parts have no direction from one to the other [m]."""
 
@@ -41,10 +43,13 @@ def squeezed(
         gap: Distance that parts keep at most [m]; what was closer stays as close.
 
     Returns:
-        Positions [m].
+        Positions [m]; x itself where bodies moved it too far.
     """
     shift = (x - start).norm(dim=1)
-    reach = gap + min(2.0 * float(shift.max()), REACH * float(mesh.level.spacing.mean()))
+    edge, far = float(mesh.level.spacing.mean()), float(shift.max())
+    if far > FAR * edge:
+        return x
+    reach = gap + min(2.0 * far, REACH * edge)
     mesh.move(start)
     pairs = mesh.pairs(mesh.grown(shift > 0, AROUND), torch.full_like(shift, reach))
     if not len(pairs.corners):
