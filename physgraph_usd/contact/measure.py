@@ -134,7 +134,7 @@ def pinched(
     stays = far & (detour if lost is None else detour | lost)
     if held is not None and bool(held.any()):
         which = torch.nonzero(held).squeeze(1)
-        stays[which] |= far[which] | detour[which] | surface.inside(x[which], parts=2)
+        stays[which] |= detour[which] | surface.inside(x[which], parts=2)
     return stays
 
 
