@@ -156,7 +156,9 @@ class Group:
         points[self._fixed] = self._place_fixed @ world
         crosses = np.zeros(len(points), bool) if crossing is None else crossing.cpu().numpy()
         own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
-        return Solved(own[0], carried, telemetry, own[1]), strain["p99"]
+        # What the last push out of bodies stretches is not carried on.
+        torn = strain["p99"] if strain["p99"] <= TORN else edge_strain(self.levels[-1], x)["p99"]
+        return Solved(own[0], carried, telemetry, own[1]), torn
 
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()

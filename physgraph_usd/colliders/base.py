@@ -62,8 +62,13 @@ class Surface(Protocol):
         """The closest points within reach [m]."""
         ...
 
-    def inside(self, x: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
-        """Whether points are inside; nowhere for open surfaces."""
+    def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
+        """Whether points are inside; nowhere for open surfaces.
+
+        Args:
+            x: Points.
+            parts: Of how many overlapping parts of the surface at once, at least.
+        """
         ...
 
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:

@@ -57,10 +57,11 @@ def _winding(
     mesh: wp.uint64,
     x: wp.array(dtype=wp.vec3f),
     reach: wp.float32,
+    number: wp.float32,
     side: wp.array(dtype=wp.float32),
 ):
     i = first + wp.tid()
-    query = wp.mesh_query_point_sign_winding_number(mesh, x[i], reach)
+    query = wp.mesh_query_point_sign_winding_number(mesh, x[i], reach, 2.0, number)
     if query.result:
         side[i] = query.sign
 
@@ -164,13 +165,21 @@ class MeshSurface:
         rim = self._on_rim(face.long(), weight) & distance.isfinite()
         return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
 
-    def inside(self, x: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
-        """Whether the generalised winding number is over a half (Barill et al. 2018); nowhere for open surfaces."""
+    def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
+        """Whether points are inside so many parts at least; nowhere for open surfaces.
+
+        The generalised winding number (Barill et al. 2018) is that number, to the nearest whole one.
+        """
         side = torch.ones(len(x), dtype=torch.float32, device=x.device)
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
             asked = x.to(torch.float32).contiguous()
-            self._run(_winding, self.mesh, len(x), [_vectors(asked), wp.float32(far), wp.from_torch(side)])
+            self._run(
+                _winding,
+                self.mesh,
+                len(x),
+                [_vectors(asked), wp.float32(far), wp.float32(parts - 0.5), wp.from_torch(side)],
+            )
         return side < 0
 
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:

@@ -54,8 +54,10 @@ class ShapeSurface:
         face = torch.full_like(side, -1, dtype=torch.int32)
         return Nearest(distance, point @ turn.T, normal @ turn.T, side, rim, face)
 
-    def inside(self, x: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
-        """Whether points are inside."""
+    def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
+        """Whether points are inside; a shape has one part."""
+        if parts > 1:
+            return torch.zeros_like(x[:, 0], dtype=torch.bool)
         return _SHAPES[self._pose.kind](x @ self._turn.to(x), self._size.to(x))[0] < 0
 
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:

@@ -9,27 +9,28 @@ have changed sides.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..colliders.base import Nearest, Surface
-from ..colliders.sign import MARGIN, behind, signed_distances
+from ..colliders.base import Surface
+from ..colliders.sign import signed_distances
 from ..forces.contact import Contact, Planes
 from ..level import Level
-from .measure import DEEP, Pierced, depths, longest_ways, penetration, pierced, pinched
+from .corners import lift_over
+from .measure import DEEP, depths, penetration
 from .room import room_above
 from .settings import ContactSettings
+from .track import Track
 
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
-LIFT = 0.1
-"""How much farther out the corners of what a body comes through are moved at a time, in mean edges."""
-ON_SURFACE = 1e-6
-"""Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
+
+STALLED = 6
+"""How often faces that a body comes through are moved in vain, once none more comes clear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,103 +48,10 @@ class Touching:
     offset: tuple[float, ...]
 
 
-@dataclass(eq=False)
-class _Track:
-    """What is known of the distances between one level and one surface.
-
-    Attributes:
-        surface: The surface.
-        shift: From the group's coordinates to the surface's [m], shape (3,).
-        offset: Distance to keep [m], shape (V,).
-        side: Start side of each vertex, of open surfaces, shape (V,); zeros for closed ones.
-        at: Positions at which distances were found [m], shape (V, 3).
-        known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
-        longest: Longest way out from between overlapping parts that a vertex is sent [m].
-        held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
-        looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
-    """
-
-    surface: Surface
-    shift: Tensor
-    offset: Tensor
-    side: Tensor
-    at: Tensor
-    known: Tensor
-    longest: float
-    held: Tensor | None = None
-    looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
-
-    def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
-        """What crosses at x [m], distances or bounds given; the answer is kept for the same tensor."""
-        if not self.looked or self.looked[0][0] is not x:
-            self.looked[:] = [(x, pierced(self.surface, level, x + self.shift, distance))]
-        return self.looked[0][1]
-
-    def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Find anew what may be nearer than a distance that each vertex has [m].
-
-        Returns:
-            Numbers of those vertices, their unit normals away from the surface, and the signed distances; without
-            those that are pinched.
-        """
-        moved = (x - self.at).norm(dim=1)
-        which = torch.nonzero(self.known - moved < within).squeeze(1)
-        if not len(which):
-            return which, x[which], moved[which]
-        asked = x[which] + self.shift
-        limit = self._limit(which, within[which], moved[which])
-        found = self.surface.closest(asked, limit)
-        sign = self._signs(which, found, asked, moved[which])
-        self.at[which], self.known[which] = x[which], torch.minimum(found.distance, limit) * sign
-        distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
-        within = torch.nonzero(sign < 0).squeeze(1)
-        kept = distance.isfinite()
-        if len(within):
-            near = _at(found, within)
-            way = self.surface.exit(asked[within], near)
-            distance[within], point[within], outward[within] = way.distance, way.point, way.normal
-            kept[within] = ~pinched(near, way, longest_ways(self.longest, self.held, which[within]))
-        away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
-        outward = outward * self._outward(which).unsqueeze(1)
-        normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
-        normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
-        return which[kept], normal[kept], (distance * sign)[kept]
-
-    def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
-        """How far to look for the surface: what is farther away outside is known well enough by that bound."""
-        limit = torch.maximum(within + self.longest, MARGIN * moved)
-        everywhere = torch.full_like(limit, float("inf"))
-        return everywhere if self.surface.certain else torch.where(self.known[which] < 0, everywhere, limit)
-
-    def _outward(self, which: Tensor) -> Tensor:
-        """1 where a face's normal points away from the body, -1 where the start side is the other one."""
-        side = self.side[which]
-        return torch.where(side < 0, side, torch.ones_like(side))
-
-    def _signs(self, which: Tensor, found: Nearest, asked: Tensor, moved: Tensor) -> Tensor:
-        """1 outside, or on the start side of an open surface; -1 inside or behind it."""
-        if not self.surface.closed:
-            return torch.where(behind(found, self.side[which]), -torch.ones_like(moved), torch.ones_like(moved))
-        if self.surface.certain:
-            return found.side
-        known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
-        may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
-        sign = torch.where(may_have_crossed & (found.side != 0), found.side, known)
-        ask = may_have_crossed & (found.side == 0)
-        if bool(ask.any()):
-            sign[ask] = 1.0 - 2.0 * self.surface.inside(asked[ask]).to(sign)
-        return sign
-
-
-def _at(found: Nearest, which: Tensor) -> Nearest:
-    """Some of the closest points."""
-    return Nearest(**{each.name: getattr(found, each.name)[which] for each in fields(found)})
-
-
 class LevelBodies:
     """One level's view of the bodies."""
 
-    def __init__(self, level: Level, tracks: Sequence[_Track], settings: ContactSettings) -> None:
+    def __init__(self, level: Level, tracks: Sequence[Track], settings: ContactSettings) -> None:
         """Keep what is known of the distances."""
         self._level, self._tracks, self._settings = level, tuple(tracks), settings
         self._reach = float(level.spacing.mean())
@@ -162,32 +70,27 @@ class LevelBodies:
             return None
         return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form)
 
-    def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, int | float]]:
+    def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], int]:
         """Move free vertices that are under the least clearance to it, and farther where a body comes through a face.
 
         Returns:
-            Positions [m]; x itself when none had to move; and how many moved, how far at most [mm] and in how many
-            passes.
+            Positions [m]; x itself when none had to move; and the passes that it took.
         """
-        extra = torch.zeros_like(x[:, 0])
-        out, passes = self._out(x, extra)
+        out, passes = self._out(x)
+        best, least, stalled = out, len(self._level.triangles) + 1, 0
         for _ in range(self._settings.lifts):
-            through = self._through(out)
-            if not bool(through.any()):
+            lifted, faces = self._over_corners(out)
+            if faces < least:
+                best, least, stalled = out, faces, 0
+            stalled += 1
+            if not faces or stalled > STALLED:
                 break
-            lifted, more = self._out(out, torch.where(through, extra + LIFT * self._reach, extra))
-            # What another body is in the way of stays where it is.
-            stuck = self._depth(lifted) > self._depth(out).clamp_min(DEEP)
-            extra = torch.where(through & ~stuck, extra + LIFT * self._reach, extra)
-            out = torch.where(stuck.unsqueeze(1), out, lifted)
-            passes += more
-        shifts = (out - x).norm(dim=1)
-        far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
-        return out, {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
+            out, passes = lifted, passes + 1
+        return best, passes
 
     def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Free vertices moved to the least clearance, wherever bodies come through faces [m]."""
-        return self._out(x, torch.zeros_like(x[:, 0]))[0]
+        return self._out(x)[0]
 
     def within(self, x: Float[Tensor, "vertices 3"]) -> tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
         """Vertices inside closed bodies at x [m], and those of them that are pinched."""
@@ -201,13 +104,18 @@ class LevelBodies:
             held |= pinned
         return inside, held
 
+    def lose(self, lost: Bool[Tensor, " vertices"]) -> None:
+        """From now on send these vertices of cloth between overlapping parts out of a body by short ways only."""
+        for track in self._tracks:
+            track.lost = lost
+
     def hold(self, held: Bool[Tensor, " vertices"] | None) -> None:
         """From now on leave these vertices where they are between overlapping parts of a body."""
         for track in self._tracks:
             track.held = held
 
-    def _out(self, x: Tensor, extra: Tensor) -> tuple[Tensor, int]:
-        """Push out to the least clearance and more, body by body; the positions and the passes made.
+    def _out(self, x: Tensor) -> tuple[Tensor, int]:
+        """Push out to the least clearance, body by body; the positions and the passes made.
 
         What bodies push to and fro until the passes end is moved by halves, and so to the middle between them.
         """
@@ -216,7 +124,7 @@ class LevelBodies:
             together = attempt >= self._settings.projections
             moved, total = False, torch.zeros_like(x)
             for track in self._tracks:
-                vertex, push = self._pushes(track, out, extra)
+                vertex, push = self._pushes(track, out)
                 if not len(vertex):
                     continue
                 moved = True
@@ -231,20 +139,57 @@ class LevelBodies:
             passes += 1
         return out, passes
 
-    def _pushes(self, track: _Track, x: Tensor, extra: Tensor) -> tuple[Tensor, Tensor]:
+    def _pushes(self, track: Track, x: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices that are under their least clearance to a surface, and the ways to it."""
-        least = self._settings.clearance * track.offset + extra
+        least = self._settings.clearance * track.offset
         vertex, normal, signed = track.refresh(x, least)
         lack = self._kept(track, x[vertex], normal, signed, least[vertex]) - signed
         push = (lack > 1e-7) & self._level.free[vertex, 0]
         return vertex[push], lack[push].unsqueeze(1) * normal[push]
 
-    def _kept(self, track: _Track, x: Tensor, normal: Tensor, signed: Tensor, wanted: Tensor) -> Tensor:
+    def _kept(self, track: Track, x: Tensor, normal: Tensor, signed: Tensor, wanted: Tensor) -> Tensor:
         """The distance to keep from a surface: half the room that it leaves, where that is less than what is wanted."""
         foot = x - signed.unsqueeze(1) * normal + track.shift
         reach = 2.0 * wanted.clamp_min(0.0)
         room = room_above(track.surface, foot, normal, reach=reach, lanes=self._level.lanes)
         return torch.minimum(wanted, 0.5 * room)
+
+    def _over_corners(self, x: Tensor) -> tuple[Tensor, int]:
+        """Corners of faces that bodies come through moved towards where they do not, and how many there are."""
+        out, count = x, 0
+        for track in self._tracks:
+            faces = self._pierced_faces(track, out)
+            count += len(faces)
+            if len(faces):
+                least = self._settings.clearance * track.offset
+                at = out + track.shift
+                out = out + lift_over(track.surface, self._level, at, faces, clearance=least, start=track.side)
+        if not count:
+            return x, 0
+        out = self.push_out(out)
+        # What another body is in the way of stays where it is.
+        stuck = self._depth(out) > self._depth(x).clamp_min(DEEP)
+        return torch.where(stuck.unsqueeze(1), x, out), count
+
+    def _pierced_faces(self, track: Track, x: Tensor) -> Tensor:
+        """Faces that a body comes through though none of their corners is left inside it."""
+        found = track.pierced(self._level, x, (track.known.abs() - (x - track.at).norm(dim=1)).clamp_min(0.0))
+        triangles, ends = self._level.triangles.long(), self._level.edges.long()[found.edges]
+        hit = torch.zeros(len(triangles), dtype=torch.bool, device=x.device)
+        hit[found.triangles] = True
+        if len(ends):
+            around = torch.zeros_like(self._level.free[:, 0])
+            around[ends.reshape(-1)] = True
+            near = torch.nonzero(around[triangles].sum(dim=1) >= 2).squeeze(1)
+            sides = triangles[near][:, [[0, 1], [1, 2], [2, 0]]].sort(dim=2).values
+            key, known = sides[..., 0] * len(x) + sides[..., 1], ends.sort(dim=1).values
+            hit[near[torch.isin(key, known[:, 0] * len(x) + known[:, 1]).any(dim=1)]] = True
+        stays = (track.known < 0) | ~track.offset.isfinite()
+        for other in self._tracks:  # Between two bodies there is no room to lift anything.
+            if other is not track:
+                moved = (x - other.at).norm(dim=1)
+                stays |= other.known - moved < 2.0 * self._settings.clearance * other.offset
+        return torch.nonzero(hit & ~stays[triangles].any(dim=1)).squeeze(1)
 
     def _depth(self, x: Tensor) -> Tensor:
         """How deep each vertex is in the deepest body [m]."""
@@ -254,17 +199,12 @@ class LevelBodies:
             out[vertex] = torch.maximum(out[vertex], -signed)
         return out
 
-    def _through(self, x: Tensor) -> Bool[Tensor, " vertices"]:
-        """Vertices whose edges or faces bodies pass through, though they are outside themselves."""
-        out = torch.zeros_like(self._level.free[:, 0])
-        for track in self._tracks:
-            moved = (x - track.at).norm(dim=1)
-            found = track.pierced(self._level, x, (track.known.abs() - moved).clamp_min(0.0))
-            held = ~self._level.free[:, 0] & (track.known < 0)
-            for corners in (self._level.edges.long()[found.edges], self._level.triangles.long()[found.triangles]):
-                # What a pin holds inside comes out at no height.
-                out[corners[~held[corners].any(dim=1)].reshape(-1)] = True
-        return out
+
+def moves(x: Float[Tensor, "vertices 3"], out: Float[Tensor, "vertices 3"], passes: int) -> dict[str, int | float]:
+    """How many vertices moved from x to other positions [m], how far at most [mm] and in how many passes."""
+    shifts = (out - x).norm(dim=1)
+    far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
+    return {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}
 
 
 @dataclass(eq=False)
@@ -278,7 +218,7 @@ class FrameBodies:
 
     touching: tuple[Touching, ...]
     distances: list[Float[Tensor, " vertices"]]
-    _tracks: list[_Track] = field(default_factory=list)
+    _tracks: list[Track] = field(default_factory=list)
     _settings: ContactSettings = field(default_factory=ContactSettings)
     _views: dict[int, LevelBodies] = field(default_factory=dict)
 
@@ -311,7 +251,7 @@ class FrameBodies:
             known = torch.where(offset.isfinite(), known, torch.full_like(known, float("inf")))
             side = _start_sides(each.surface, coarse + shift, finest)
             longest = PINCHED * float(levels[0].spacing.mean())
-            tracks.append(_Track(each.surface, shift, offset, side, base, known, longest))
+            tracks.append(Track(each.surface, shift, offset, side, base, known, longest))
         return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
 
     def measure(

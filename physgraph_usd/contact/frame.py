@@ -15,15 +15,20 @@ from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact, Spheres
 from ..integrate.metric import Metric
 from ..level import Level
-from .bodies import FrameBodies, LevelBodies
+from .bodies import FrameBodies, LevelBodies, moves
 from .cloth import ClothContact, ClothView
+from .cloth_mesh import ClothMesh
+from .last_resort import taken_back
 from .metric import HeldMetric
-from .repair import repaired_cage
+from .repair import hidden_between, repaired_cage
 from .seams import Seams
 from .settings import ContactSettings
+from .squeeze import squeezed
 
 FINISHES = 3
-"""How often cloth is mended and pushed out of bodies in turn, while either undoes the other."""
+"""How often cloth is pushed along, mended and pushed out in turn, while more crosses than before bodies pushed."""
+SQUEEZED = 2.0
+"""Distance to which cloth is moved apart then, in thicknesses: what bodies push moves faces, whose middles sag."""
 HOLDS = 6
 """How often more of what is between overlapping parts of a body is left there, while pushing it out makes it cross."""
 Touch = Contact | SelfContact | Spheres | Seam
@@ -128,6 +133,8 @@ class FrameContact:
         if level.index not in self._views:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
+            if bodies is not None and self._cloth is not None and self.aim is not self._coarse:
+                bodies.lose(hidden_between(level, base, bodies, self._cloth.mesh(level)))
             cloth = self._cloth_at(level, base)
             if cloth is not None and level is self._levels[-1] and self._judge is not None:
                 cloth.allowed = self._judge.before
@@ -170,44 +177,86 @@ class FrameContact:
         if self.aim is not self._coarse:
             shift = (self.aim - self._coarse).norm(dim=1)
             moved["repaired"] = {"vertices": int((shift > 0).sum()), "largest_mm": round(1e3 * float(shift.max()), 4)}
-        mended = None
         if self._seams is not None:
             x = self._seams.close(finest, finest.base.apply(self.aim), x)
-        for _ in range(FINISHES):
-            x = x if view.cloth is None else view.cloth.mend(x).x
-            mended = x if mended is None else mended
-            if view.bodies is not None:
-                x, moved["projected"] = view.bodies.project(x)
-            if view.cloth is None or view.bodies is None or not view.cloth.worse(x):
-                break
-        if view.cloth is not None and view.bodies is not None and mended is not None and view.cloth.worse(x):
-            x, moved["projected"] = self._least_crossed(view.cloth, view.bodies, mended, x, moved["projected"])
+        mended = x = x if view.cloth is None else view.cloth.mend(x).x
+        passes = 0
+        if view.bodies is not None:
+            x, passes = view.bodies.project(mended)
+            if view.cloth is not None and view.cloth.look(x).crossings.count:
+                x = self._least_crossed(view.cloth, view.bodies, mended, x)
+        if view.cloth is not None and view.cloth.worse(x):
+            x = self._not_worse(view.cloth, view.bodies, mended, x)
+        if view.bodies is not None:
+            moved["projected"] = moves(mended, x, passes)
         if self._seams is not None:
             x = self._seams.close(finest, finest.base.apply(self.aim), x)
-        return x, x if mended is None else mended, moved
+        return x, mended, moved
 
-    def _least_crossed(
-        self, cloth: ClothView, bodies: LevelBodies, mended: Tensor, x: Tensor, told: object
-    ) -> tuple[Tensor, object]:
-        """Leave more of what is nearly pinched where it is, until pushing out the rest crosses no more than the input.
+    def _least_crossed(self, cloth: ClothView, bodies: LevelBodies, mended: Tensor, x: Tensor) -> Tensor:
+        """Push cloth along that bodies push onto; where more crosses than in the input even then, leave more of it.
 
         Between overlapping parts of a body there is no room: what is pushed out there piles up in the crease.
         """
-        best = (cloth.look(x).crossings.count, x, told, self._held)
-        held, out = torch.zeros_like(self._levels[-1].free[:, 0]), x
+        least = cloth.look(mended).crossings.count
+        if cloth.look(x).crossings.count <= least:
+            return x
+        best = ((cloth.worse(x), cloth.look(x).crossings.count), x, self._held)
+        held, out, pushed = torch.zeros_like(self._levels[-1].free[:, 0]), x, x
         for attempt in range(HOLDS):
-            held = held | cloth.round_crossings(out, rings=attempt)
-            bodies.hold(held)
-            out, moved = bodies.project(mended)
-            count = cloth.look(out).crossings.count
-            if count >= best[0]:
+            for _ in range(FINISHES):
+                out = self._pushed_along(bodies, mended, out)
+                found = (cloth.worse(out), cloth.look(out).crossings.count)
+                better = found < best[0]
+                if better:
+                    best = (found, out, self._held)
+                if found <= (False, least):
+                    return out
+                if not better:
+                    break
+                out = bodies.project(cloth.mend(out).x)[0]
+            if not best[0][0]:
                 break
-            best = (count, out, moved, held)
-            if not cloth.worse(out):
-                break
-        self._held = best[3]
-        bodies.hold(self._held)
-        return best[1], best[2]
+            held = held | cloth.round_crossings(best[1], rings=attempt)
+            self._hold(bodies, held)
+            before, out = pushed, bodies.project(mended)[0]
+            if torch.equal(out, before):
+                break  # None of them is between overlapping parts.
+            pushed = out
+        self._hold(bodies, best[2])
+        return best[1]
+
+    def _pushed_along(self, bodies: LevelBodies, start: Tensor, x: Tensor) -> Tensor:
+        """Cloth that bodies pushed onto other cloth, and that cloth, moved until both have room."""
+        mesh = self._cloth_mesh
+        return bodies.project(squeezed(mesh, start, x, push_out=bodies.push_out, gap=self._apart))[0]
+
+    def _hold(self, bodies: LevelBodies, held: Bool[Tensor, " vertices"] | None) -> None:
+        """Leave vertices where they are between overlapping parts of a body."""
+        self._held = held
+        bodies.hold(held)
+
+    def _not_worse(self, cloth: ClothView, bodies: LevelBodies | None, mended: Tensor, x: Tensor) -> Tensor:
+        """The last resort where more crosses than in the input: cloth goes back, but not into bodies."""
+        back = taken_back(cloth, self._cloth_mesh, x, (cloth.look(mended), cloth.allowed or cloth.before))
+        if bodies is None:
+            return back
+        out = bodies.project(back)[0]
+        if cloth.worse(out):
+            out = self._pushed_along(bodies, back, out)
+        # Skin through cloth shows more than cloth through cloth: what cannot have both stays out of the body.
+        return min(x, out, key=lambda each: (cloth.worse(each), cloth.look(each).crossings.count))
+
+    @cached_property
+    def _cloth_mesh(self) -> ClothMesh:
+        """The finest level's faces; asked for only where cloth touches cloth."""
+        assert self._cloth is not None
+        return self._cloth.mesh(self._levels[-1])
+
+    @property
+    def _apart(self) -> float:
+        """Distance to which cloth that bodies push together is moved apart [m]."""
+        return SQUEEZED * float(self._thickness.mean())
 
     @cached_property
     def _judge(self) -> ClothView | None:

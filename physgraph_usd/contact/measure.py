@@ -104,27 +104,38 @@ def depths(
     if len(within):
         found = surface.closest(x[within], torch.full_like(signed[within], float("inf")))
         way = surface.exit(x[within], found)
-        ways = longest_ways(longest, held, within)
-        depth[within], stays[within] = way.distance, pinched(found, way, ways)
+        kept = None if held is None else held[within]
+        depth[within], stays[within] = way.distance, pinched(surface, x[within], found, way, longest=longest, held=kept)
     return depth, stays
 
 
-def longest_ways(
-    longest: float, held: Bool[Tensor, " vertices"] | None, which: Int[Tensor, " some"]
-) -> float | Float[Tensor, " some"]:
-    """The longest way out that each of some vertices is sent [m]: none where it is held."""
-    return longest if held is None else longest * (~held[which]).to(torch.float32)
-
-
-def pinched(found: Nearest, way: Nearest, longest: float | Float[Tensor, " points"]) -> Bool[Tensor, " points"]:
-    """Which points inside are between overlapping parts and too far from a way out.
+def pinched(
+    surface: Surface,
+    x: Float[Tensor, "points 3"],
+    found: Nearest,
+    way: Nearest,
+    *,
+    longest: float,
+    held: Bool[Tensor, " points"] | None = None,
+    lost: Bool[Tensor, " points"] | None = None,
+) -> Bool[Tensor, " points"]:
+    """Which points inside are between overlapping parts and too far from a way out, or held there.
 
     Args:
+        surface: The surface.
+        x: Points inside it, in its coordinates [m].
         found: The closest points.
         way: The closest points on faces that lie bare.
         longest: Longest way out [m].
+        held: Points that stay, however short the way out, if they are inside two parts at once; or None.
+        lost: Points of cloth that lies between overlapping parts, wherever it was pushed from there; or None.
     """
-    return (way.distance > longest) & (way.distance > DETOUR * found.distance)
+    far, detour = way.distance > longest, way.distance > DETOUR * found.distance
+    stays = far & (detour if lost is None else detour | lost)
+    if held is not None and bool(held.any()):
+        which = torch.nonzero(held).squeeze(1)
+        stays[which] |= detour[which] | surface.inside(x[which], parts=2)
+    return stays
 
 
 @wp.kernel

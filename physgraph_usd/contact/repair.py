@@ -58,16 +58,32 @@ def repaired_cage(
 
 def _drawn_taut(cage: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Tensor:
     """Cloth between overlapping parts of a body as a taut membrane, and what can leave it outside."""
-    inside, held = bodies.within(x)
-    held &= cage.free[:, 0]
-    if not bool(held.any()):
+    hidden = hidden_between(cage, x, bodies, mesh)
+    if not bool(hidden.any()):
         return x
-    hidden = _patches_with(inside & cage.free[:, 0], held, mesh.beside)
     around = mesh.grown(hidden, 1) & cage.free[:, 0]
     out = _membrane(x, hidden, mesh.beside)
     for _ in range(FAIRINGS):
         out = bodies.push_out(_smoothed(out, around, mesh.beside))
     return out
+
+
+def hidden_between(
+    level: Level, x: Float[Tensor, "vertices 3"], bodies: LevelBodies, mesh: ClothMesh
+) -> Bool[Tensor, " vertices"]:
+    """Free vertices of patches inside bodies that are pinched between overlapping parts somewhere.
+
+    Args:
+        level: The level.
+        x: Its positions [m].
+        bodies: Its view of the bodies.
+        mesh: Its faces.
+    """
+    inside, held = bodies.within(x)
+    held &= level.free[:, 0]
+    if not bool(held.any()):
+        return held
+    return _patches_with(inside & level.free[:, 0], held, mesh.beside)
 
 
 def _patches_with(

@@ -21,7 +21,7 @@ class ContactSettings:
         rounds: How often in a level's steps closest points are found anew.
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
-        lifts: How often it moves cloth farther out where a body comes through it.
+        lifts: How often it moves faces outwards that a body comes through.
         measured: Whether what is off is measured all the same.
     """
 
@@ -34,7 +34,7 @@ class ContactSettings:
     rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
-    lifts: int = 5
+    lifts: int = 40
     measured: bool = False
 
     @property

@@ -1,0 +1,87 @@
+"""Cloth lifted over a body's corners and ridges: faces that it comes through though all their vertices are outside."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..colliders.base import Surface
+from ..colliders.sign import behind
+from ..level import Level
+
+ORDER = 6
+"""Parts into which the sides of a face are cut where it is looked how deep it is."""
+LEAST_LIFT = 0.5
+"""Least move of that point, in clearances."""
+OVER = 1.25
+"""Its move over what would do if the way out did not turn: fewer goes."""
+LEAST = 1e-6
+"""Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
+
+
+def lift_over(
+    surface: Surface,
+    level: Level,
+    x: Float[Tensor, "vertices 3"],
+    triangles: Int[Tensor, " triangles"],
+    *,
+    clearance: Float[Tensor, " vertices"],
+    start: Float[Tensor, " vertices"],
+) -> Float[Tensor, "vertices 3"]:
+    """How far to move vertices so that the deepest point of each of some faces comes out, or most of the way [m].
+
+    The point is moved to its clearance, by the least move of the face's free corners; a corner of several faces takes
+    the longest of theirs.
+
+    Args:
+        surface: The surface.
+        level: The level.
+        x: Positions in the surface's coordinates [m].
+        triangles: The faces that the surface comes through.
+        clearance: Distance to keep [m].
+        start: Side on which vertices belong, of open surfaces: 1 their normals', -1 the other, 0 undecided.
+
+    Returns:
+        Moves [m].
+    """
+    corners = level.triangles.long()[triangles]
+    grid = _grid(x)
+    points = torch.einsum("pk,tkd->tpd", grid, x[corners])
+    sides = start[corners[:, :1]].expand(-1, len(grid)).reshape(-1)
+    signed, away = _away(surface, points.reshape(-1, 3), sides)
+    signed, away = signed.reshape(points.shape[:2]), away.reshape(points.shape)
+    each = torch.arange(len(corners), device=x.device)
+    deepest = signed.argmin(dim=1)
+    weight = grid[deepest] * level.free[corners, 0]
+    kept = (grid[deepest] * clearance[corners]).sum(dim=1)
+    # What comes through between the points is at least near one.
+    lack = OVER * torch.maximum(kept - signed[each, deepest], LEAST_LIFT * kept)
+    share = weight / weight.square().sum(dim=1, keepdim=True).clamp_min(1e-9)
+    move = share.unsqueeze(2) * (lack.unsqueeze(1) * away[each, deepest]).unsqueeze(1)
+    best, length = torch.zeros_like(x), torch.zeros_like(x[:, 0])
+    which, move = corners.reshape(-1), move.reshape(-1, 3)
+    length.scatter_reduce_(0, which, move.norm(dim=1), "amax")
+    largest = torch.nonzero((move.norm(dim=1) >= length[which]) & (length[which] > 0)).squeeze(1)
+    best[which[largest]] = move[largest]
+    return best
+
+
+def _away(surface: Surface, points: Float[Tensor, "points 3"], start: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distances [m] and unit directions out of a closed surface, or to the side of an open one."""
+    found = surface.closest(points, torch.full_like(points[:, 0], float("inf")))
+    open_side = torch.where(behind(found, start), -1.0, 1.0).to(found.side)
+    side = found.side.clone() if surface.closed else open_side
+    ask = side == 0
+    if bool(ask.any()):
+        side[ask] = 1.0 - 2.0 * surface.inside(points[ask]).to(side)
+    away = (points - found.point) * side.unsqueeze(1)
+    outward = found.normal * torch.where(start < 0, -1.0, 1.0).to(points).unsqueeze(1)
+    away = torch.where((found.distance > LEAST).unsqueeze(1), away, outward)
+    return found.distance * side, torch.nn.functional.normalize(away, dim=1, eps=1e-30)
+
+
+def _grid(like: Tensor) -> Float[Tensor, "points 3"]:
+    """Barycentric coordinates of a regular grid of points on a triangle."""
+    cells = [(i, j, ORDER - i - j) for i in range(ORDER + 1) for j in range(ORDER + 1 - i)]
+    return torch.tensor(cells, dtype=like.dtype, device=like.device) / ORDER

@@ -1,0 +1,58 @@
+"""The last resort where a result crosses more than its input: back towards positions that do not, as far as it takes.
+
+`ClothView.mend` looks for the smallest change and may find none. This always ends: at worst all of the cloth is where
+the good positions have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .cloth import ClothState, ClothView
+from .cloth_mesh import ClothMesh
+
+FIRST = 4
+"""Rings round what crosses that are taken back at first; twice as many each time."""
+
+
+def taken_back(
+    cloth: ClothView, mesh: ClothMesh, x: Float[Tensor, "vertices 3"], goods: Sequence[ClothState]
+) -> Float[Tensor, "vertices 3"]:
+    """Positions that cross no more than may.
+
+    Args:
+        cloth: The finest level's cloth.
+        mesh: Its faces.
+        x: Positions [m].
+        goods: Positions to go back to, the best first; the last crosses no more than may.
+
+    Returns:
+        Positions [m], x itself where no more crosses.
+    """
+    if not cloth.worse(x):
+        return x
+    for good in goods:
+        if not cloth.worse(good.x):
+            mended = cloth.mend(x, good).x
+            if not cloth.worse(mended):
+                return mended
+    good, rings = goods[-1], FIRST
+    out, back = x, torch.zeros_like(mesh.level.free[:, 0])
+    while cloth.worse(out) and not bool(back.all()):
+        back = mesh.grown(back | cloth.round_crossings(out, rings=0), rings)
+        out = good.x + (x - good.x) * _kept(mesh, back, rings)
+        rings *= 2
+    return out
+
+
+def _kept(mesh: ClothMesh, back: Bool[Tensor, " vertices"], rings: int) -> Float[Tensor, "vertices 1"]:
+    """0 at some vertices, rising to 1 over some rings round them."""
+    kept = torch.ones_like(back, dtype=mesh.level.rest.dtype)
+    for ring in range(rings):
+        kept[back] = torch.minimum(kept[back], torch.full_like(kept[back], ring / rings))
+        back = mesh.grown(back, 1)
+    return kept.unsqueeze(1)

@@ -1,0 +1,112 @@
+"""What is known of the distances between one level's cloth and one body, asked anew only where it may have changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import torch
+from torch import Tensor
+
+from ..colliders.base import Nearest, Surface
+from ..colliders.sign import MARGIN, behind
+from ..level import Level
+from .measure import Pierced, pierced, pinched
+
+ON_SURFACE = 1e-6
+"""Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
+
+
+@dataclass(eq=False)
+class Track:
+    """What is known of the distances between one level and one surface.
+
+    Attributes:
+        surface: The surface.
+        shift: From the group's coordinates to the surface's [m], shape (3,).
+        offset: Distance to keep [m], shape (V,).
+        side: Start side of each vertex, of open surfaces, shape (V,); zeros for closed ones.
+        at: Positions at which distances were found [m], shape (V, 3).
+        known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
+        longest: Longest way out from between overlapping parts that a vertex is sent [m].
+        held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
+        looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
+    """
+
+    surface: Surface
+    shift: Tensor
+    offset: Tensor
+    side: Tensor
+    at: Tensor
+    known: Tensor
+    longest: float
+    held: Tensor | None = None
+    lost: Tensor | None = None
+    looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
+
+    def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
+        """What crosses at x [m], distances or bounds given; the answer is kept for the same tensor."""
+        if not self.looked or self.looked[0][0] is not x:
+            self.looked[:] = [(x, pierced(self.surface, level, x + self.shift, distance))]
+        return self.looked[0][1]
+
+    def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Find anew what may be nearer than a distance that each vertex has [m].
+
+        Returns:
+            Numbers of those vertices, their unit normals away from the surface, and the signed distances; without
+            those that are pinched.
+        """
+        moved = (x - self.at).norm(dim=1)
+        which = torch.nonzero(self.known - moved < within).squeeze(1)
+        if not len(which):
+            return which, x[which], moved[which]
+        asked = x[which] + self.shift
+        limit = self._limit(which, within[which], moved[which])
+        found = self.surface.closest(asked, limit)
+        sign = self._signs(which, found, asked, moved[which])
+        self.at[which], self.known[which] = x[which], torch.minimum(found.distance, limit) * sign
+        distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
+        within = torch.nonzero(sign < 0).squeeze(1)
+        kept = distance.isfinite()
+        if len(within):
+            near = _at(found, within)
+            way = self.surface.exit(asked[within], near)
+            distance[within], point[within], outward[within] = way.distance, way.point, way.normal
+            held = None if self.held is None else self.held[which[within]]
+            lost = None if self.lost is None else self.lost[which[within]]
+            kept[within] = ~pinched(self.surface, asked[within], near, way, longest=self.longest, held=held, lost=lost)
+        away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
+        outward = outward * self._outward(which).unsqueeze(1)
+        normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
+        normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+        return which[kept], normal[kept], (distance * sign)[kept]
+
+    def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
+        """How far to look for the surface: what is farther away outside is known well enough by that bound."""
+        limit = torch.maximum(within + self.longest, MARGIN * moved)
+        everywhere = torch.full_like(limit, float("inf"))
+        return everywhere if self.surface.certain else torch.where(self.known[which] < 0, everywhere, limit)
+
+    def _outward(self, which: Tensor) -> Tensor:
+        """1 where a face's normal points away from the body, -1 where the start side is the other one."""
+        side = self.side[which]
+        return torch.where(side < 0, side, torch.ones_like(side))
+
+    def _signs(self, which: Tensor, found: Nearest, asked: Tensor, moved: Tensor) -> Tensor:
+        """1 outside, or on the start side of an open surface; -1 inside or behind it."""
+        if not self.surface.closed:
+            return torch.where(behind(found, self.side[which]), -torch.ones_like(moved), torch.ones_like(moved))
+        if self.surface.certain:
+            return found.side
+        known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
+        may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
+        sign = torch.where(may_have_crossed & (found.side != 0), found.side, known)
+        ask = may_have_crossed & (found.side == 0)
+        if bool(ask.any()):
+            sign[ask] = 1.0 - 2.0 * self.surface.inside(asked[ask]).to(sign)
+        return sign
+
+
+def _at(found: Nearest, which: Tensor) -> Nearest:
+    """Some of the closest points."""
+    return Nearest(**{each.name: getattr(found, each.name)[which] for each in fields(found)})
