@@ -18,7 +18,7 @@ from ..level import Level
 from .bodies import FrameBodies, LevelBodies, moves
 from .cloth import ClothContact, ClothView
 from .cloth_mesh import ClothMesh
-from .last_resort import taken_back
+from .last_resort import FIRST, returned, taken_back
 from .metric import HeldMetric
 from .repair import hidden_between, repaired_cage
 from .seams import Seams
@@ -241,11 +241,23 @@ class FrameContact:
         back = taken_back(cloth, self._cloth_mesh, x, (cloth.look(mended), cloth.allowed or cloth.before))
         if bodies is None:
             return back
-        out = bodies.project(back)[0]
-        if cloth.worse(out):
-            out = self._pushed_along(bodies, back, out)
+        tried = [x, bodies.project(back)[0]]
+        tried.append(self._pushed_along(bodies, back, tried[-1]))
+        out = min(tried, key=lambda each: (cloth.worse(each), cloth.look(each).crossings.count))
         # Skin through cloth shows more than cloth through cloth: what cannot have both stays out of the body.
-        return min(x, out, key=lambda each: (cloth.worse(each), cloth.look(each).crossings.count))
+        return out if not cloth.worse(out) else self._as_input(cloth, bodies, x, out)
+
+    def _as_input(self, cloth: ClothView, bodies: LevelBodies, x: Tensor, worst: Tensor) -> Tensor:
+        """More and more of the cloth as the input has it, pushed out, until no more crosses; else what was there."""
+        good, mesh = (cloth.allowed or cloth.before).x, self._cloth_mesh
+        where, rings, crossing = torch.zeros_like(self._levels[-1].free[:, 0]), FIRST, worst
+        while not bool(where.all()):
+            where = mesh.grown(where | cloth.round_crossings(crossing, rings=0), rings)
+            crossing = bodies.project(returned(mesh, x, good, where=where, rings=rings))[0]
+            if not cloth.worse(crossing):
+                return crossing
+            rings *= 2
+        return worst
 
     @cached_property
     def _cloth_mesh(self) -> ClothMesh:

@@ -44,9 +44,21 @@ def taken_back(
     out, back = x, torch.zeros_like(mesh.level.free[:, 0])
     while cloth.worse(out) and not bool(back.all()):
         back = mesh.grown(back | cloth.round_crossings(out, rings=0), rings)
-        out = good.x + (x - good.x) * _kept(mesh, back, rings)
+        out = returned(mesh, x, good.x, where=back, rings=rings)
         rings *= 2
     return out
+
+
+def returned(
+    mesh: ClothMesh,
+    x: Float[Tensor, "vertices 3"],
+    good: Float[Tensor, "vertices 3"],
+    *,
+    where: Bool[Tensor, " vertices"],
+    rings: int,
+) -> Float[Tensor, "vertices 3"]:
+    """Positions that are good ones at some vertices and change over to others over some rings round them [m]."""
+    return good + (x - good) * _kept(mesh, where, rings)
 
 
 def _kept(mesh: ClothMesh, back: Bool[Tensor, " vertices"], rings: int) -> Float[Tensor, "vertices 1"]:
