@@ -49,10 +49,7 @@ def main() -> None:
         "paper's form": ("linear", "spheres", ball),
     }
     refiners = {name: _refiner(scene, form, cloth) for name, (form, cloth, _) in cases.items()}
-    times: dict[str, list[float]] = {name: [] for name in cases}
-    work: dict[str, list[float]] = {name: [] for name in cases}
-    solve: dict[str, list[float]] = {name: [] for name in cases}
-    measure: dict[str, list[float]] = {name: [] for name in cases}
+    times, work, solve, measure = ({name: list[float]() for name in cases} for _ in range(4))
     said: dict[str, Any] = {}
     count = 0
     for repeat in range(REPEATS):

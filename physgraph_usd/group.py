@@ -23,7 +23,7 @@ from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
 from .integrate.base import Integrator, System
-from .integrate.choice import choose
+from .integrate.choice import Choice, choose
 from .integrate.metric import Metric
 from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
@@ -121,9 +121,7 @@ class Group:
         """Solve one frame; also the 99th percentile of the edges' strain."""
         clock = time.perf_counter()
         forces = self._forces_for(frames)
-        world = np.concatenate([frame.points for frame in frames])
-        origin = world.mean(axis=0) if len(world) else np.zeros(3)
-        coarse = self._tensor(world - origin)
+        world, origin, coarse = self._placed(frames)
         predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
         contact = self._contact(touching, coarse, origin, frames)
         aim = coarse if contact is None else contact.aim
@@ -196,9 +194,7 @@ class Group:
         self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()
     ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
         """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
-        world = np.concatenate([frame.points for frame in frames])
-        origin = world.mean(axis=0)
-        coarse = self._tensor(world - origin)
+        _, origin, coarse = self._placed(frames)
         contact = self._contact(touching, coarse, origin, frames)
         aim = coarse if contact is None else contact.aim
         return self._forces_for(frames)[-1].module(aim), contact, origin
@@ -208,6 +204,12 @@ class Group:
         world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
         coarse = self._tensor((world - world.mean(dim=0)).numpy())
         return [lasting.module(coarse) for lasting in self._forces_for(frames)], coarse
+
+    def _placed(self, frames: Sequence[GarmentFrame]) -> tuple[np.ndarray, np.ndarray, Tensor]:
+        """The cages' world positions, their mean [m], and the cages about it."""
+        world = np.concatenate([frame.points for frame in frames])
+        origin = world.mean(axis=0) if len(world) else np.zeros(3)
+        return world, origin, self._tensor(world - origin)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)
@@ -299,21 +301,8 @@ class Group:
         contact: FrameContact | None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
         """Walk the levels; a warm start goes straight to the finest. Also says why, where there was a choice."""
-        subdivisions, warm = len(self.levels) - 1, predicted is not None
-        choice = choose(
-            self._settings.method.nested,
-            subdivisions,
-            contact,
-            remaining=lambda: self._remaining(forces[0], coarse),
-            warm=warm,
-            device=self.levels[0].device,
-        )
-        if choice.learned not in self._integrators:
-            self._integrators[choice.learned] = choice.integrator(self._settings.method.build)
-        self._integrator = self._integrators[choice.learned]
-        if contact is not None and (choice.nested or warm):
-            contact.forget()  # The choice looked at the upsampled cage, which is not where the level starts.
-        first = 0 if choice.nested else subdivisions
+        choice = self._choose(forces[0], coarse, contact, warm=predicted is not None)
+        first = 0 if choice.nested else len(self.levels) - 1
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
         module = ForceModule(())
@@ -339,6 +328,23 @@ class Group:
             reports += made
             module = ForceModule((*module.forces, *touched))
         return x, reports, module, {"chosen": choice.reason} if choice.reason else {}
+
+    def _choose(self, cage: LevelForces, coarse: Tensor, contact: FrameContact | None, *, warm: bool) -> Choice:
+        """Which levels a frame is solved at, and the integrator, which is made ready."""
+        choice = choose(
+            self._settings.method.nested,
+            len(self.levels) - 1,
+            contact,
+            remaining=lambda: self._remaining(cage, coarse),
+            warm=warm,
+            device=self.levels[0].device,
+        )
+        if choice.learned not in self._integrators:
+            self._integrators[choice.learned] = choice.integrator(self._settings.method.build)
+        self._integrator = self._integrators[choice.learned]
+        if contact is not None and (choice.nested or warm):
+            contact.forget()  # The choice looked at the upsampled cage, which is not where the level starts.
+        return choice
 
     def _remaining(self, forces: LevelForces, coarse: Tensor) -> float:
         """The cage's remaining move, in its edge lengths."""

@@ -31,14 +31,9 @@ def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], *, means: bool
         smoothed: Rows whose means over the neighbours are the last rows.
         means: Whether it keeps the vectors in local edge lengths, for the garments' means.
     """
-    rows = 1 + max(row for row, _ in parts)
-    own = (*((row, 0) for row in range(rows)), *(part for part in parts if part[1] == STRAIN))
-    place = tuple(own.index((row, 0 if kind == NORMAL else kind)) for row, kind in parts)
-    crosses = tuple(kind == NORMAL for _, kind in parts)
-    table = wp.types.matrix(shape=(len(own), 3), dtype=wp.float32)
-    column = wp.types.vector(length=len(own), dtype=wp.float32)
-    floor, strained = FLOOR**2, len(own) > rows
-    average, show = _averaging(smoothed, rows - len(smoothed)), _showing(place, crosses, pairs, means=means)
+    own, place, crosses, wholes = _laid_out(parts, len(smoothed))
+    average, measure = _averaging(smoothed, wholes), _measuring(own)
+    show = _showing(place, crosses, pairs, means=means)
 
     @wp.kernel(module="unique")
     def see(
@@ -58,25 +53,28 @@ def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], *, means: bool
         scaled: wp.array(dtype=wp.vec3f),
     ):
         i = first + wp.tid()
-        across, along = wp.vec3f(), wp.mat33f()
+        across = wp.vec3f()
         if wp.static(any(crosses)):
             across = normal_of(i, x, corners, others)
             normal[i] = across
-        if wp.static(strained):
-            along = strain[i]
         if wp.static(len(smoothed) > 0):
             average(i, vertices, ends, far, v)
-        unit, square = table(), column()
-        scale = wp.float32(1.0) / spacing[i]
-        for u in range(wp.static(len(own))):
-            w = scale * v[wp.static(own[u][0]) * vertices + i]
-            if wp.static(own[u][1] == STRAIN):
-                w = along * w
-            square[u] = wp.dot(w, w) + wp.float32(wp.static(floor))
-            unit[u] = w * (wp.float32(1.0) / wp.sqrt(square[u]))
+        unit, square = measure(i, vertices, v, spacing, strain)
         show(i, vertices, unit, square, across, squares, cosines, scaled)
 
     return see
+
+
+def _laid_out(parts: Parts, smoothed: int) -> tuple[Parts, tuple[int, ...], tuple[bool, ...], int]:
+    """The vectors that are looked at as they are, and where each of these parts is among them.
+
+    Returns:
+        Rows, and parts by strain; for each part its place there; whether it is the normal part of that; whole rows.
+    """
+    rows = 1 + max(row for row, _ in parts)
+    own = (*((row, 0) for row in range(rows)), *(part for part in parts if part[1] == STRAIN))
+    place = tuple(own.index((row, 0 if kind == NORMAL else kind)) for row, kind in parts)
+    return own, place, tuple(kind == NORMAL for _, kind in parts), rows - smoothed
 
 
 @wp.func
@@ -114,6 +112,33 @@ def _averaging(smoothed: tuple[int, ...], wholes: int) -> Any:
             v[wp.static(wholes + s) * vertices + i] = share * total[s]
 
     return average
+
+
+def _measuring(own: Parts) -> Any:
+    """The function that finds directions and squared lengths, in local edges, of vectors looked at as they are."""
+    table = wp.types.matrix(shape=(len(own), 3), dtype=wp.float32)
+    column = wp.types.vector(length=len(own), dtype=wp.float32)
+    floor = FLOOR**2
+
+    @wp.func
+    def measure(
+        i: wp.int32,
+        vertices: wp.int32,
+        v: wp.array(dtype=wp.vec3f),
+        spacing: wp.array(dtype=wp.float32),
+        strain: wp.array(dtype=wp.mat33f),
+    ):
+        unit, square = table(), column()
+        scale = wp.float32(1.0) / spacing[i]
+        for u in range(wp.static(len(own))):
+            w = scale * v[wp.static(own[u][0]) * vertices + i]
+            if wp.static(own[u][1] == STRAIN):
+                w = strain[i] * w
+            square[u] = wp.dot(w, w) + wp.float32(wp.static(floor))
+            unit[u] = w * (wp.float32(1.0) / wp.sqrt(square[u]))
+        return unit, square
+
+    return measure
 
 
 def _showing(place: tuple[int, ...], crosses: tuple[bool, ...], pairs: Pairs, *, means: bool) -> Any:
