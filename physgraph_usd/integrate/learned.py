@@ -84,8 +84,8 @@ class LearnedMetric:
         self._recordings: dict[System, Recording] = {}
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
-        """Evaluate x with an empty memory."""
-        self._network = placed(self._network, system)
+        """Evaluate x with an empty memory; the network counts as precisely as the system does."""
+        self._network = placed(self._network, system, x.dtype)
         energy, force = system.energy_and_force(x)
         image = system.apply_smooth_inverse(force)
         recording = self._recorded(system)
@@ -140,9 +140,9 @@ class LearnedMetric:
             return fused(bases, system.spacing, step, around=around) * system.free
         stacked = torch.stack(vectors_of(names, whole, around=cache(lambda: Around(_level(system), x))), dim=1)  # V N 3
         needed = self._network.config.strain or self._network.config.rounds > 0
-        strain = edge_strain(system, x).float() if needed else None
+        strain = edge_strain(system, x) if needed else None
         scaled = stacked / system.spacing.reshape(-1, 1, 1)  # V N 3
-        coefficients = self._network(scaled.float(), strain, step, graph=graph).to(stacked)  # V N
+        coefficients = self._network(scaled, strain, step, graph=graph)  # V N
         move = (coefficients.unsqueeze(2) * stacked).sum(dim=1)  # V 3
         return limited(move, system.spacing) * system.free
 
@@ -223,7 +223,7 @@ class LearnedPaper:
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty history."""
-        self._network = placed(self._network, system)
+        self._network = placed(self._network, system, torch.float32)
         energy, force = system.energy_and_force(x)
         # A third of the trace of the Hessian's blocks, at the start: what the force is measured in (A7).
         stiffness = system.diagonal(x).unsqueeze(1)
@@ -261,10 +261,11 @@ class LearnedPaper:
         return limited(out.to(carry.x) * length, system.spacing) * system.free
 
 
-def placed(network: NetworkT, system: System) -> NetworkT:
-    """The network on the system's device: itself, or a copy."""
+def placed(network: NetworkT, system: System, dtype: torch.dtype) -> NetworkT:
+    """The network on the system's device and of a scalar type: itself, or a copy."""
     parameter, device = next(network.parameters()), system.spacing.device
-    return network if parameter.device == device else copy.deepcopy(network).to(device)
+    fits = (parameter.device, parameter.dtype) == (device, dtype)
+    return network if fits else copy.deepcopy(network).to(device=device, dtype=dtype)
 
 
 def integrator_of(network: Physgraph | PaperNetwork) -> LearnedMetric | LearnedPaper:
@@ -352,9 +353,8 @@ def graph_of(system: System) -> Graph:
     if level is None:
         owner = torch.zeros(len(system.spacing), dtype=torch.int64, device=system.spacing.device)
         edges = owner.new_zeros((0, 2)).int()
-        return Graph(owner, (slice(0, len(owner)),), edges, system.spacing.float(), system.spacing.new_zeros(0).float())
-    spacing, rest = system.spacing.float(), level.rest_length.float()
-    return Graph(level.vertex_garment.long(), level.spans, level.edges, spacing, rest)
+        return Graph(owner, (slice(0, len(owner)),), edges, system.spacing, system.spacing.new_zeros(0))
+    return Graph(level.vertex_garment.long(), level.spans, level.edges, system.spacing, level.rest_length)
 
 
 _WAYS: WeakKeyDictionary[Surface, Ways] = WeakKeyDictionary()

@@ -88,18 +88,19 @@ def test_s7_the_same_cloth_at_another_size(scale: float, integrator: str):
     """Lengths by s; Y by 1, D by s^2, k_g by 1 / s^2, density by 1 / s: every term by s^2, so the shape is the same.
 
     In float64: float32's rounding differs with the scale, and forty steps of buckling make 0.002 edges of it. Newton's
-    inner loop, which stops at negative curvature, makes 0.1 edges even of that (docs/stability.md, S7). A network
-    counts in float32 whatever the cloth does: that makes 1e-4 edges of it.
+    inner loop, which stops at negative curvature, makes 0.1 edges even of that (docs/stability.md, S7). The network,
+    which sees directions of whatever length, doubles a difference with each step where cloth buckles: it makes eighteen
+    steps here, not a hundred.
     """
     mesh, rest = sheet(6, 4, EDGE)
     points = wave(rest)
     options = {"level": 2, "dtype": torch.float64, "integrator": integrator}
+    options |= {"steps": 2} if integrator == "physgraph" else {}
     one = solved(mesh, rest, points, **options).points[0]
     fabric = Fabric(30.0, 4.7e-6 * scale**2, 0.187 / scale, FABRIC.thickness * scale)
     frame = frame_of(scale * points, fabric=fabric, guide=2000.0 / scale**2)
     two = refiner_of([garment_of(mesh, scale * rest)], **options).solve(frame).points[0]
-    most = 5e-4 if integrator == "physgraph" else 1e-6
-    assert rms(two / scale - one) < most * EDGE / 4
+    assert rms(two / scale - one) < 1e-6 * EDGE / 4
 
 
 def displaced_at_rest(kind: str, dtype: torch.dtype, *, guide: float) -> float:
