@@ -9,6 +9,7 @@ from torch import Tensor
 from ..colliders.base import Surface
 from ..colliders.sign import behind
 from ..level import Level
+from .track import ON_SURFACE
 
 ORDER = 6
 """Parts into which the sides of a face are cut where it is looked how deep it is."""
@@ -16,8 +17,6 @@ LEAST_LIFT = 0.5
 """Least move of that point, in clearances."""
 OVER = 1.25
 """Its move over what would do if the way out did not turn: fewer goes."""
-LEAST = 1e-6
-"""Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
 
 
 def lift_over(
@@ -77,7 +76,7 @@ def _away(surface: Surface, points: Float[Tensor, "points 3"], start: Tensor) ->
         side[ask] = 1.0 - 2.0 * surface.inside(points[ask]).to(side)
     away = (points - found.point) * side.unsqueeze(1)
     outward = found.normal * torch.where(start < 0, -1.0, 1.0).to(points).unsqueeze(1)
-    away = torch.where((found.distance > LEAST).unsqueeze(1), away, outward)
+    away = torch.where((found.distance > ON_SURFACE).unsqueeze(1), away, outward)
     return found.distance * side, torch.nn.functional.normalize(away, dim=1, eps=1e-30)
 
 

@@ -147,6 +147,20 @@ class _Smooth(torch.autograd.Function):
 _KNOWN: WeakKeyDictionary[Surface, _Tables] = WeakKeyDictionary()
 
 
+@wp.func
+def normal_of(
+    i: wp.int32,
+    x: wp.array(dtype=Any),
+    starts: wp.array(dtype=wp.int32),
+    others: wp.array(dtype=wp.vec2i),
+):
+    """Area-weighted unit normal of a vertex; zero where triangles have no area."""
+    total = x[i] - x[i]
+    for k in range(starts[i], starts[i + 1]):
+        total += wp.cross(x[others[k][0]] - x[i], x[others[k][1]] - x[i])
+    return wp.normalize(total)
+
+
 @wp.kernel
 def _normals(
     first: wp.int32,
@@ -156,10 +170,7 @@ def _normals(
     out: wp.array(dtype=Any),
 ):
     i = first + wp.tid()
-    total = x[i] - x[i]
-    for k in range(starts[i], starts[i + 1]):
-        total += wp.cross(x[others[k][0]] - x[i], x[others[k][1]] - x[i])
-    out[i] = wp.normalize(total)
+    out[i] = normal_of(i, x, starts, others)
 
 
 @wp.func

@@ -13,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+from .around import normal_of
 from .network import FLOOR
 
 NORMAL, STRAIN = 1, 2
@@ -75,20 +76,6 @@ def _laid_out(parts: Parts, smoothed: int) -> tuple[Parts, tuple[int, ...], tupl
     own = (*((row, 0) for row in range(rows)), *(part for part in parts if part[1] == STRAIN))
     place = tuple(own.index((row, 0 if kind == NORMAL else kind)) for row, kind in parts)
     return own, place, tuple(kind == NORMAL for _, kind in parts), rows - smoothed
-
-
-@wp.func
-def normal_of(
-    i: wp.int32,
-    x: wp.array(dtype=wp.vec3f),
-    corners: wp.array(dtype=wp.int32),
-    others: wp.array(dtype=wp.vec2i),
-):
-    """Area-weighted unit normal of a vertex; zero where triangles have no area."""
-    total = wp.vec3f()
-    for k in range(corners[i], corners[i + 1]):
-        total += wp.cross(x[others[k][0]] - x[i], x[others[k][1]] - x[i])
-    return wp.normalize(total)
 
 
 def _averaging(smoothed: tuple[int, ...], wholes: int) -> Any:
