@@ -22,6 +22,7 @@ from physgraph_usd.fabric import Fabric
 from physgraph_usd.group import Group
 from physgraph_usd.integrate import METHODS, paper_network
 from physgraph_usd.integrate.base import Carry, Integrator, System
+from physgraph_usd.integrate.features import NORMAL, seeing
 from physgraph_usd.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
 from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
 from physgraph_usd.integrate.paper_network import PaperConfig
@@ -87,6 +88,8 @@ def test_edges_in_pieces_are_the_edges_at_once(monkeypatch: pytest.MonkeyPatch):
         {"means": False, "strain": True},
         {"strain": True, "depth": 3},
         {"strain": True, "cosines": "few"},
+        {"means": False, "cosines": "few", "soft": 0.2},
+        {"strain": True, "soft": 0.2},
     ],
 )
 @pytest.mark.parametrize(
@@ -96,6 +99,7 @@ def test_edges_in_pieces_are_the_edges_at_once(monkeypatch: pytest.MonkeyPatch):
         ("secant", "metric", "metric1", "move1"),
         ("secant", "secant.normal", "metric.strain", "diagonal.smooth"),
         ("secant", "metric", "secant.normal", "metric.normal", "metric.smooth", "secant.smooth"),
+        ("secant", "metric.normal", "diagonal", "diagonal.normal", "diagonal1.normal"),
     ],
 )
 def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str, Any]):
@@ -109,6 +113,16 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str
         move, expected = one.propose(system, carry), other.propose(system, carry)
         assert float((move - expected).abs().max()) < 1e-5 * float(expected.abs().max())
         assert not bool(move[~system.free.squeeze(1)].any())
+
+
+def test_networks_of_one_size_do_not_share_a_kernel():
+    """Warp keeps what it compiled under a hash that does not see everything; the names of the kernels must."""
+    three, two = ((0, 0), (1, 0), (0, NORMAL)), ((0, 0), (1, 0), (1, NORMAL))
+    soft, hard = (((share,) * 3,) * 3 for share in (0.1, 0.0))
+    made = [(three, ((0, 1), (0, 2)), soft), (two, ((0, 1), (0, 2)), soft), (three, ((0, 1), (1, 2)), soft)]
+    made.append((three, ((0, 1), (0, 2)), hard))
+    names = {seeing(parts, pairs, (), shares, means=False).module.name for parts, pairs, shares in made}
+    assert len(names) == len(made)
 
 
 def test_few_cosines_are_those_of_whole_vectors_and_of_what_belongs_together():

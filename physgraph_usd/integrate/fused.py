@@ -23,7 +23,7 @@ from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
 from .around import Around
 from .features import NORMAL, STRAIN, Parts, seeing
-from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of, pairs_of
+from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of, families, pairs_of
 
 LOG_SCALE = 0.5 / math.log(10.0)
 LOG_OFFSET = 1.5
@@ -86,7 +86,8 @@ class FusedPhysgraph:
         given = {"device": device, "lanes": lanes}
         seen = [wp.from_torch(self._squares), wp.from_torch(self._cosines), vectors(self._scaled.reshape(-1, 3))]
         between = tuple((a, b) for a, b in self._pairs.T.tolist())
-        see = seeing(self._parts, between, self._smoothed, means=config.means)
+        shares = tuple(tuple(column) for column in (config.soft**2 * families(config.vectors)).T.tolist())
+        see = seeing(self._parts, between, self._smoothed, shares, means=config.means)
         self._see = Launch(see, vertices, [*shared, x, number, others, number, number, *seen], **given)
         self._mesh: object = None
         self._spacing: Tensor | None = None

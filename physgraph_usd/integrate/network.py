@@ -8,6 +8,7 @@ the cloth exactly, whatever the weights.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,6 +72,8 @@ class PhysgraphConfig:
         strain: Show each vertex the strain of its edges.
         means: Show each vertex what its garment as a whole does; without, a patch moves as it would in any garment.
         cosines: Between "all" vectors, or "few" of them (`pairs_of`).
+        soft: Least length that a vector shows, over the root mean square of its family's at the vertex (`families`).
+            Without, cosines and logarithms jump where a vector vanishes, and a step magnifies rounding a hundredfold.
     """
 
     vectors: tuple[str, ...] = ("metric", "metric1", "move1", "move2", "diagonal")
@@ -80,6 +83,7 @@ class PhysgraphConfig:
     strain: bool = False
     means: bool = True
     cosines: str = "all"
+    soft: float = 0.0
 
 
 class Physgraph(nn.Module):
@@ -93,8 +97,10 @@ class Physgraph(nn.Module):
         first, second = pairs_of(config)
         self._first: Tensor
         self._second: Tensor
+        self._family: Tensor
         self.register_buffer("_first", first, persistent=False)
         self.register_buffer("_second", second, persistent=False)
+        self.register_buffer("_family", families(config.vectors), persistent=False)
         numbers = count + len(first)
         self.encode = nn.Linear(numbers + 3 * config.strain, width)
         self.encode_means = nn.Linear(1 + numbers * config.means, width, bias=False)
@@ -122,7 +128,7 @@ class Physgraph(nn.Module):
             graph: Where numbers flow.
         """
         square = vectors.square().sum(dim=2)  # V N
-        length = (square + FLOOR**2).sqrt()  # V N
+        length = (square + self.config.soft**2 * (square @ self._family) + FLOOR**2).sqrt()  # V N
         unit = vectors / length.unsqueeze(2)  # V N 3
         cosine = (unit[:, self._first] * unit[:, self._second]).sum(dim=2)  # V P
         local = [_scaled_log(length), cosine]
@@ -161,6 +167,18 @@ class Physgraph(nn.Module):
         degree = h.new_zeros(len(h), 1).index_add_(0, here, sent[:, :1] * 0 + 1).clamp_min(1.0)
         mean = torch.zeros_like(h).index_add_(0, here, sent) / degree  # V W
         return self.update(torch.cat([torch.relu(h), mean], dim=1))  # V W
+
+
+def families(names: Sequence[str]) -> Float[Tensor, "vectors vectors"]:
+    """What gives each vector the mean square of its family, out of the squares of all.
+
+    Forces over the diagonal are one family, displacements the other: they differ in size by what H0^-1 carries from
+    afar. Normal parts belong to their vector's family and do not count in its mean.
+    """
+    scaled = torch.tensor([name.startswith("diagonal") for name in names])
+    counts = torch.tensor([not name.endswith(".normal") for name in names])
+    same = ((scaled[:, None] == scaled) & counts[:, None]).float()
+    return same / same.sum(dim=0).clamp_min(1.0)
 
 
 def pairs_of(config: PhysgraphConfig) -> Int[Tensor, "2 pairs"]:
