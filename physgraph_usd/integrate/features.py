@@ -197,7 +197,6 @@ def _showing(place: tuple[int, ...], crosses: tuple[bool, ...], pairs: Pairs, *,
                 scaled[a * vertices + i] = w
         for p in range(wp.static(len(pairs))):
             a, b = wp.static(pairs[p][0]), wp.static(pairs[p][1])
-            product = wp.float32(0.0)
             if wp.static(crosses[pairs[p][0]] and crosses[pairs[p][1]]):
                 product = height[a] * height[b]
             elif wp.static(crosses[pairs[p][0]]):
