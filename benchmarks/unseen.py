@@ -92,7 +92,7 @@ def cases(
     """
     known: dict[str, float] = json.loads(cache.read_text()) if cache and cache.exists() else {}
     for name in shots:
-        opened = _opened(name)
+        opened = opened_garment(name)
         if opened is None:
             continue
         garment, gravity, points = opened
@@ -100,7 +100,7 @@ def cases(
             frame = replace(points, fabric=PRESETS[fabric])
             label = f"{name.partition('/')[0].partition('.')[0]}, {fabric}"
             single, double = (
-                _group(garment, gravity, d, level=level, device=device) for d in (torch.float32, torch.float64)
+                plain_group(garment, gravity, d, level=level, device=device) for d in (torch.float32, torch.float64)
             )
             key = f"{label}, level {level}"
             if key not in known:
@@ -176,7 +176,7 @@ def history(system: System, integrator: Integrator, x: torch.Tensor, steps: int)
     return energies
 
 
-def _opened(name: str) -> tuple[Garment, np.ndarray, GarmentFrame] | None:
+def opened_garment(name: str) -> tuple[Garment, np.ndarray, GarmentFrame] | None:
     """Garment, gravity and frame of a shot, or None where it is not there."""
     prim, time_code = SHOTS[name]
     with tempfile.TemporaryDirectory() as folder:
@@ -192,7 +192,8 @@ def _opened(name: str) -> tuple[Garment, np.ndarray, GarmentFrame] | None:
         return replace(garment, colliders=()), shot.scene.gravity, frame.garments[0]
 
 
-def _group(garment: Garment, gravity: np.ndarray, dtype: torch.dtype, *, level: int, device: str) -> Group:
+def plain_group(garment: Garment, gravity: np.ndarray, dtype: torch.dtype, *, level: int, device: str) -> Group:
+    """One garment's levels, without contact."""
     settings = SolveSettings(method_named("quasi-newton"))
     chains = refine_garments([garment], [level])
     return Group([garment], chains, gravity, settings, dtype=dtype, device=device, lanes=LANES)
