@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,15 +54,28 @@ def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart
     assert found.reason
 
 
-@pytest.mark.parametrize(("device", "contact", "learned"), [("cpu", None, False), ("cuda", None, True)])
-@pytest.mark.parametrize("warm", [False, True])
-def test_the_network_makes_the_steps_on_cuda(device: str, contact: Seen | None, learned: bool, warm: bool):
-    found = choose(None, 2, contact, warm=warm, device=device, remaining=moving)
+@pytest.mark.parametrize(
+    ("device", "subdivisions", "warm", "learned"),
+    [
+        ("cpu", 1, False, False),
+        ("cpu", 2, False, True),
+        ("cpu", 3, False, True),
+        ("cpu", 2, True, False),
+        ("cuda", 1, False, True),
+        ("cuda", 2, False, True),
+        ("cuda", 2, True, True),
+    ],
+)
+def test_the_network_makes_the_steps_on_cuda_and_where_levels_are_many(
+    device: str, subdivisions: int, warm: bool, learned: bool
+):
+    options: dict[str, Any] = {"warm": warm, "device": device, "remaining": moving}
+    found = choose(None, subdivisions, None, **options)
     assert found.learned == learned
     assert ("physgraph" in found.reason) == learned
     assert found.integrator(QuasiNewton).name == ("physgraph" if learned else "quasi-newton")
-    assert not choose(None, 2, Seen(0.01), warm=warm, device=device, remaining=moving).learned
-    assert not choose(True, 2, contact, warm=warm, device=device, remaining=moving).learned
+    assert not choose(None, subdivisions, Seen(0.01), **options).learned
+    assert not choose(True, subdivisions, None, **options).learned
 
 
 @pytest.mark.parametrize(("move", "crowding", "nested"), [(0.02, 0.0, False), (0.02, 0.5, True), (0.3, 0.0, True)])
@@ -75,7 +89,7 @@ def test_refine_leaves_it_open():
     assert RefineOptions().solve_settings().method.nested is None
 
 
-@pytest.mark.parametrize(("level", "same", "steps"), [(1, "quasi-newton-flat", 12 * LONGER), (2, "quasi-newton", 12)])
+@pytest.mark.parametrize(("level", "same", "steps"), [(1, "quasi-newton-flat", 12 * LONGER), (2, "physgraph", 12)])
 def test_auto_is_what_it_chose_to_the_bit(level: int, same: str, steps: int):
     mesh, rest = sheet(8, 6)
     points = wave(rest)

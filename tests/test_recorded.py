@@ -72,6 +72,31 @@ def test_resuming_keeps_the_memory():
     assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
 
 
+def test_a_step_that_another_shortened_is_followed():
+    """As the guard does it: a step is proposed, half of it taken back, then half of the rest; memory is kept."""
+    system, x = problem()
+    network = random_network(LOCAL, seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    ends = []
+    for integrator in (LearnedMetric(network), Recorder(network)):
+        carry = integrator.start(system, x)
+        for _ in range(3):
+            carry = integrator.step(system, carry)
+        move = integrator.step(system, carry).x - carry.x
+        integrator.follow(system, carry, carry.x + 0.5 * move)
+        after = integrator.follow(system, carry, carry.x + 0.25 * move)
+        assert torch.allclose(after.x, carry.x + 0.25 * move)
+        assert after.energy == pytest.approx(system.energy_and_force(after.x)[0], rel=1e-6)
+        ends.append(integrator.step(system, after).x)
+    assert float((ends[0] - ends[1]).abs().max()) < 1e-3 * float(system.spacing.mean())
+    # A step of its own, followed, is that step.
+    integrator = LearnedMetric(network)
+    carry = integrator.step(system, integrator.start(system, x))
+    own = integrator.step(system, carry)
+    again = integrator.follow(system, carry, own.x)
+    assert float((integrator.propose(system, again) - integrator.propose(system, own)).abs().max()) < 1e-6
+
+
 @pytest.mark.parametrize("integrator", ["quasi-newton", "physgraph"])
 def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, monkeypatch: pytest.MonkeyPatch):
     """A cold frame, warm ones with a tether, and another fabric: systems aimed anew give the same bytes."""

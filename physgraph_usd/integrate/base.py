@@ -218,3 +218,19 @@ def resumed(integrator: Integrator, system: System, carry: Carry) -> Carry:
     if isinstance(integrator, Resumable):
         return integrator.resume(system, carry)
     return integrator.start(system, carry.x)
+
+
+@runtime_checkable
+class Following(Protocol):
+    """An integrator that learns from steps that another makes."""
+
+    def follow(self, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
+        """Evaluate x [m] and remember the way from the carry to there as a step of its own."""
+        ...
+
+
+def followed(integrator: Integrator, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
+    """Go on from x [m], to which another than the integrator has moved; start again where that is all one can."""
+    if isinstance(integrator, Following):
+        return integrator.follow(system, carry, x)
+    return integrator.start(system, x)

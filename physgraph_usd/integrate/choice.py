@@ -6,8 +6,8 @@ cloth: who lies above whom is settled at the cage. `python -m benchmarks.front` 
 table. What starts from the last frame's detail starts at the finest level in any case.
 
 On CUDA the network's step costs less than quasi-Newton's and goes further (docs/learned.md, `python -m
-benchmarks.learned --device cuda`); on the CPU it costs more than it gains. Where cloth presses on cloth the guard
-rejects most of its steps, so there quasi-Newton makes them everywhere.
+benchmarks.learned --device cuda`). On the CPU it costs more, and pays where a cold frame goes through two coarse levels
+or more. Where cloth presses on cloth the guard rejects most of its steps, so there quasi-Newton makes them everywhere.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ LONGER = 4
 """Steps of the finest level alone over those that it takes after coarse ones."""
 CROWDED = 0.1
 """Part of the vertices with cloth near them from which a cold frame goes through the levels."""
-
+DEEP = 2
+"""Subdivisions from which the network makes a cold frame's steps on the CPU too."""
 RESTING = 0.05
 """Remaining move of the cage, in its edge lengths, under which it is nearly at rest."""
 
@@ -82,9 +83,10 @@ def choose(
     if nested is not None:
         return Choice(nested and not warm)
     alone = not warm and subdivisions > 0 and (subdivisions == 1 or remaining() < RESTING)
-    crowding = contact.crowding if contact is not None and (alone or device != "cpu") else 0.0
-    learned = device != "cpu" and not crowding
-    who = "; physgraph, the quicker one on CUDA" if learned else ""
+    deep = not warm and not alone and subdivisions >= DEEP
+    crowding = contact.crowding if contact is not None and (alone or deep or device != "cpu") else 0.0
+    learned = (deep or device != "cpu") and not crowding
+    who = f"; physgraph, the quicker one {'there' if device == 'cpu' else 'on CUDA'}" if learned else ""
     if warm:
         return Choice(False, reason=who.removeprefix("; "), learned=learned)
     if crowding > CROWDED and alone:

@@ -7,15 +7,16 @@ import math
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, Integrator, System, resumed
+from .base import Carry, Integrator, System, followed, resumed
 from .quasi_newton import backtrack
 
 
 class Guard:
     """Wraps any integrator; with it no result is worse than the input, whatever the integrator proposes.
 
-    A step that raises the energy is halved, then quartered, then replaced by a step along H0^-1 F with a line search;
-    after such a correction the integrator starts again from there. ``Carry.mover`` says who moved.
+    A step that raises the energy is halved, then quartered, then replaced by a step along H0^-1 F with a line search.
+    The integrator goes on from there: with what it has learned and this step, if it can follow another's, else anew.
+    ``Carry.mover`` says who moved.
     """
 
     def __init__(self, inner: Integrator) -> None:
@@ -39,11 +40,11 @@ class Guard:
         move = proposed.x - carry.x
         if bool(move.isfinite().all()):
             for fraction, mover in ((0.5, "halved"), (0.25, "quartered")):
-                shorter = self._inner.start(system, carry.x + fraction * move)
+                shorter = followed(self._inner, system, carry, carry.x + fraction * move)
                 if shorter.energy <= carry.energy:
                     return shorter.moved_by(mover)
         direction = system.apply_metric_inverse(carry.force)
         found = backtrack(system, carry, direction, float((carry.force * direction).sum()))
         if found is None:
             return carry.moved_by("stayed")
-        return self._inner.start(system, found[0]).moved_by("fallback")
+        return followed(self._inner, system, carry, found[0]).moved_by("fallback")

@@ -31,8 +31,8 @@ from .base import Carry, Surface, System
 from .fused import can_fuse, fused_physgraph
 from .network import Graph, Physgraph
 from .paper_network import PaperNetwork, Ways
-from .quasi_newton import Pair, two_loop
 from .recorded import FORCE, IMAGE, MOST_GARMENTS, SECANTS, Place, Recording
+from .secants import Secant, secant_direction, secant_of
 
 NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
 
@@ -43,23 +43,13 @@ RECORDINGS = 6
 
 
 @dataclass(frozen=True, eq=False)
-class _Secant:
-    """A difference of positions, of negative forces, of their images under H0^-1, and 1 / s.y of each garment or 0."""
-
-    move: Tensor
-    yields: Tensor
-    image: Tensor
-    inverse: Tensor
-
-
-@dataclass(frozen=True, eq=False)
 class _Memory:
     """The last steps, newest first: H0^-1 F, displacements [m] and forces [N]; the secants; the number of steps."""
 
     images: tuple[Tensor, ...]
     forces: tuple[Tensor, ...]
     moves: tuple[Tensor, ...] = ()
-    pairs: tuple[_Secant, ...] = ()
+    pairs: tuple[Secant, ...] = ()
     step: int = 0
     graph: Graph | None = field(default=None, repr=False)
 
@@ -117,6 +107,14 @@ class LearnedMetric:
         energy, force = system.energy_and_force(x)
         image = system.apply_smooth_inverse(force)
         return Carry(x, energy, force, image, self.name, self._remember(carry, move, force, image=image))
+
+    def follow(self, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
+        """Evaluate x [m] and remember the way there as a step of the network's."""
+        energy, force = system.energy_and_force(x)
+        image = system.apply_smooth_inverse(force)
+        if isinstance(carry.memory, Place):
+            return carry.memory.recording.follow(carry, x, energy, force, image)
+        return Carry(x, energy, force, image, self.name, self._remember(carry, x - carry.x, force, image=image))
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
@@ -200,7 +198,7 @@ class LearnedMetric:
         pairs = old.pairs
         if "secant" in self._network.config.vectors:
             assert old.graph is not None
-            pair = _secant(move, carry.force - force, old.images[0] - image, graph=old.graph)
+            pair = secant_of(move, carry.force - force, old.images[0] - image, graph=old.graph)
             pairs = (*pairs, pair)[-SECANTS:]
         return replace(
             old,
@@ -271,56 +269,6 @@ def placed(network: NetworkT, system: System, dtype: torch.dtype) -> NetworkT:
 def integrator_of(network: Physgraph | PaperNetwork) -> LearnedMetric | LearnedPaper:
     """The integrator that uses a network."""
     return LearnedMetric(network) if isinstance(network, Physgraph) else LearnedPaper(network)
-
-
-def secant_direction(
-    force: Float[Tensor, "vertices 3"],
-    image: Float[Tensor, "vertices 3"],
-    pairs: tuple[_Secant, ...],
-    *,
-    graph: Graph,
-) -> Float[Tensor, "vertices 3"]:
-    """The L-BFGS direction [m], as in `quasi_newton`, for each garment by itself.
-
-    Args:
-        force: [N].
-        image: H0^-1 F [m].
-        pairs: Secants, oldest first.
-        graph: Which vertex belongs to which garment.
-    """
-    if pairs and graph.garments == 1 and not (force.is_cuda or force.requires_grad) and float(pairs[-1].inverse) > 0:
-        known = ((pair, float(pair.inverse)) for pair in pairs)
-        good = tuple(Pair(pair.move, pair.yields, pair.image, 1.0 / each) for pair, each in known if each > 0)
-        return two_loop(force, image, good)
-    weights = []
-    for pair in reversed(pairs):
-        weight = pair.inverse * _dots(pair.move, force, graph)
-        force = torch.addcmul(force, weight, pair.yields, value=-1.0)
-        image = torch.addcmul(image, weight, pair.image, value=-1.0)
-        weights.append(weight)
-    if pairs:
-        newest = pairs[-1]
-        own = newest.inverse > 0
-        size = _dots(newest.yields, newest.image, graph)
-        image = image * torch.where(own, 1.0 / torch.where(own, newest.inverse * size, 1.0), 1.0)
-    for pair, weight in zip(pairs, reversed(weights), strict=True):
-        image = torch.addcmul(image, weight - pair.inverse * _dots(pair.yields, image, graph), pair.move)
-    return image
-
-
-def _secant(move: Tensor, yields: Tensor, image: Tensor, *, graph: Graph) -> _Secant:
-    """A secant that counts where its curvature is safely positive."""
-    curvature = _dots(move, yields, graph)
-    floor = 1e-8 * (_dots(move, move, graph) * _dots(yields, yields, graph)).sqrt()
-    good = (curvature > floor) & (_dots(yields, image, graph) > 0)
-    return _Secant(move, yields, image, torch.where(good, 1.0 / torch.where(good, curvature, 1.0), 0.0))
-
-
-def _dots(a: Tensor, b: Tensor, graph: Graph) -> Tensor:
-    """Scalar products of each garment, at each of its vertices."""
-    if graph.garments == 1:
-        return torch.dot(a.reshape(-1), b.reshape(-1)).reshape(1, 1)
-    return graph.total((a * b).sum(dim=1, keepdim=True))[graph.owner]
 
 
 def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices"]) -> Float[Tensor, "vertices 3"]:

@@ -74,6 +74,8 @@ class PhysgraphConfig:
         cosines: Between "all" vectors, or "few" of them (`pairs_of`).
         soft: Least length that a vector shows, over the root mean square of its family's at the vertex (`families`).
             Without, cosines and logarithms jump where a vector vanishes, and a step magnifies rounding a hundredfold.
+        noise: Standard deviation of what is added to each vertex's features in training, so that a small change of them
+            never decides.
     """
 
     vectors: tuple[str, ...] = ("metric", "metric1", "move1", "move2", "diagonal")
@@ -84,6 +86,7 @@ class PhysgraphConfig:
     means: bool = True
     cosines: str = "all"
     soft: float = 0.0
+    noise: float = 0.0
 
 
 class Physgraph(nn.Module):
@@ -135,7 +138,10 @@ class Physgraph(nn.Module):
         if self.config.strain and strain is not None:
             local.append(_strain_features(strain, graph))  # V 3
         means = self._means(vectors, square, step, graph=graph)  # G 1 or G 1+N+P
-        h = self.encode(torch.cat(local, dim=1)) + self.encode_means(means)[graph.owner]  # V W
+        seen = torch.cat(local, dim=1)
+        if self.training and self.config.noise:
+            seen = seen + self.config.noise * torch.randn_like(seen)
+        h = self.encode(seen) + self.encode_means(means)[graph.owner]  # V W
         for layer in self.hidden:
             h = layer(torch.relu(h))  # V W
         for _ in range(self.config.rounds):

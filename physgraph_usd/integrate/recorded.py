@@ -3,7 +3,7 @@
 A step of some hundred small kernels costs a GPU a tenth of a millisecond and Python several: replayed, only the first
 is left. Everything between two steps lives in buffers that stay where they are. The L-BFGS direction is a combination
 of vectors whose coefficients depend on their scalar products alone, so one product of matrices, a kernel of one thread
-a garment and one more product replace the two loops of `learned.secant_direction`.
+a garment and one more product replace the two loops of `secants.secant_direction`.
 
 | symbol | here | meaning |
 |---|---|---|
@@ -80,7 +80,7 @@ class Recording:
         self._combine = Launch(_KERNEL[like["dtype"]], len(self._spans), arrays, device=str(like["device"]))
         self._graph: torch.cuda.CUDAGraph | None = None
         self._loaded = False
-        self.version = 0
+        self.version, self._from = 0, -1
 
     def begin(self, x: Tensor, energy: float, force: Tensor, image: Tensor) -> Carry:
         """Start at x with an empty memory."""
@@ -113,9 +113,21 @@ class Recording:
             self.begin(carry.x, carry.energy, carry.force, carry.preconditioned)
         self._run()
         self.system.evaluations += 1
+        self._from = place.version
         self.version += 1
         x, force, image = self.x.clone(), self.rows[FORCE].clone(), self.rows[IMAGE].clone()
         return Carry(x, float(self.energy), force, image, "physgraph", Place(self, self.version))
+
+    def follow(self, carry: Carry, x: Tensor, energy: float, force: Tensor, image: Tensor) -> Carry:
+        """Put a step from a carry to x in the place of the one that was made from there last."""
+        place: Place = carry.memory
+        if place.version != self._from:
+            return self.begin(x, energy, force, image)
+        last = SECANTS - 1
+        self.rows[last].copy_(x - carry.x)
+        self.rows[SECANTS + last].copy_(self.force_before - force)
+        self.rows[2 * SECANTS + last].copy_(self.images[0] - image)
+        return self.go_on(x, energy, force, image)
 
     def direction(self) -> Float[Tensor, "vertices 3"]:
         """The L-BFGS direction of each garment [m]."""
@@ -190,7 +202,7 @@ def two_loops(
     weight: Any,
     along: Any,
 ):
-    """The recursion of `learned.secant_direction` on scalar products; ``inverse`` is 1 / s.y, or 0 for a bad pair."""
+    """The recursion of `secants.secant_direction` on scalar products; ``inverse`` is 1 / s.y, or 0 for a bad pair."""
     n = wp.static(SECANTS)
     for k in range(n):
         i = n - 1 - k
