@@ -7,7 +7,7 @@ table. What starts from the last frame's detail starts at the finest level in an
 
 On CUDA the network's step costs less than quasi-Newton's and goes further (docs/learned.md, `python -m
 benchmarks.learned --device cuda`). On the CPU it costs more, and pays where a cold frame goes through two coarse levels
-or more. Where cloth presses on cloth the guard rejects most of its steps, so there quasi-Newton makes them everywhere.
+or more. Elsewhere, where cloth presses on cloth, the guard rejects most of its steps, and quasi-Newton makes them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LONGER = 4
 CROWDED = 0.1
 """Part of the vertices with cloth near them from which a cold frame goes through the levels."""
 DEEP = 2
-"""Subdivisions from which the network makes a cold frame's steps on the CPU too."""
+"""Subdivisions from which the network makes the steps of a cold frame that goes through the levels, on the CPU too."""
 RESTING = 0.05
 """Remaining move of the cage, in its edge lengths, under which it is nearly at rest."""
 
@@ -83,14 +83,17 @@ def choose(
     if nested is not None:
         return Choice(nested and not warm)
     alone = not warm and subdivisions > 0 and (subdivisions == 1 or remaining() < RESTING)
-    deep = not warm and not alone and subdivisions >= DEEP
-    crowding = contact.crowding if contact is not None and (alone or deep or device != "cpu") else 0.0
-    learned = (deep or device != "cpu") and not crowding
-    who = f"; physgraph, the quicker one {'there' if device == 'cpu' else 'on CUDA'}" if learned else ""
+    asked = alone or (device != "cpu" and (warm or subdivisions < DEEP))
+    crowding = contact.crowding if contact is not None and asked else 0.0
+    crowded = alone and crowding > CROWDED
+    deep = (crowded or not alone) and not warm and subdivisions >= DEEP
+    learned = deep or (device != "cpu" and not crowding)
+    who = f"; physgraph, the quicker one {'there' if deep else 'on CUDA'}" if learned else ""
     if warm:
         return Choice(False, reason=who.removeprefix("; "), learned=learned)
-    if crowding > CROWDED and alone:
-        return Choice(True, reason="level by level: cloth crosses cloth, or much of it lies near some")
+    if crowded:
+        reason = f"level by level: cloth crosses cloth, or much of it lies near some{who}"
+        return Choice(True, reason=reason, learned=learned)
     if not alone:
         return Choice(True, reason=f"level by level: {subdivisions} subdivisions{who}", learned=learned)
     why = "one subdivision" if subdivisions == 1 else "the cage is nearly at rest"
