@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.lanes import Launch
+from ..mesh.lanes import LEAST_QUERIES, Launch
 from .cluster_kernels import any_of_ring, cluster_boxes, edge_boxes, rings_turn
 
 TURNED = math.radians(85.0)
@@ -98,7 +98,8 @@ class Clusters:
         self._launch(kernel, [*self._shared, *inputs])({})
 
     def _launch(self, kernel: wp.Kernel, inputs: Sequence[object]) -> Launch:
-        return Launch(kernel, self.count, inputs, device=self._level.device, lanes=self._level.lanes)
+        given = {"device": self._level.device, "lanes": self._level.lanes, "least": LEAST_QUERIES}
+        return Launch(kernel, self.count, inputs, **given)
 
     def _array(self, values: np.ndarray, dtype: type = wp.int32) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=dtype, device=self._level.device)

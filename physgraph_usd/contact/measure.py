@@ -14,7 +14,7 @@ from torch import Tensor
 from ..colliders.base import Nearest, Surface
 from ..colliders.mesh import MeshSurface
 from ..level import Level
-from ..mesh.lanes import Launch
+from ..mesh.lanes import LEAST_QUERIES, Launch
 
 DETOUR = 1.05
 """The nearest face is buried where the way out is longer than this, over the distance to it."""
@@ -231,5 +231,5 @@ def _faces_met(mesh: wp.Mesh, start: Tensor, end: Tensor, *, lanes: int) -> Int[
     if len(start):
         points = [wp.from_torch(each.to(torch.float32).contiguous(), dtype=wp.vec3f) for each in (start, end)]
         inputs = [mesh.id, *points, wp.from_torch(face)]
-        Launch(_pierce, len(start), inputs, device=str(start.device), lanes=lanes)({})
+        Launch(_pierce, len(start), inputs, device=str(start.device), lanes=lanes, least=LEAST_QUERIES)({})
     return face
