@@ -11,6 +11,7 @@ from brute import Soup, contour_length, crossings
 from energies import evaluate
 from folds import EDGE, SHAPES, crumpled, curved, folded, levels_of, named, placed, square, strip, view_of
 
+from physgraph_usd.contact import untangle
 from physgraph_usd.contact.cloth import ClothView
 from physgraph_usd.contact.cloth_mesh import ClothMesh, Crossings
 from physgraph_usd.contact.untangle import cut_off, gaps_out, ways_out
@@ -142,6 +143,18 @@ class TestCutOff:
             assert off[second].mean() < 0.5
             side = under if under[second].mean() < 0.5 else ~under
             np.testing.assert_array_equal(off[second], side[second])
+
+    def test_looking_near_the_crossings_first_changes_nothing(self, monkeypatch: pytest.MonkeyPatch):
+        level, x = pair("tilted")
+        mesh, found = found_in(level, x)
+        asked: list[int] = []
+        whole = untangle.pieces_of
+        monkeypatch.setattr(untangle, "pieces_of", lambda *given: (asked.append(1), whole(*given))[1])
+        for count in (1, 2, 5, len(found.edge)):
+            some = Crossings(found.edge[:count], found.face[:count], count)
+            piece, off, _ = whole(mesh, some)
+            np.testing.assert_array_equal(cut_off(mesh, some).numpy(), off[piece])
+        assert 0 < len(asked) < 4
 
     def test_nothing_without_crossings(self):
         level, _ = pair("tilted")

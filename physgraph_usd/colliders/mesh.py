@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..mesh.lanes import Launch
+from ..mesh.lanes import LEAST_QUERIES, Launch
 from .base import Nearest
 from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
@@ -251,7 +251,8 @@ class MeshSurface:
 
     def _run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
         """Launch over points in slices on several threads."""
-        Launch(kernel, count, [mesh.id, *inputs], device=self._device, lanes=self._lanes)({})
+        given = {"device": self._device, "lanes": self._lanes, "least": LEAST_QUERIES}
+        Launch(kernel, count, [mesh.id, *inputs], **given)({})
 
     def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
         """Whether closest points lie on a rim edge or a rim vertex."""

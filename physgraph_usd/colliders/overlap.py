@@ -13,7 +13,7 @@ import warp as wp
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ..mesh.lanes import Launch
+from ..mesh.lanes import LEAST_QUERIES, Launch
 from ..mesh.piercing import passes_through
 
 
@@ -65,5 +65,5 @@ def overlapping(mesh: wp.Mesh, faces: Int[Tensor, " faces"], *, lanes: int = 1) 
     if len(faces):
         ask = faces.to(torch.int32).contiguous()
         inputs = [mesh.id, wp.from_torch(ask), mesh.points, mesh.indices, wp.from_torch(out)]
-        Launch(_overlap, len(faces), inputs, device=str(faces.device), lanes=lanes)({})
+        Launch(_overlap, len(faces), inputs, device=str(faces.device), lanes=lanes, least=LEAST_QUERIES)({})
     return out > 0

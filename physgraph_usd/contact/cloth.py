@@ -155,8 +155,8 @@ class ClothView:
 
     @cached_property
     def before(self) -> ClothState:
-        """The upsampled cage."""
-        return self.look(self._base)
+        """The upsampled cage; what was looked at last stays known."""
+        return self._look(self._base, None)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ClothState:
         """Find what crosses at x; the answer is kept for the same tensor, unless it was written to since."""

@@ -22,9 +22,11 @@ def has(t: wp.vec3i, v: wp.int32):
 
 @wp.func
 def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.vec3f):
-    """Whether two boxes meet."""
-    first = low[0] <= other_high[0] and low[1] <= other_high[1] and low[2] <= other_high[2]
-    return first and other_low[0] <= high[0] and other_low[1] <= high[1] and other_low[2] <= high[2]
+    """Whether two boxes meet; all six comparisons are made, for a wrong guess at a branch costs more."""
+    first = wp.where(low[0] <= other_high[0], 1, 0) & wp.where(low[1] <= other_high[1], 1, 0)
+    second = wp.where(low[2] <= other_high[2], 1, 0) & wp.where(other_low[0] <= high[0], 1, 0)
+    third = wp.where(other_low[1] <= high[1], 1, 0) & wp.where(other_low[2] <= high[2], 1, 0)
+    return (first & second & third) == 1
 
 
 @wp.func
@@ -134,8 +136,9 @@ def clusters_meet(
     j = wp.int32(0)
     found = wp.int32(0)
     while wp.bvh_query_next(query, j):
-        if found == 0 and not are_apart(i, j, garment, ring_starts, ring, turns, around, meets, garments, reach):
+        if not are_apart(i, j, garment, ring_starts, ring, turns, around, meets, garments, reach):
             found = 1
+            break
     if found == 1:
         for m in range(first_face[i], first_face[i + 1]):
             for corner in range(3):

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
 from ..colliders.mesh import MeshSurface
+from ..colliders.sign import MARGIN
 from ..level import Level
-from ..mesh.lanes import Launch
+from ..mesh.lanes import LEAST_QUERIES, Launch
 
 DETOUR = 1.05
 """The nearest face is buried where the way out is longer than this, over the distance to it."""
@@ -188,7 +189,8 @@ def pierced(
     """
     ends = level.edges.long()
     start, end = x[ends[:, 0]], x[ends[:, 1]]
-    near = torch.nonzero(distance[ends].sum(dim=1) <= (end - start).norm(dim=1)).squeeze(1)
+    length = (end - start).norm(dim=1)
+    near = torch.nonzero(distance[ends].sum(dim=1) <= length).squeeze(1)
     none = near[:0]
     if not len(near):
         return Pierced(none, none)
@@ -196,14 +198,16 @@ def pierced(
         inside = surface.inside(x)[ends[near]]
         return Pierced(near[inside[:, 0] != inside[:, 1]], none)
     faces = _faces_met(surface.mesh, start[near], end[near], lanes=level.lanes)
-    return Pierced(near[faces >= 0], _through_cloth(surface, level, x, distance))
+    return Pierced(near[faces >= 0], _through_cloth(surface, level, x, distance, longest=float(length.max())))
 
 
-def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tensor) -> Int[Tensor, " triangles"]:
-    """The cloth's triangles that the body's edges pass through."""
-    corners = x[level.triangles.long()]
-    sides = (corners - corners.roll(1, dims=1)).norm(dim=2)
-    near = torch.nonzero(distance[level.triangles.long()].amin(dim=1) <= COVER * sides.amax(dim=1)).squeeze(1)
+def _through_cloth(
+    surface: MeshSurface, level: Level, x: Tensor, distance: Tensor, *, longest: float
+) -> Int[Tensor, " triangles"]:
+    """The cloth's triangles that the body's edges pass through; no side is longer than the longest [m]."""
+    least = distance[level.triangles.long()].amin(dim=1)
+    near = torch.nonzero(least <= COVER * longest).squeeze(1)
+    near = near[least[near] <= _farthest_inside(x[level.triangles[near].long()])]
     if not len(near):
         return near
     used = torch.zeros(len(x), dtype=torch.bool, device=x.device)
@@ -225,11 +229,20 @@ def _through_cloth(surface: MeshSurface, level: Level, x: Tensor, distance: Tens
     return near[faces[faces >= 0].long()]
 
 
+def _farthest_inside(corners: Float[Tensor, "triangles 3 3"]) -> Float[Tensor, " triangles"]:
+    """No point of a triangle is farther than this from its nearest corner [m]: its circumradius is one bound."""
+    across = corners - corners.roll(1, dims=1)
+    sides = across.norm(dim=2)
+    twice_area = torch.linalg.cross(across[:, 0], across[:, 1]).norm(dim=1)
+    circumradius = sides.prod(dim=1) / (2.0 * twice_area).clamp_min(1e-30)
+    return torch.minimum(COVER * sides.amax(dim=1), MARGIN * circumradius)
+
+
 def _faces_met(mesh: wp.Mesh, start: Tensor, end: Tensor, *, lanes: int) -> Int[Tensor, " segments"]:
     """The first face of a mesh that each segment meets, -1 where there is none."""
     face = torch.full((len(start),), -1, dtype=torch.int32, device=start.device)
     if len(start):
         points = [wp.from_torch(each.to(torch.float32).contiguous(), dtype=wp.vec3f) for each in (start, end)]
         inputs = [mesh.id, *points, wp.from_torch(face)]
-        Launch(_pierce, len(start), inputs, device=str(start.device), lanes=lanes)({})
+        Launch(_pierce, len(start), inputs, device=str(start.device), lanes=lanes, least=LEAST_QUERIES)({})
     return face

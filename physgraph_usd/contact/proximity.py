@@ -135,23 +135,18 @@ def box_of_vertices(
 
 
 @wp.func
-def is_own_face(
-    v: wp.int32,
-    t: wp.vec3i,
-    weight: wp.vec3f,
-    distance: float,
-    cosine: float,
-    rest: wp.array(dtype=wp.vec3f),
-    starts: wp.array(dtype=wp.int32),
-    beside: wp.array(dtype=wp.int32),
-):
-    """Whether a face of the same garment is next to the vertex, or in its plane, where it belongs."""
-    at_rest = rest[v] - (weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]])
-    if belongs(distance, wp.length(at_rest), cosine):
-        return True
-    if is_beside(v, t[0], starts, beside) or is_beside(v, t[1], starts, beside):
-        return True
-    return is_beside(v, t[2], starts, beside)
+def is_face_beside(v: wp.int32, t: wp.vec3i, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
+    """Whether a neighbour of v is a corner of a triangle."""
+    for k in range(starts[v], starts[v + 1]):
+        if has(t, ring[k]):
+            return True
+    return False
+
+
+@wp.func
+def at_rest(t: wp.vec3i, weight: wp.vec3f, rest: wp.array(dtype=wp.vec3f)):
+    """Where a point of a triangle is at rest."""
+    return weight[0] * rest[t[0]] + weight[1] * rest[t[1]] + weight[2] * rest[t[2]]
 
 
 @wp.func
@@ -177,7 +172,7 @@ def keep_nearest(
 
 
 @wp.kernel
-def faces_near(  # noqa: C901 - one query, each candidate refused as early as can be
+def faces_near(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
     first: wp.int32,
     tree: wp.uint64,
     low: wp.array(dtype=wp.vec3f),
@@ -222,21 +217,25 @@ def faces_near(  # noqa: C901 - one query, each candidate refused as early as ca
             continue
         for k in range(begin, end):
             v = vertices[k]
-            grow = wp.vec3f(wp.max(best[v][0], best[v][1]))
-            if not asked[v] or not overlap(x[v] - grow, x[v] + grow, low[j], high[j]):
+            p, grow = x[v], wp.vec3f(wp.max(best[v][0], best[v][1]))
+            lower, upper = p - grow, p + grow
+            if not asked[v] or not overlap(lower, upper, low[j], high[j]):
                 continue
             for m in range(first_face[j], first_face[j + 1]):
                 t = triangles[m]
-                if not overlap(x[v] - grow, x[v] + grow, face_low[m], face_high[m]) or has(t, v):
+                if not overlap(lower, upper, face_low[m], face_high[m]) or has(t, v):
                     continue
-                weight = closest_on_triangle(x[v], x[t[0]], x[t[1]], x[t[2]])
-                way = x[v] - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
+                if same:
+                    if is_face_beside(v, t, starts, beside):
+                        continue
+                weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
+                way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
                 distance = wp.length(way)
                 if distance > wp.max(best[v][0], best[v][1]) or distance < LEAST:
                     continue
                 cosine = wp.dot(way, normal[v]) / distance
                 if same:
-                    if is_own_face(v, t, weight, distance, cosine, rest, starts, beside):
+                    if belongs(distance, wp.length(rest[v] - at_rest(t, weight, rest)), cosine):
                         continue
                 side = keep_nearest(v, number[m], distance, cosine, best, face)
                 if side > 0:
@@ -333,17 +332,19 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             a, b, e = edges[k][0], edges[k][1], number[k]
             if not (asked[a] or asked[b]):
                 continue
-            grow = wp.vec3f(wp.max(best[e][0], best[e][1]))
+            p, q, grow = x[a], x[b], wp.vec3f(wp.max(best[e][0], best[e][1]))
             lower, upper = edge_low[k] - grow, edge_high[k] + grow
             if not overlap(lower, upper, low[j], high[j]):
                 continue
             for m in range(first_edge[j], first_edge[j + 1]):
                 if not overlap(lower, upper, edge_low[m], edge_high[m]) or share_an_end(edges[k], edges[m]):
                     continue
-                places = places_inside(x[a], x[b], x[edges[m][0]], x[edges[m][1]])
+                places = places_inside(p, q, x[edges[m][0]], x[edges[m][1]])
+                if places[0] < 0.0:
+                    continue
                 way = between(x, edges[k], edges[m], places[0], places[1])
                 distance = wp.length(way)
-                if places[0] < 0.0 or distance > wp.max(best[e][0], best[e][1]) or distance < LEAST:
+                if distance > wp.max(best[e][0], best[e][1]) or distance < LEAST:
                     continue
                 cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
                 if same:

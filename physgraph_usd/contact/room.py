@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
-from ..mesh.lanes import Launch
+from ..mesh.lanes import LEAST_QUERIES, Launch
 
 OFF = 1e-5
 """How far off the surface a ray starts, so that it does not meet where it starts [m]."""
@@ -57,5 +57,7 @@ def room_above(
     limit = reach.to(torch.float32).contiguous()
     inputs = [wp.from_torch(each, dtype=wp.vec3f) for each in (start, along)]
     inputs += [wp.from_torch(each) for each in (limit, found)]
-    Launch(_ahead, len(point), [surface.mesh.id, *inputs], device=str(point.device), lanes=lanes)({})
+    Launch(_ahead, len(point), [surface.mesh.id, *inputs], device=str(point.device), lanes=lanes, least=LEAST_QUERIES)(
+        {}
+    )
     return found.to(room)

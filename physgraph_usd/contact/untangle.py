@@ -33,6 +33,8 @@ from .cloth_mesh import ClothMesh, Crossings, joined_by
 
 GRAZING = 0.2
 """Least |N.E|: an edge that lies almost in the face would be sent far along the normal."""
+NEAR = 2
+"""Rings round crossing edges within which their ends mostly hang together without them."""
 
 
 def ways_out(
@@ -80,8 +82,23 @@ def cut_off(mesh: ClothMesh, crossings: Crossings) -> Bool[Tensor, " vertices"]:
         mesh: The cloth.
         crossings: What crosses.
     """
+    if _stays_joined(mesh, crossings):
+        return torch.zeros_like(mesh.level.free[:, 0])
     piece, off, _ = pieces_of(mesh, crossings)
     return torch.as_tensor(off[piece], device=mesh.level.rest.device)
+
+
+def _stays_joined(mesh: ClothMesh, crossings: Crossings) -> bool:
+    """Whether the ends of every crossing edge hang together near it without any of those: then nothing is cut off."""
+    ends, crossing = mesh.level.edges.cpu().numpy(), crossings.edge.cpu().numpy()
+    around = torch.zeros_like(mesh.level.free[:, 0])
+    around[torch.as_tensor(ends[crossing].reshape(-1), device=around.device).long()] = True
+    near = np.all(mesh.grown(around, NEAR).cpu().numpy()[ends], axis=1)
+    near = np.flatnonzero(near & ~np.isin(np.arange(len(ends)), crossing))
+    places, number = np.unique(np.concatenate([ends[crossing], ends[near]]), return_inverse=True)
+    number = number.reshape(-1, 2)
+    piece = joined_by(number[len(crossing) :], len(places))[number[: len(crossing)]]
+    return bool((piece[:, 0] == piece[:, 1]).all())
 
 
 def pieces_of(mesh: ClothMesh, crossings: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,13 +17,22 @@ import warp as wp
 
 LEAST_PER_LANE = 4000
 """Items below which another lane costs more than it saves."""
+LEAST_QUERIES = 250
+"""The same where each item asks a hierarchy or stands for many elements."""
 
 
 class Launch:
     """One kernel over items 0 to size - 1; the kernel's first parameter is its slice's first item."""
 
     def __init__(
-        self, kernel: wp.Kernel, size: int, inputs: Sequence[wp.array], *, device: str, lanes: int = 1
+        self,
+        kernel: wp.Kernel,
+        size: int,
+        inputs: Sequence[wp.array],
+        *,
+        device: str,
+        lanes: int = 1,
+        least: int = LEAST_PER_LANE,
     ) -> None:
         """Prepare the launch.
 
@@ -33,8 +42,9 @@ class Launch:
             inputs: The kernel's arrays; those that change are given again at each call.
             device: "cpu" or a CUDA device.
             lanes: Most threads to use on the CPU.
+            least: Items below which another of them costs more than it saves.
         """
-        lanes = max(1, min(lanes, size // LEAST_PER_LANE)) if device == "cpu" else 1
+        lanes = max(1, min(lanes, size // least)) if device == "cpu" else 1
         self._device = None if device == "cpu" else device
         bounds = np.linspace(0, size, lanes + 1).astype(int).tolist()
         self._commands: list[wp.Launch] = []
