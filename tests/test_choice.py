@@ -21,6 +21,7 @@ class Seen:
     """Contact where some part of the cloth lies near cloth."""
 
     crowding: float
+    crossed: bool = False
 
 
 def moving() -> float:
@@ -76,6 +77,7 @@ def test_the_network_makes_the_steps_on_cuda_and_where_levels_are_many(
     assert found.integrator(QuasiNewton).name == ("physgraph" if learned else "quasi-newton")
     deep = subdivisions > 1 and not warm
     assert choose(None, subdivisions, Seen(0.01), **options).learned == deep
+    assert not choose(None, subdivisions, Seen(1.0, crossed=True), **options).learned
     assert not choose(True, subdivisions, None, **options).learned
 
 

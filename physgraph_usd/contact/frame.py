@@ -103,6 +103,7 @@ class FrameContact:
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._aim: Tensor | None = None
+        self._crossed = False
         self._held: Tensor | None = None
         self._bodies, self._cloth = bodies, cloth
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
@@ -118,15 +119,21 @@ class FrameContact:
                 cage = self._levels[0]
                 bodies = None if self._bodies is None else self._bodies.at(cage, self._levels[-1])
                 view = self._cloth_at(cage, cage.base.apply(self._coarse))
+                self._crossed = view is not None and view.before.crossings.count > 0
                 self._aim = repaired_cage(
                     cage,
                     self._coarse,
                     bodies=bodies,
                     mesh=self._cloth.mesh(cage),
                     gap=float(self._thickness.mean()),
-                    crosses=view is not None and view.before.crossings.count > 0,
+                    crosses=self._crossed,
                 )
         return self._aim
+
+    @property
+    def crossed(self) -> bool:
+        """Whether the cage crosses itself."""
+        return self.aim is not None and self._crossed
 
     def at(self, level: Level) -> LevelContact:
         """The view of one level, the same at each call."""

@@ -7,7 +7,8 @@ table. What starts from the last frame's detail starts at the finest level in an
 
 On CUDA the network's step costs less than quasi-Newton's and goes further (docs/learned.md, `python -m
 benchmarks.learned --device cuda`). On the CPU it costs more, and pays where a cold frame goes through two coarse levels
-or more. Elsewhere, where cloth presses on cloth, the guard rejects most of its steps, and quasi-Newton makes them.
+or more and the cage does not cross itself. Elsewhere, where cloth presses on cloth, the guard rejects most of its
+steps, and quasi-Newton makes them.
 """
 
 from __future__ import annotations
@@ -56,6 +57,11 @@ class Crowd(Protocol):
     """What is asked of contact."""
 
     @property
+    def crossed(self) -> bool:
+        """Whether the cage crosses itself."""
+        ...
+
+    @property
     def crowding(self) -> float:
         """Part of the vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
         ...
@@ -83,10 +89,10 @@ def choose(
     if nested is not None:
         return Choice(nested and not warm)
     alone = not warm and subdivisions > 0 and (subdivisions == 1 or remaining() < RESTING)
-    asked = alone or (device != "cpu" and (warm or subdivisions < DEEP))
-    crowding = contact.crowding if contact is not None and asked else 0.0
+    many = not warm and subdivisions >= DEEP and not (contact is not None and contact.crossed)
+    crowding = contact.crowding if contact is not None and (alone or (device != "cpu" and not many)) else 0.0
     crowded = alone and crowding > CROWDED
-    deep = (crowded or not alone) and not warm and subdivisions >= DEEP
+    deep = many and (crowded or not alone)
     learned = deep or (device != "cpu" and not crowding)
     who = f"; physgraph, the quicker one {'there' if deep else 'on CUDA'}" if learned else ""
     if warm:
