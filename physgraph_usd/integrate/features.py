@@ -85,7 +85,6 @@ def _laid_out(parts: Parts, smoothed: int) -> tuple[Parts, tuple[int, ...], tupl
 
 def _averaging(smoothed: tuple[int, ...], wholes: int) -> Any:
     """The function that writes the means over a vertex's neighbours of some rows behind the whole ones."""
-    means_of = wp.types.matrix(shape=(max(len(smoothed), 1), 3), dtype=wp.float32)
 
     @wp.func
     def average(
@@ -95,13 +94,12 @@ def _averaging(smoothed: tuple[int, ...], wholes: int) -> Any:
         far: wp.array(dtype=wp.int32),
         v: wp.array(dtype=wp.vec3f),
     ):
-        total = means_of()
-        for k in range(ends[i], ends[i + 1]):
-            for s in range(wp.static(len(smoothed))):
-                total[s] += v[wp.static(smoothed[s]) * vertices + far[k]]
         share = wp.float32(1.0) / wp.float32(wp.max(ends[i + 1] - ends[i], 1))
         for s in range(wp.static(len(smoothed))):
-            v[wp.static(wholes + s) * vertices + i] = share * total[s]
+            total = wp.vec3f()
+            for k in range(ends[i], ends[i + 1]):
+                total += v[wp.static(smoothed[s]) * vertices + far[k]]
+            v[wp.static(wholes + s) * vertices + i] = share * total
 
     return average
 

@@ -15,8 +15,8 @@ class Guard:
     """Wraps any integrator; with it no result is worse than the input, whatever the integrator proposes.
 
     A step that raises the energy is halved, then quartered, then replaced by a step along H0^-1 F with a line search.
-    The integrator goes on from there: with what it has learned and this step, if it can follow another's, else anew.
-    ``Carry.mover`` says who moved.
+    From a shortened step the integrator goes on with what it has learned, if it can follow another's step. From one that
+    was replaced it starts anew: what it had learned misled it. ``Carry.mover`` says who moved.
     """
 
     def __init__(self, inner: Integrator) -> None:
@@ -47,4 +47,4 @@ class Guard:
         found = backtrack(system, carry, direction, float((carry.force * direction).sum()))
         if found is None:
             return carry.moved_by("stayed")
-        return followed(self._inner, system, carry, found[0]).moved_by("fallback")
+        return self._inner.start(system, found[0]).moved_by("fallback")
