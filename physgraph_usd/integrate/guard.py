@@ -15,8 +15,8 @@ class Guard:
     """Wraps any integrator; with it no result is worse than the input, whatever the integrator proposes.
 
     A step that raises the energy is halved, then quartered, then replaced by a step along H0^-1 F with a line search.
-    From a shortened step the integrator goes on with what it has learned, if it can follow another's step. From one that
-    was replaced it starts anew: what it had learned misled it. ``Carry.mover`` says who moved.
+    From a shortened step the integrator goes on with what it has learned, if it can follow another's step. From one
+    that was replaced it starts anew: what it had learned misled it. ``Carry.mover`` says who moved.
     """
 
     def __init__(self, inner: Integrator) -> None:
