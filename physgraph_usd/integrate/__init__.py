@@ -13,7 +13,7 @@ from ..errors import UsageError
 from .base import Integrator
 from .first_order import Adam, GradientDescent
 from .guard import Guard
-from .learned import integrator_of
+from .learned import guarded
 from .newton import Newton
 from .quasi_newton import QuasiNewton
 from .weights import load_network, shipped_network
@@ -40,8 +40,8 @@ METHODS: dict[str, Method] = {
     "adam": Method(lambda: Guard(Adam()), nested=False),
     "gd": Method(lambda: Guard(GradientDescent()), nested=False),
     "newton": Method(Newton, nested=True),
-    "physgraph": Method(lambda: Guard(integrator_of(shipped_network("physgraph"))), nested=True),
-    "physgraph-paper": Method(lambda: Guard(integrator_of(shipped_network("physgraph-paper"))), nested=False),
+    "physgraph": Method(lambda: guarded(shipped_network("physgraph")), nested=True),
+    "physgraph-paper": Method(lambda: guarded(shipped_network("physgraph-paper")), nested=False),
 }
 """Every method by its name on the command line."""
 LEARNED = ("physgraph", "physgraph-paper")
@@ -66,4 +66,4 @@ def method_named(name: str, weights: Path | None = None) -> Method:
     if name not in LEARNED:
         raise UsageError(f"integrator '{name}' has no weights; name one that has: {', '.join(LEARNED)}")
     network = load_network(weights, kind=name)
-    return Method(lambda: Guard(integrator_of(network)), nested=METHODS[name].nested)
+    return Method(lambda: guarded(network), nested=METHODS[name].nested)

@@ -175,6 +175,7 @@ class Carry:
         preconditioned: H0^-1 F at x [m] where the integrator knows it.
         mover: Who made the last step: the integrator's name, "halved", "quartered", "fallback" or "stayed".
         memory: The integrator's own state.
+        setbacks: Corrections of the guard in a row, up to this step.
     """
 
     x: Float[Tensor, "vertices 3"]
@@ -183,6 +184,7 @@ class Carry:
     preconditioned: Float[Tensor, "vertices 3"] | None = None
     mover: str = ""
     memory: Any = None
+    setbacks: int = 0
 
     def moved_by(self, mover: str) -> Carry:
         """The same carry under another mover's name."""

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from .base import Integrator
-from .guard import Guard
-from .learned import integrator_of
+from .learned import guarded
 from .weights import shipped_network
 
 LONGER = 4
@@ -50,7 +49,7 @@ class Choice:
 
     def integrator(self, asked: Callable[[], Integrator]) -> Integrator:
         """The integrator: the network's, or what the method builds."""
-        return Guard(integrator_of(shipped_network("physgraph"))) if self.learned else asked()
+        return guarded(shipped_network("physgraph")) if self.learned else asked()
 
 
 class Crowd(Protocol):

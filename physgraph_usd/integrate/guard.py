@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor
@@ -10,33 +11,57 @@ from torch import Tensor
 from .base import Carry, Integrator, System, followed, resumed
 from .quasi_newton import backtrack
 
+PATIENCE = 4
+"""Corrections in a row after which an integrator gives way to its spare."""
+
 
 class Guard:
     """Wraps any integrator; with it no result is worse than the input, whatever the integrator proposes.
 
     A step that raises the energy is halved, then quartered, then replaced by a step along H0^-1 F with a line search.
     From a shortened step the integrator goes on with what it has learned, if it can follow another's step. From one
-    that was replaced it starts anew: what it had learned misled it. ``Carry.mover`` says who moved.
+    that was replaced it starts anew: what it had learned misled it. After `PATIENCE` corrections in a row the spare
+    integrator, where there is one, makes the level's other steps. ``Carry.mover`` says who moved.
     """
 
-    def __init__(self, inner: Integrator) -> None:
-        """Wrap an integrator."""
+    def __init__(self, inner: Integrator, *, spare: Integrator | None = None) -> None:
+        """Wrap an integrator.
+
+        Args:
+            inner: It proposes the steps.
+            spare: One that needs no guard, for levels at which the other fails, or None.
+        """
         self.name = inner.name
-        self._inner = inner
+        self._inner, self._spare = inner, spare
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Start the wrapped integrator."""
         return self._inner.start(system, x)
 
     def resume(self, system: System, carry: Carry) -> Carry:
-        """Go on under forces that changed a little, as the wrapped integrator can."""
+        """Go on under forces that changed a little, as who made the last step can."""
+        spare = self._spare_of(carry)
+        if spare is not None:
+            return replace(resumed(spare, system, carry), setbacks=carry.setbacks)
         return resumed(self._inner, system, carry)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step whose energy is not above the last one's."""
+        spare = self._spare_of(carry)
+        if spare is not None:
+            return replace(spare.step(system, carry), setbacks=carry.setbacks)
         proposed = self._inner.step(system, carry)
         if math.isfinite(proposed.energy) and proposed.energy <= carry.energy:
             return proposed
+        corrected = replace(self._corrected(system, carry, proposed), setbacks=carry.setbacks + 1)
+        spare = self._spare_of(corrected)
+        if spare is None or corrected.mover == "stayed":
+            return corrected
+        handed = spare.start(system, corrected.x)
+        return replace(handed, mover=corrected.mover, setbacks=corrected.setbacks)
+
+    def _corrected(self, system: System, carry: Carry, proposed: Carry) -> Carry:
+        """Where a step that raised the energy is cut back or replaced."""
         move = proposed.x - carry.x
         if bool(move.isfinite().all()):
             for fraction, mover in ((0.5, "halved"), (0.25, "quartered")):
@@ -48,3 +73,7 @@ class Guard:
         if found is None:
             return carry.moved_by("stayed")
         return self._inner.start(system, found[0]).moved_by("fallback")
+
+    def _spare_of(self, carry: Carry) -> Integrator | None:
+        """Who makes the steps after a carry in the wrapped integrator's place, or None."""
+        return self._spare if carry.setbacks >= PATIENCE else None

@@ -29,8 +29,10 @@ from ..errors import SolveError
 from .around import Around
 from .base import Carry, Surface, System
 from .fused import can_fuse, fused_physgraph
+from .guard import Guard
 from .network import Graph, Physgraph
 from .paper_network import PaperNetwork, Ways
+from .quasi_newton import QuasiNewton
 from .recorded import FORCE, IMAGE, MOST_GARMENTS, SECANTS, Place, Recording
 from .secants import Secant, secant_direction, secant_of
 
@@ -269,6 +271,11 @@ def placed(network: NetworkT, system: System, dtype: torch.dtype) -> NetworkT:
 def integrator_of(network: Physgraph | PaperNetwork) -> LearnedMetric | LearnedPaper:
     """The integrator that uses a network."""
     return LearnedMetric(network) if isinstance(network, Physgraph) else LearnedPaper(network)
+
+
+def guarded(network: Physgraph | PaperNetwork) -> Guard:
+    """The integrator as it is used: guarded, our own with quasi-Newton to spare."""
+    return Guard(integrator_of(network), spare=QuasiNewton() if isinstance(network, Physgraph) else None)
 
 
 def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices"]) -> Float[Tensor, "vertices 3"]:

@@ -11,7 +11,8 @@ import torch
 from cloth import finest_system, group_of, sheet, wave
 
 from physgraph_usd.integrate.base import Carry, System
-from physgraph_usd.integrate.guard import Guard
+from physgraph_usd.integrate.guard import PATIENCE, Guard
+from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.solve import Budget, solve_level
 
 Proposal = Callable[[Carry, torch.Generator], torch.Tensor]
@@ -90,6 +91,19 @@ def test_s37_random_networks_fall_back_and_say_so(seed: int):
     system, x = problem()
     carries = descent(system, x, PROPOSALS["huge"], seed=seed, steps=5)
     assert {carry.mover for carry in carries[1:]} == {"fallback"}
+
+
+def test_s37_after_corrections_in_a_row_the_spare_makes_the_steps():
+    system, x = problem()
+    carries: list[Carry] = []
+    guard = Guard(Adversary(PROPOSALS["huge"]), spare=QuasiNewton())
+    _, report = solve_level(system, guard, x, level=0, budget=Budget(12), observe=carries.append)
+    assert [carry.mover for carry in carries[1:]] == ["fallback"] * PATIENCE + ["quasi-newton"] * (12 - PATIENCE)
+    assert all(after.energy < before.energy for before, after in pairwise(carries))
+    again = guard.step(system, guard.resume(system, carries[-1]))
+    assert (again.mover, report.movers) == ("quasi-newton", {"fallback": PATIENCE, "quasi-newton": 12 - PATIENCE})
+    alone = descent(system, x, PROPOSALS["huge"], steps=12)
+    assert carries[-1].energy < alone[-1].energy
 
 
 def test_s37_a_good_direction_that_overshoots_is_halved_or_quartered():
