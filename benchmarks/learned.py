@@ -6,9 +6,8 @@
 Two tables. The first has every shot and fabric: the gaps at two schedules. The second has one row a candidate: its gap
 over quasi-Newton's at the same number of force evaluations, the time of the same descents over quasi-Newton's, and the
 time to a gap of 3% over quasi-Newton's, as medians over shots and fabrics; on the CPU time is that of all threads
-together. Everything is guarded. Cards stand beside
-the weights (`physgraph-usd train` writes them). Samples are always there; real shots where PHYSGRAPH_DATA names their
-folder. No body pushes.
+together. Everything is guarded, without a spare integrator. Cards stand beside the weights (`physgraph-usd train`
+writes them). Samples are always there; real shots where PHYSGRAPH_DATA names their folder. No body pushes.
 """
 
 from __future__ import annotations

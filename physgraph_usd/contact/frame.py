@@ -103,7 +103,6 @@ class FrameContact:
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._aim: Tensor | None = None
-        self._crossed = False
         self._held: Tensor | None = None
         self._bodies, self._cloth = bodies, cloth
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
@@ -118,22 +117,24 @@ class FrameContact:
             if self._cloth is not None and self._seams is None:
                 cage = self._levels[0]
                 bodies = None if self._bodies is None else self._bodies.at(cage, self._levels[-1])
-                view = self._cloth_at(cage, cage.base.apply(self._coarse))
-                self._crossed = view is not None and view.before.crossings.count > 0
                 self._aim = repaired_cage(
                     cage,
                     self._coarse,
                     bodies=bodies,
                     mesh=self._cloth.mesh(cage),
                     gap=float(self._thickness.mean()),
-                    crosses=self._crossed,
+                    crosses=self.crossed,
                 )
         return self._aim
 
-    @property
+    @cached_property
     def crossed(self) -> bool:
-        """Whether the cage crosses itself."""
-        return self.aim is not None and self._crossed
+        """Whether the cage crosses itself; not looked at where seams hold points together."""
+        if self._cloth is None or self._seams is not None:
+            return False
+        cage = self._levels[0]
+        view = self._cloth_at(cage, cage.base.apply(self._coarse))
+        return view is not None and view.before.crossings.count > 0
 
     def at(self, level: Level) -> LevelContact:
         """The view of one level, the same at each call."""
