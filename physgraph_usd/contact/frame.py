@@ -127,9 +127,14 @@ class FrameContact:
                 )
         return self._aim
 
-    @cached_property
+    @property
     def crossed(self) -> bool:
         """Whether the cage crosses itself; not looked at where seams hold points together."""
+        return self._crossed
+
+    @cached_property
+    def _crossed(self) -> bool:
+        """The same, found once."""
         if self._cloth is None or self._seams is not None:
             return False
         cage = self._levels[0]
