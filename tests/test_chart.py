@@ -26,7 +26,7 @@ from shots import cloth_shot, refine
 
 from physgraph_usd import cli
 from physgraph_usd.chart.journal import Journal
-from physgraph_usd.chart.measure import expected_ms, rungs
+from physgraph_usd.chart.measure import FURTHER, allowance, expected_ms, rungs
 from physgraph_usd.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
 from physgraph_usd.chart.options import LONG, SHORT, ChartOptions
 from physgraph_usd.chart.peers.run import PEERS, Peer, parse_peers
@@ -265,6 +265,12 @@ def test_budgets_grow_by_the_size_s_factor():
     assert list(rungs(2.0))[:5] == [1, 2, 4, 8, 16]
     assert list(rungs(4.0))[:4] == [1, 4, 16, 64]
     assert list(rungs(1.5))[:8] == [1, 2, 3, 4, 6, 8, 12, 16]
+
+
+@pytest.mark.parametrize(("gap", "times"), [(0.5, 1.0), (0.099, FURTHER), (0.031, FURTHER), (0.03, 1.0), (0.001, 1.0)])
+def test_who_is_nearly_there_may_take_longer(gap: float, times: float):
+    assert allowance(gap) == times
+    assert FURTHER > 2.0, "one more budget has to fit"
 
 
 def test_the_next_budget_is_expected_on_a_line():

@@ -17,6 +17,8 @@ from .methods import DEFAULT
 
 GAPS = (0.1, 0.03, 0.01)
 """Gaps to which the time is told."""
+JUDGED = 0.03
+"""The one by which methods are put in order."""
 TOLERANCE = 1.1
 """Times that differ by less than this factor count as equal: medians of a few runs are no better."""
 BUSY = 0.1

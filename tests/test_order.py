@@ -1,0 +1,35 @@
+"""Whether a chart repeats: what `benchmarks.order` says of methods that change places."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("pxr", reason="charts read stages with usd-core")
+pytest.importorskip("matplotlib", reason="charts are drawn with matplotlib")
+
+from benchmarks.order import compared
+
+
+def orders(*runs: str) -> list[str]:
+    """What three methods' places in some runs have in common."""
+    return compared([dict(zip(("a", "b", "c"), map(float, run.split()), strict=False)) for run in runs])
+
+
+def test_runs_have_one_order_where_none_changes_places():
+    assert orders("10 20 40", "15 30 70", "11 21 39")[-1] == "the order is the same in 3 runs"
+
+
+def test_what_is_as_fast_has_no_order():
+    lines = orders("10 20 21", "10 20 19", "10 20 20")
+    assert lines[-1] == "the order is the same in 3 runs"
+    assert "b and c are as fast: 1.05, 0.95, 1.00" in lines
+
+
+@pytest.mark.parametrize(
+    ("last", "word"),
+    [("10 24 20", "b and c change places: 2.00, 1.33, 0.83"), ("10 20", "c gets there in some runs only")],
+)
+def test_runs_differ_where_methods_change_places_or_do_not_get_there(last: str, word: str):
+    lines = orders("10 20 40", "10 30 40", last)
+    assert "the order is not the same" in lines
+    assert word in lines
