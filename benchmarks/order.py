@@ -52,7 +52,7 @@ def times(name: str, minutes: float) -> dict[str, float]:
 
 def compared(runs: Sequence[dict[str, float]]) -> list[str]:
     """The table of some runs, and what their orders have in common."""
-    methods = sorted(set().union(*runs), key=lambda m: statistics.median(run.get(m, float("inf")) for run in runs))
+    methods = sorted(set().union(*runs), key=lambda m: (statistics.median(run.get(m, math.inf) for run in runs), m))
     rows = [[method, *(f"{run[method]:.0f}" if method in run else "-" for run in runs)] for method in methods]
     lines = [table(("method", *(f"run {k + 1}" for k in range(len(runs)))), rows), ""]
     told = []
