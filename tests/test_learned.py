@@ -87,9 +87,8 @@ def test_edges_in_pieces_are_the_edges_at_once(monkeypatch: pytest.MonkeyPatch):
         {"means": False},
         {"means": False, "strain": True},
         {"strain": True, "depth": 3},
-        {"strain": True, "cosines": "few"},
-        {"means": False, "cosines": "few", "soft": 0.2},
-        {"strain": True, "soft": 0.2},
+        {"strain": True, "products": "few"},
+        {"means": False, "products": "few"},
     ],
 )
 @pytest.mark.parametrize(
@@ -118,20 +117,18 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str
 def test_networks_of_one_size_do_not_share_a_kernel():
     """Warp keeps what it compiled under a hash that does not see everything; the names of the kernels must."""
     three, two = ((0, 0), (1, 0), (0, NORMAL)), ((0, 0), (1, 0), (1, NORMAL))
-    soft, hard = (((share,) * 3,) * 3 for share in (0.1, 0.0))
-    made = [(three, ((0, 1), (0, 2)), soft), (two, ((0, 1), (0, 2)), soft), (three, ((0, 1), (1, 2)), soft)]
-    made.append((three, ((0, 1), (0, 2)), hard))
+    one, other = ((0, True),) * 3, ((0, True), (1, True), (0, False))
+    made = [(three, ((0, 1), (0, 2)), one), (two, ((0, 1), (0, 2)), one), (three, ((0, 1), (1, 2)), one)]
+    made.append((three, ((0, 1), (0, 2)), other))
     names = {seeing(parts, pairs, (), shares, means=False).module.name for parts, pairs, shares in made}
     assert len(names) == len(made)
 
 
-def test_few_cosines_are_those_of_whole_vectors_and_of_what_belongs_together():
+def test_few_products_are_those_of_whole_vectors_and_of_what_belongs_together():
     names = ("secant", "metric", "secant.normal", "metric.normal", "move1.normal", "metric.smooth")
-    pairs = [(names[a], names[b]) for a, b in pairs_of(PhysgraphConfig(names, cosines="few")).T.tolist()]
+    pairs = [(names[a], names[b]) for a, b in pairs_of(PhysgraphConfig(names, products="few")).T.tolist()]
     assert set(pairs) == {
         ("secant", "metric"),
-        ("secant", "secant.normal"),
-        ("metric", "metric.normal"),
         ("metric", "metric.smooth"),
         ("secant.normal", "metric.normal"),
         ("secant.normal", "move1.normal"),

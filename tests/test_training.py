@@ -15,15 +15,16 @@ from physgraph_usd.cli import main
 from physgraph_usd.errors import UsageError
 from physgraph_usd.forces.base import ForceModule
 from physgraph_usd.forces.contact import Contact
+from physgraph_usd.integrate.base import Carry, System
 from physgraph_usd.integrate.learned import integrator_of
 from physgraph_usd.integrate.network import PhysgraphConfig
 from physgraph_usd.integrate.paper_network import PaperConfig
 from physgraph_usd.integrate.weights import load_network, random_network
-from physgraph_usd.train import record
+from physgraph_usd.train import loop, record
 from physgraph_usd.train.bundle import Bundle, deal
-from physgraph_usd.train.loop import TrainConfig, Trainer, detached, loss_of, nested_gap
+from physgraph_usd.train.loop import TrainConfig, Trainer, loss_of, nested_gap
 from physgraph_usd.train.patches import Patch, PatchConfig, describe, make_patches
-from physgraph_usd.train.unroll import JointSystem
+from physgraph_usd.train.unroll import JointSystem, Twin, detached, unrolled
 
 FEW = PatchConfig(count=3, levels=(1, 1), edges=(5, 6), reference_steps=20)
 TINY = """
@@ -212,6 +213,40 @@ def test_training_lowers_the_loss(through_forces: bool):
     trainer.train()
     assert trainer.iteration == 30
     assert mean_gap() < before
+
+
+class Stretching:
+    """Makes every distance three times as long."""
+
+    name = "stretching"
+
+    def start(self, system: System, x: torch.Tensor) -> Carry:
+        return Carry(x, 0.0, torch.zeros_like(x))
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        return replace(carry, x=3.0 * carry.x)
+
+
+def test_a_twin_tells_how_many_times_steps_magnify_a_difference(patches: list[Patch]):
+    system, x = joint(calm(patches))
+    torch.manual_seed(1)
+    twin, carry = Twin(Stretching(), system, x), Stretching().start(system, x)
+    for steps in (2, 1):
+        twin.unroll(steps, beside=carry.x)
+        carry = unrolled(Stretching(), system, carry, steps)
+        assert torch.allclose(twin.growth(carry.x), torch.full((system.garments,), 3.0**steps), rtol=1e-2)
+
+
+def test_what_steadies_a_descent_reaches_the_weights(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(loop, "TWINS", 1.0)
+    config = TrainConfig(network=PhysgraphConfig(width=8, means=False), patches=FEW, unroll=3, segments=1, held_out=0)
+    weights = []
+    for steady in (0.0, 1.0):
+        trainer = Trainer(replace(config, steady=steady, iterations=3))
+        trainer.train()
+        weights.append(torch.cat([p.detach().reshape(-1) for p in trainer.network.parameters()]))
+    assert bool(weights[1].isfinite().all())
+    assert float((weights[0] - weights[1]).abs().max()) > 1e-5
 
 
 def test_detached_carries_hold_no_graph(patches: list[Patch]):

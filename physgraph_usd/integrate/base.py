@@ -117,6 +117,7 @@ class System:
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
+        self._kept = free.to(spacing.dtype)  # A factor of the vectors' own type saves a conversion at each product.
         self.evaluations = 0
         self.metric_solves = 0
 
@@ -128,13 +129,13 @@ class System:
         """Energy [J] and force [N]; the force on vertices that may not move is zero."""
         self.evaluations += 1
         energy, force = self.field.energy_and_force(x)
-        return float(energy), force if self._all_free else force * self.free
+        return float(energy), force if self._all_free else force * self._kept
 
     def apply_metric_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with."""
         self.metric_solves += 1
         move = self.metric.solve(force)
-        return move if self._all_free else move * self.free
+        return move if self._all_free else move * self._kept
 
     def apply_smooth_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m] by the smooth part alone of a metric that has two."""
@@ -142,7 +143,7 @@ class System:
         if smooth is None:
             return self.apply_metric_inverse(force)
         self.metric_solves += 1
-        return smooth(force) * self.free
+        return smooth(force) * self._kept
 
     @cached_property
     def _smooth(self) -> Callable[[Tensor], Tensor] | None:
@@ -157,6 +158,11 @@ class System:
     def rest_diagonal(self) -> Float[Tensor, " vertices"]:
         """Diagonal of H0 [N/m], positive; 1 where a vertex may not move."""
         return self.metric.diagonal.to(self.spacing)
+
+    @cached_property
+    def reach(self) -> Float[Tensor, " vertices"]:
+        """The spacing [m], and 0 where a vertex may not move."""
+        return self.spacing * self._kept.squeeze(1)
 
     def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
         """RMS of H0^-1 F over the free vertices, in local edge lengths."""

@@ -10,7 +10,6 @@ combines; `tests/test_learned.py` holds them against `network.Physgraph`. The sa
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
@@ -23,11 +22,7 @@ from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
 from .around import Around
 from .features import NORMAL, STRAIN, Parts, seeing
-from .network import FLOOR, Physgraph, PhysgraphConfig, clock_of, families, pairs_of
-
-LOG_SCALE = 0.5 / math.log(10.0)
-LOG_OFFSET = 1.5
-"""The networks see (log10 + 3) / 2 of a length."""
+from .network import FLOOR, LOG_OFFSET, LOG_SCALE, Physgraph, PhysgraphConfig, clock_of, counted, families_of, pairs_of
 
 
 def can_fuse(config: PhysgraphConfig, dtype: torch.dtype) -> bool:
@@ -61,52 +56,51 @@ class FusedPhysgraph:
         self.bases, self._smoothed, self._parts = in_rows(config.vectors)
         self._kinds = {kind for _, kind in self._parts}
         self._pairs = pairs_of(config).to(device)
-        pairs = self._pairs.shape[1]
         self._rows = torch.zeros((len(self.bases) + len(self._smoothed), vertices, 3), device=device)
-        self._squares = torch.zeros((self.count, vertices), device=device)
-        self._cosines, self._out = (torch.zeros((vertices, n), device=device) for n in (pairs, 3))
+        self._out = torch.zeros((vertices, 3), device=device)
         self._scaled = torch.zeros((self.count, vertices if config.means else 1, 3), device=device)
-        self._bias, means = network.encode.bias.detach(), network.encode_means.weight.detach()
+        means = network.encode_means.weight.detach()
         self._clock, self._at_means = means[:, 0], means[:, 1:]
         layers = [network.encode, *network.hidden, network.decode]
-        self._weights = [layer.weight.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
-        self._biases = [layer.bias.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue]
+        # Turned, so that each layer is one product whose rows are vertices.
+        self._weights = [layer.weight.detach().T.contiguous() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+        self._biases = [layer.bias.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
         self._biases[-1][0] += 1.0
-        # The features are logarithms of squares as they are: the first layer takes their scale and offset.
-        sizes = [self.count, pairs, 3 * config.strain]
-        lengths, cosines, self._at_stretch = self._weights.pop(0).split(sizes, dim=1)
-        self._bias = self._bias + LOG_OFFSET * lengths.sum(dim=1)
-        self._at_lengths, self._at_cosines = 0.5 * LOG_SCALE * lengths, cosines.contiguous()
-        self._layers = [torch.zeros((bias.numel(), vertices), device=device) for bias in self._biases]
+        self._stretches = 3 * config.strain
+        self._features = torch.zeros((vertices, len(self._weights[0])), device=device)
+        self._layers = [torch.zeros((vertices, len(bias)), device=device) for bias in self._biases]
         flat, spacing = vectors(self._rows.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
         normal = wp.zeros(vertices if NORMAL in self._kinds else 1, dtype=wp.vec3f, device=device)
         strain, x, others = (wp.zeros(1, dtype=t, device=device) for t in (wp.mat33f, wp.vec3f, wp.vec2i))
         number = wp.zeros(1, dtype=wp.int32, device=device)
         shared = [vertices, flat, spacing, normal, strain]
         given = {"device": device, "lanes": lanes}
-        seen = [wp.from_torch(self._squares), wp.from_torch(self._cosines), vectors(self._scaled.reshape(-1, 3))]
+        seen = [wp.from_torch(self._features), vectors(self._scaled.reshape(-1, 3))]
         between = tuple((a, b) for a, b in self._pairs.T.tolist())
-        shares = tuple(tuple(column) for column in (config.soft**2 * families(config.vectors)).T.tolist())
+        shares = tuple(zip(families_of(config.vectors), counted(config.vectors), strict=True))
         see = seeing(self._parts, between, self._smoothed, shares, means=config.means)
         self._see = Launch(see, vertices, [*shared, x, number, others, number, number, *seen], **given)
         self._mesh: object = None
         self._spacing: Tensor | None = None
         ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
+        self._reach: Tensor | None = None
         self._combine = Launch(combining(self._parts), vertices, [*shared, *ends], **given)
 
     def __call__(
         self,
         bases: Sequence[Float[Tensor, "vertices 3"]],
         spacing: Float[Tensor, " vertices"],
+        reach: Float[Tensor, " vertices"],
         step: int | Tensor,
         *,
         around: Callable[[], Around],
     ) -> Float[Tensor, "vertices 3"]:
-        """The displacement [m], no longer than allowed; valid until the next call.
+        """The displacement [m], no longer than allowed.
 
         Args:
             bases: The vectors that `bases` names [m].
             spacing: Mean rest edge at each vertex [m].
+            reach: The same, and 0 where a vertex may not move [m].
             step: Number of steps made before, a scalar on the device while steps are recorded.
             around: Gives the surroundings of the vertices; called where parts need them.
         """
@@ -117,26 +111,27 @@ class FusedPhysgraph:
         seen = around() if self._kinds & {NORMAL, STRAIN} or self._smoothed or self._config.strain else None
         if seen is not None and STRAIN in self._kinds:
             changed[4] = wp.from_torch(seen.strain, dtype=wp.mat33f)
-        self._combine.change(changed)
+            self._combine.change({4: changed[4]})
+        if self._reach is not reach:
+            self._reach = reach
+            self._combine.change({2: wp.from_torch(reach, requires_grad=False)})
         if seen is not None:
             changed[5] = seen.positions
             if self._mesh is not seen.mesh:
                 self._mesh = seen.mesh
                 changed |= dict(enumerate(seen.mesh, start=6))
         self._see(changed)
-        h = self._layers[0]
-        bias = self._bias + self._clock * clock_of(step)
-        torch.addmm(bias.unsqueeze(1), self._at_cosines, self._cosines.T, out=h)
-        h.addmm_(self._at_lengths, self._squares.log_())
-        if seen is not None and self._config.strain:
-            h.addmm_(self._at_stretch, seen.stretch.T)
-        if self._config.means:
-            for span in self._spans:
-                h[:, span] += self._from_means(span).unsqueeze(1)
-        for bias, weight, out in zip(self._biases[1:], self._weights, self._layers[1:], strict=True):
-            h = torch.addmm(bias.unsqueeze(1), weight, h.relu_(), out=out)
+        if seen is not None and self._stretches:
+            self._features[:, -self._stretches :] = seen.stretch
+        h = self._features
+        biases = [self._biases[0] + self._clock * clock_of(step), *self._biases[1:]]
+        for place, (bias, weight, out) in enumerate(zip(biases, self._weights, self._layers, strict=True)):
+            h = torch.addmm(bias, h.relu_() if place else h, weight, out=out)
+            if self._config.means and not place:
+                for span in self._spans:
+                    h[span] += self._from_means(span)
         self._combine({})
-        return self._out
+        return self._out.clone()
 
     def _from_means(self, span: slice) -> Float[Tensor, " width"]:
         """What the first layer takes from a garment's means."""
@@ -145,7 +140,7 @@ class FusedPhysgraph:
         root = (products.diagonal() + FLOOR**2).sqrt()
         first, second = self._pairs
         cosine = products[first, second] / (root[first] * root[second])
-        return self._at_means @ torch.cat([LOG_SCALE * root.log() + LOG_OFFSET, cosine])
+        return self._at_means @ torch.cat([2.0 * LOG_SCALE * root.log() + LOG_OFFSET, cosine])
 
 
 @functools.lru_cache(maxsize=8)
@@ -181,7 +176,7 @@ def combining(parts: Parts) -> wp.Kernel:
         first: wp.int32,
         vertices: wp.int32,
         v: wp.array(dtype=wp.vec3f),
-        spacing: wp.array(dtype=wp.float32),
+        reach: wp.array(dtype=wp.float32),
         normal: wp.array(dtype=wp.vec3f),
         strain: wp.array(dtype=wp.mat33f),
         coefficients: wp.array(dtype=wp.float32, ndim=2),
@@ -198,13 +193,13 @@ def combining(parts: Parts) -> wp.Kernel:
         for a in range(wp.static(len(parts))):
             s = v[wp.static(parts[a][0]) * vertices + i]
             if wp.static(parts[a][1] == NORMAL):
-                lift += coefficients[a, i] * wp.dot(s, across)
+                lift += coefficients[i, a] * wp.dot(s, across)
             elif wp.static(parts[a][1] == STRAIN):
-                move += coefficients[a, i] * (along * s)
+                move += coefficients[i, a] * (along * s)
             else:
-                move += coefficients[a, i] * s
+                move += coefficients[i, a] * s
         move += lift * across
-        far, most = wp.length(move), longest * spacing[i]
+        far, most = wp.length(move), longest * reach[i]
         if far > most:
             move = move * (most / far)
         out[i] = move

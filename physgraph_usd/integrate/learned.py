@@ -137,7 +137,7 @@ class LearnedMetric:
             fused = fused_physgraph(self._network, starts, LONGEST, device=device, lanes=lanes)
             around = cache(lambda: Around(_level(system), x))
             bases = vectors_of(fused.bases, whole, around=around)
-            return fused(bases, system.spacing, step, around=around) * system.free
+            return fused(bases, system.spacing, system.reach, step, around=around)
         stacked = torch.stack(vectors_of(names, whole, around=cache(lambda: Around(_level(system), x))), dim=1)  # V N 3
         needed = self._network.config.strain or self._network.config.rounds > 0
         strain = edge_strain(system, x) if needed else None

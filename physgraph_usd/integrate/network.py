@@ -1,8 +1,8 @@
 """The network of our own learned integrator; it sees numbers without units and knows no force (DESIGN 4.4).
 
 `Physgraph` looks at a few vectors per vertex and answers with the coefficients of their combination. It is told only
-what a rotation does not change: logarithms of lengths, cosines, means over the garment. So the displacement turns with
-the cloth exactly, whatever the weights.
+what a rotation does not change: scalar products over the mean square, and the logarithm of that. So the displacement
+turns with the cloth exactly, whatever the weights.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ VECTORS = (*WHOLE, *(f"{name}.{part}" for name in WHOLE for part in PARTS))
 
 FLOOR = 1e-9
 """Lengths below this many edges count as none."""
+LOG_SCALE, LOG_OFFSET = 0.25 / math.log(10.0), 1.5
+"""The networks see (log10 + 3) / 2 of a length: of its square's natural logarithm so much, and this."""
 FEW = 8
 """Garments up to which sums over each are made one by one."""
 
@@ -71,9 +73,7 @@ class PhysgraphConfig:
         rounds: Rounds of message passing, with shared weights.
         strain: Show each vertex the strain of its edges.
         means: Show each vertex what its garment as a whole does; without, a patch moves as it would in any garment.
-        cosines: Between "all" vectors, or "few" of them (`pairs_of`).
-        soft: Least length that a vector shows, over the root mean square of its family's at the vertex (`families`).
-            Without, cosines and logarithms jump where a vector vanishes, and a step magnifies rounding a hundredfold.
+        products: Between "all" vectors, or "few" of them (`pairs_of`).
         noise: Standard deviation of what is added to each vertex's features in training, so that a small change of them
             never decides.
     """
@@ -84,8 +84,7 @@ class PhysgraphConfig:
     rounds: int = 0
     strain: bool = False
     means: bool = True
-    cosines: str = "all"
-    soft: float = 0.0
+    products: str = "all"
     noise: float = 0.0
 
 
@@ -101,11 +100,13 @@ class Physgraph(nn.Module):
         self._first: Tensor
         self._second: Tensor
         self._family: Tensor
+        self._share: Tensor
         self.register_buffer("_first", first, persistent=False)
         self.register_buffer("_second", second, persistent=False)
-        self.register_buffer("_family", families(config.vectors), persistent=False)
+        self.register_buffer("_family", torch.tensor(families_of(config.vectors)), persistent=False)
+        self.register_buffer("_share", sharing(config.vectors), persistent=False)
         numbers = count + len(first)
-        self.encode = nn.Linear(numbers + 3 * config.strain, width)
+        self.encode = nn.Linear(numbers + self._share.shape[1] + 3 * config.strain, width)
         self.encode_means = nn.Linear(1 + numbers * config.means, width, bias=False)
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(config.depth - 1))
         if config.rounds:
@@ -131,10 +132,10 @@ class Physgraph(nn.Module):
             graph: Where numbers flow.
         """
         square = vectors.square().sum(dim=2)  # V N
-        length = (square + self.config.soft**2 * (square @ self._family) + FLOOR**2).sqrt()  # V N
-        unit = vectors / length.unsqueeze(2)  # V N 3
-        cosine = (unit[:, self._first] * unit[:, self._second]).sum(dim=2)  # V P
-        local = [_scaled_log(length), cosine]
+        size = (square @ self._share + FLOOR**2).sqrt()  # V K
+        unit = vectors / size[:, self._family].unsqueeze(2)  # V N 3
+        product = (unit[:, self._first] * unit[:, self._second]).sum(dim=2)  # V P
+        local = [unit.square().sum(dim=2), product, _scaled_log(size)]
         if self.config.strain and strain is not None:
             local.append(_strain_features(strain, graph))  # V 3
         means = self._means(vectors, square, step, graph=graph)  # G 1 or G 1+N+P
@@ -175,35 +176,48 @@ class Physgraph(nn.Module):
         return self.update(torch.cat([torch.relu(h), mean], dim=1))  # V W
 
 
-def families(names: Sequence[str]) -> Float[Tensor, "vectors vectors"]:
-    """What gives each vector the mean square of its family, out of the squares of all.
+def families_of(names: Sequence[str]) -> tuple[int, ...]:
+    """The family of each vector: forces over the diagonal are one, displacements the other.
 
-    Forces over the diagonal are one family, displacements the other: they differ in size by what H0^-1 carries from
-    afar. Normal parts belong to their vector's family and do not count in its mean.
+    They differ in size by what H0^-1 carries from afar. Families are numbered in the order in which they come.
     """
-    scaled = torch.tensor([name.startswith("diagonal") for name in names])
-    counts = torch.tensor([not name.endswith(".normal") for name in names])
-    same = ((scaled[:, None] == scaled) & counts[:, None]).float()
-    return same / same.sum(dim=0).clamp_min(1.0)
+    kinds = [name.startswith("diagonal") for name in names]
+    order = list(dict.fromkeys(kinds))
+    return tuple(order.index(kind) for kind in kinds)
+
+
+def counted(names: Sequence[str]) -> tuple[bool, ...]:
+    """Which vectors count in their family's mean square: all but normal parts of those that are there themselves."""
+    return tuple(not (part == "normal" and whole in names) for whole, _, part in (n.partition(".") for n in names))
+
+
+def sharing(names: Sequence[str]) -> Float[Tensor, "vectors families"]:
+    """What gives each family's mean square, out of the squares of all vectors."""
+    families = torch.tensor(families_of(names))
+    own = families[:, None] == torch.arange(int(families.max()) + 1)
+    own = (own & torch.tensor(counted(names))[:, None]).float()
+    return own / own.sum(dim=0)
 
 
 def pairs_of(config: PhysgraphConfig) -> Int[Tensor, "2 pairs"]:
-    """The vectors between which a network sees cosines.
+    """The vectors whose scalar products a network sees.
 
-    The part of v along the normal is parallel to that of w: of all their cosines a few say everything. "few" are those
-    between whole vectors, between a part and the vector that it is of, and between a part and the first of its kind.
+    Normal parts are parallel: of their products a few say everything, and that with the vector itself is their square.
+    "few" are those between whole vectors, between a mean or a part by strain and its own vector, and between a part and
+    the first of its kind.
     """
     names = [name.partition(".")[::2] for name in config.vectors]
     kinds = [kind for _, kind in names]
 
     def seen(a: int, b: int) -> bool:
         (whole, kind), (other, part) = names[a], names[b]
-        own = whole == other and not (kind and part)
+        own = whole == other and not (kind and part) and "normal" not in (kind, part)
         return kind == part == "" or own or (kind == part and kinds.index(kind) in (a, b))
 
     count = len(names)
     every = [(a, b) for a in range(count) for b in range(a + 1, count)]
-    return torch.tensor([pair for pair in every if config.cosines == "all" or seen(*pair)]).reshape(-1, 2).T
+    chosen = [pair for pair in every if config.products == "all" or seen(*pair)]
+    return torch.tensor(chosen, dtype=torch.int64).reshape(-1, 2).T
 
 
 def clock_of(step: int | Tensor) -> Any:

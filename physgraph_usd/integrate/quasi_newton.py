@@ -77,7 +77,7 @@ class QuasiNewton:
             return self._forget(system, carry)
         x, energy, force = found
         image = self._image(system, memory.scale, force)
-        pair = _pair(x - carry.x, carry.force - force, memory.image - image)
+        pair = pair_of(x - carry.x, carry.force - force, memory.image - image)
         pairs = memory.pairs if pair is None else (*memory.pairs, pair)[-self._history :]
         return self._carry(x, energy, force, _Memory(pairs, memory.scale, image))
 
@@ -161,7 +161,7 @@ def two_loop(
     return image
 
 
-def _pair(move: Tensor, yields: Tensor, image: Tensor) -> Pair | None:
+def pair_of(move: Tensor, yields: Tensor, image: Tensor) -> Pair | None:
     """A secant pair, or None when its curvature is not safely positive."""
     curvature = _dot(move, yields)
     floor = 1e-8 * (_dot(move, move) * _dot(yields, yields)) ** 0.5

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .network import Graph
-from .quasi_newton import Pair, two_loop
+from .quasi_newton import Pair, pair_of, two_loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +63,9 @@ def secant_direction(
 
 def secant_of(move: Tensor, yields: Tensor, image: Tensor, *, graph: Graph) -> Secant:
     """A secant that counts where its curvature is safely positive."""
+    if graph.garments == 1 and not (move.is_cuda or move.requires_grad):
+        pair = pair_of(move, yields, image)
+        return Secant(move, yields, image, move.new_full((1, 1), 0.0 if pair is None else 1.0 / pair.curvature))
     curvature = _dots(move, yields, graph)
     floor = 1e-8 * (_dots(move, move, graph) * _dots(yields, yields, graph)).sqrt()
     good = (curvature > floor) & (_dots(yields, image, graph) > 0)

@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,12 @@ from ..integrate.quasi_newton import QuasiNewton
 from ..integrate.weights import make_network
 from .bundle import Bundle, deal
 from .patches import Patch, PatchConfig, make_patches
+from .unroll import Twin, detached, unrolled
 
 HARMLESS = 0.02
 """Part of the energy at the start below which the logarithm of the gap stops to reward."""
+TWINS = 1 / 3
+"""Part of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
 SCHEDULES = ((5, 5, 5), (10, 10, 5))
 """Steps a level at which held-out patches are measured."""
 
@@ -48,6 +51,8 @@ class TrainConfig:
         through_forces: Gradients flow through forces too, by differences; else through displacements only (A19).
         loss: "ratio" or "log" of the gap, averaged over the steps (A18).
         late: Weight of step k in that average, as the power of k: 0 counts all alike, more counts where an unroll ends.
+        steady: Weight of how much an unroll magnifies the difference of two descents whose starts differ by noise, as a
+            logarithm. Without, rounding decides where cloth folds.
         raw: Part of the starts that are the upsampled cage.
         middle: Part of the starts where an earlier unroll ended; the others come from a solved level below.
         own: Part of those that the network itself has solved; quasi-Newton the others.
@@ -70,6 +75,7 @@ class TrainConfig:
     through_forces: bool = False
     loss: str = "log"
     late: float = 0.0
+    steady: float = 0.0
     raw: float = 0.4
     middle: float = 0.15
     own: float = 0.5
@@ -177,17 +183,21 @@ class Trainer:
         x = bundle.begin(index, lambda: self._dice(len(bundle.patches)), shares=config)
         integrator = integrator_of(self.network)
         segments = int(self._rng.integers(1, config.segments + 1))
-        carry, total = integrator.start(system, self._turned(x) if config.turn else x), 0.0
+        x = self._turned(x) if config.turn else x
+        twin = Twin(integrator, system, x) if config.steady and self._rng.random() < TWINS else None
+        carry, total = integrator.start(system, x), 0.0
         before = system.energies[-1].detach()
         for _ in range(segments):
             before = system.energies[-1].detach()
+            if twin is not None:
+                twin.unroll(steps, beside=carry.x)
             system.energies.clear()
-            carry = detached(carry)
-            for _ in range(steps):
-                carry = integrator.step(system, carry)
+            carry = unrolled(integrator, system, detached(carry), steps)
             reached = torch.stack(system.energies)  # K P
             bundle.learn(index, reached.detach())
             loss = loss_of(reached, before, bundle.least[index], kind=config.loss, late=config.late)
+            if twin is not None:
+                loss = loss + config.steady / TWINS * twin.growth(carry.x).log().mean()
             if not bool(loss.isfinite()):
                 break
             (loss / segments).backward()
@@ -284,17 +294,6 @@ def loss_of(
         told = (gap.clamp_min(0.0) + HARMLESS).log()
     weight = torch.arange(1, len(gap) + 1, dtype=gap.dtype, device=gap.device) ** late  # K
     return (weight / weight.sum()) @ told.mean(dim=1)
-
-
-def detached(carry: Any) -> Any:
-    """The carry without the graph that led to it."""
-    if isinstance(carry, Tensor):
-        return carry.detach()
-    if isinstance(carry, tuple):
-        return tuple(detached(item) for item in carry)
-    if is_dataclass(carry) and not isinstance(carry, type):
-        return replace(carry, **{f.name: detached(getattr(carry, f.name)) for f in fields(carry)})
-    return carry
 
 
 def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> float:

@@ -1,11 +1,12 @@
-"""A system of many patches that torch can differentiate: gradients through forces and metric solves.
+"""A system of many patches that torch can differentiate, and unrolled steps: gradients through forces and solves.
 
 All patches of a batch are garments of one group, so forces, metric and network each run once for all of them, and each
-patch's energy is known.
+patch's energy is known. A `Twin` unrolls the same steps from a start that differs by noise.
 """
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, cast
 
 import torch
@@ -13,8 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..forces.base import ForceModule
-from ..integrate.base import System
+from ..integrate.base import Carry, Integrator, System
 
+NOISE = 1e-3
+"""Root mean square of what a twin's start differs by, in local edge lengths: well above float32's rounding."""
 NUDGE = 1e-2
 """Displacement of the difference of forces behind a Hessian product, in local edge lengths."""
 
@@ -102,3 +105,52 @@ class _MetricSolve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:  # type: ignore[override]
         return System.apply_metric_inverse(ctx.system, gradients[0].contiguous()), None
+
+
+def unrolled(integrator: Integrator, system: System, carry: Carry, steps: int) -> Carry:
+    """The carry after so many steps."""
+    for _ in range(steps):
+        carry = integrator.step(system, carry)
+    return carry
+
+
+def detached(carry: Any) -> Any:
+    """The carry without the graph that led to it."""
+    if isinstance(carry, Tensor):
+        return carry.detach()
+    if isinstance(carry, tuple):
+        return tuple(detached(item) for item in carry)
+    if is_dataclass(carry) and not isinstance(carry, type):
+        return replace(carry, **{f.name: detached(getattr(carry, f.name)) for f in fields(carry)})
+    return carry
+
+
+class Twin:
+    """A second descent, whose start differs by noise, beside another."""
+
+    def __init__(self, integrator: Integrator, system: JointSystem, x: Float[Tensor, "vertices 3"]) -> None:
+        """Start near x [m]."""
+        self._integrator, self._system = integrator, system
+        drawn = torch.randn(x.shape, dtype=x.dtype, device=x.device) / 3.0**0.5
+        self._carry = integrator.start(system, x + NOISE * system.spacing.unsqueeze(1) * drawn * system.free)
+        self._before = torch.ones(system.garments, dtype=x.dtype, device=x.device)
+
+    def unroll(self, steps: int, *, beside: Float[Tensor, "vertices 3"]) -> None:
+        """Make so many steps; the other descent is at ``beside`` [m] before it makes as many."""
+        self._carry = detached(self._carry)
+        self._before = self._apart(beside).detach()
+        self._carry = unrolled(self._integrator, self._system, self._carry, steps)
+
+    def growth(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " garments"]:
+        """How many times as far as before those steps the two are apart in each garment, the other being at x [m]."""
+        return self._apart(x) / self._before
+
+    def _apart(self, x: Tensor) -> Float[Tensor, " garments"]:
+        """Root mean square distance to x in each garment, in local edge lengths."""
+        system = self._system
+        square = (self._carry.x - x).square().sum(dim=1) / system.spacing.square()  # V
+        total, count = (
+            square.new_zeros(system.garments).index_add_(0, system.owner, values)
+            for values in (square, torch.ones_like(square))
+        )
+        return (total / count + 1e-12).sqrt()
