@@ -102,6 +102,7 @@ layer_options = _together(
         metavar="FILE.json|DIR",
         help="Write what was done; DIR: as a page.",
     ),
+    click.option("--progress", is_flag=True, help="Say each frame in a line of its own, into files and pipes too."),
     overwrite_option,
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )
@@ -278,7 +279,7 @@ def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -
     from .shot import refine_shot
 
     try:
-        with _progress(Path(shot).name) as progress:
+        with _progress(Path(shot).name, in_lines=options.pop("progress", False)) as progress:
             done = refine_shot(shot, layer, RefineOptions(**options, progress=progress))
     except UsageError:
         raise
@@ -346,12 +347,15 @@ def _reports(shots: tuple[str, ...], to: Path) -> Sequence[Path]:
 
 
 @contextmanager
-def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
-    with click.progressbar(length=1, label=label, file=sys.stderr, hidden=not sys.stderr.isatty()) as bar:
+def _progress(label: str, *, in_lines: bool = False) -> Iterator[Callable[[int, int], None]]:
+    hidden = in_lines or not sys.stderr.isatty()
+    with click.progressbar(length=1, label=label, file=sys.stderr, hidden=hidden) as bar:
 
         def show(done: int, total: int) -> None:
             bar.length = total
             bar.update(done - bar.pos)
+            if in_lines:
+                _tell(bar.pct, bar.eta, f"{done} of {total} frames")
 
         yield show
 

@@ -98,6 +98,12 @@ class TestRefine:
         result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", *SMALL)
         assert "%" not in result.stderr
 
+    def test_progress_in_lines_when_asked(self, sample: Sample, tmp_path: Path) -> None:
+        result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", "--progress", *SMALL)
+        lines = [line for line in result.stderr.splitlines() if "frames" in line]
+        assert [line.split()[0] for line in lines] == ["50%", "100%"]
+        assert lines[0].endswith("1 of 2 frames")
+
     def test_dry_run_writes_nothing(self, sample: Sample, tmp_path: Path) -> None:
         result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", "--dry-run", *SMALL)
         assert result.exit_code == 0
@@ -134,7 +140,7 @@ class TestRefine:
         from physgraph_usd.options import RefineOptions
 
         declared = {parameter.name for parameter in cli.refine.params} - {"shots", "out"}
-        assert declared == {field.name for field in fields(RefineOptions)} - {"progress"}
+        assert declared == {field.name for field in fields(RefineOptions)}
 
 
 class TestSeveralShots:
