@@ -1,0 +1,122 @@
+"""What the artist sees: the preferences, the settings of a scene, and the panel in the 3D view's sidebar."""
+
+# No `from __future__ import annotations` here: Blender reads the properties from the annotations themselves.
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+
+from .command import PRESETS, Settings
+from .refine import PHYSGRAPH_OT_refine, now_running
+
+AS_AUTHORED = "AS_AUTHORED"
+FABRICS = [
+    (AS_AUTHORED, "As Authored", "What custom properties of the objects and materials say; jersey where they do not"),
+    *((name, name.capitalize(), f"The fabric {name}; docs/fabrics.md has its values") for name in PRESETS),
+]
+
+
+class PhysGraphPreferences(bpy.types.AddonPreferences):
+    """Where the command is."""
+
+    bl_idname = __package__
+
+    command: StringProperty(
+        name="Command",
+        description="The command physgraph-usd: its path, or its name where it is on the search path",
+        default="physgraph-usd",
+        subtype="FILE_PATH",
+    )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the preferences."""
+        self.layout.prop(self, "command")
+
+
+class PhysGraphSettings(bpy.types.PropertyGroup):
+    """How a scene's garments are refined."""
+
+    preset: EnumProperty(name="Fabric", description="Fabric of the garments", items=FABRICS)
+    use_stretch: BoolProperty(name="Stretch", description="Give the stretch stiffness in place of the fabric's")
+    stretch: FloatProperty(
+        name="Stretch", description="Stretch stiffness E h of the sheet [N/m]", default=30.0, min=1e-3, soft_max=2000.0
+    )
+    use_bend: BoolProperty(name="Bend", description="Give the bending stiffness in place of the fabric's")
+    bend: FloatProperty(
+        name="Bend",
+        description="Bending stiffness D of the sheet [millionths of a N m]",
+        default=4.7,
+        min=0.0,
+        soft_max=500.0,
+    )
+    level: IntProperty(
+        name="Subdivisions",
+        description="Each makes four faces of one; -1 chooses by the fabric's folds",
+        default=2,
+        min=-1,
+        max=5,
+    )
+    scene_frames: BoolProperty(name="Scene's Frames", description="Refine the frames of the scene", default=True)
+    frame_start: IntProperty(name="Start", description="First frame to refine", default=1)
+    frame_end: IntProperty(name="End", description="Last frame to refine", default=250)
+    colliders: PointerProperty(
+        name="Colliders", description="The cloth rests on the meshes of this collection", type=bpy.types.Collection
+    )
+    hide_coarse: BoolProperty(name="Hide Coarse", description="Hide the coarse garments when the fine ones are there")
+    report: BoolProperty(name="Report", description="Write a page about the run, with pictures and plots")
+    more: StringProperty(
+        name="Options", description="Further options of 'physgraph-usd refine', such as --device cuda --workers 4"
+    )
+    last_report: StringProperty(options={"HIDDEN"})
+
+    def as_given(self, scene: bpy.types.Scene) -> Settings:
+        """The settings as the command takes them."""
+        frames = (scene.frame_start, scene.frame_end) if self.scene_frames else (self.frame_start, self.frame_end)
+        return Settings(
+            frames=frames,
+            preset="" if self.preset == AS_AUTHORED else self.preset,
+            stretch=self.stretch if self.use_stretch else None,
+            bend=self.bend * 1e-6 if self.use_bend else None,
+            level=self.level,
+            report=self.report,
+            more=self.more,
+        )
+
+
+class PHYSGRAPH_PT_panel(bpy.types.Panel):
+    """The panel."""
+
+    bl_label = "PhysGraph Cloth"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "PhysGraph"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the settings, the button, and how far a run is."""
+        settings, layout = context.scene.physgraph, self.layout
+        layout.use_property_split, layout.use_property_decorate = True, False
+        layout.prop(settings, "preset")
+        for name, unit in (("stretch", "N/m"), ("bend", "\N{MICRO SIGN}N m")):
+            row = layout.row(heading=f"{name.capitalize()} ({unit})")
+            row.prop(settings, f"use_{name}", text="")
+            value = row.row()
+            value.active = getattr(settings, f"use_{name}")
+            value.prop(settings, name, text="")
+        layout.prop(settings, "level")
+        layout.prop(settings, "scene_frames")
+        if not settings.scene_frames:
+            frames = layout.column(align=True)
+            frames.prop(settings, "frame_start")
+            frames.prop(settings, "frame_end")
+        for name in ("colliders", "hide_coarse", "report", "more"):
+            layout.prop(settings, name)
+        run = now_running()
+        if run:
+            part, text = run.progress()
+            layout.progress(factor=part, text=text)
+            layout.label(text="Esc cancels")
+        else:
+            layout.operator(PHYSGRAPH_OT_refine.bl_idname, icon="MOD_CLOTH")
+        if settings.last_report:
+            layout.operator("wm.path_open", text="Open Report").filepath = settings.last_report
+
+
+CLASSES = (PhysGraphPreferences, PhysGraphSettings, PHYSGRAPH_PT_panel)

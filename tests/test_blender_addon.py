@@ -1,0 +1,271 @@
+"""The add-on in Blender's own Python: what a press of its button brings, and what it says when it cannot."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from physgraph_usd.fabric import PRESETS
+
+ADDON = Path(__file__).parents[1] / "plugins" / "blender"
+SCENE = Path(__file__).with_name("blender_addon_scene.py")
+COAT, FINE, BODY = "Coat ä.001", "Coat ä.001_refined", "Body"
+CELLS = 8
+QUICK = "--integrator quasi-newton --steps 4"
+
+in_blender = pytest.mark.skipif(
+    not os.environ.get("PHYSGRAPH_BPY_PYTHON"),
+    reason="PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy",
+)
+
+
+class Seen(NamedTuple):
+    """What Blender had at the looks of a job."""
+
+    found: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    folder: Path
+
+    def array(self, label: str, name: str, frame: int, *, what: str = "points") -> np.ndarray:
+        return self.arrays[f"{label}:{name}:{frame}:{what}"]
+
+
+def run_job(folder: Path, *steps: tuple[str, tuple[object, ...], dict[str, object]]) -> Seen:
+    """Run steps of the scene in Blender's Python, with the add-on installed by a link as its README says."""
+    extensions = folder / "extensions" / "user_default"
+    extensions.mkdir(parents=True)
+    (extensions / "physgraph_usd").symlink_to(ADDON)
+    (folder / "job.json").write_text(json.dumps([(name, {"": given, **more}) for name, given, more in steps]))
+    line = [os.environ["PHYSGRAPH_BPY_PYTHON"], str(SCENE), str(extensions.parent), "job.json"]
+    environment = os.environ | {"PYTHONPATH": str(ADDON.parents[1]), "PYTHONDONTWRITEBYTECODE": "1"}
+    ran = subprocess.run(line, cwd=folder, check=False, capture_output=True, text=True, timeout=500, env=environment)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    with np.load(folder / "seen.npz") as arrays:
+        return Seen(json.loads((folder / "seen.json").read_text()), dict(arrays), folder)
+
+
+def step(name: str, *given: object, **more: object) -> tuple[str, tuple[object, ...], dict[str, object]]:
+    return name, given, more
+
+
+@pytest.fixture(scope="session")
+def program(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The command, as this environment's Python runs it."""
+    file = tmp_path_factory.mktemp("bin") / "physgraph-usd"
+    file.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m physgraph_usd "$@"\n')
+    file.chmod(0o755)
+    return str(file)
+
+
+@pytest.fixture(scope="module")
+def story(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    """A saved file: refined once, then by the refined object at another level, then opened again."""
+    folder = tmp_path_factory.mktemp("story")
+    blend = str(folder / "shot.blend")
+    panel = {"more": QUICK, "preset": "silk", "hide_coarse": True}
+    return run_job(
+        folder,
+        step("scene", program, saved=blend),
+        step("look", "before", 1, 3),
+        step("choose", "Bodies", level=1, use_bend=True, bend=20.0, report=True, **panel),
+        step("refine", "first"),
+        step("look", "one", 1, 3),
+        step("draw", "drawn"),
+        step("add_modifier", FINE, "SOLIDIFY"),
+        step("choose", level=2, use_bend=False, report=False, **panel),
+        step("refine", "second"),
+        step("look", "two"),
+        step("reopen", blend),
+        step("look", "opened"),
+        step("unregister"),
+    )
+
+
+@pytest.fixture(scope="module")
+def odd(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    """An unsaved scene, once in metres and once in centimetres, refined at one frame, without colliders."""
+    frame = {"scene_frames": False, "frame_start": 3, "frame_end": 3}
+    both = [
+        (
+            step("scene", program, unit=unit),
+            step("choose", level=1, more=QUICK, **frame),
+            step("refine", f"refined {label}"),
+            step("look", label, 3),
+        )
+        for label, unit in (("m", 1.0), ("cm", 0.01))
+    ]
+    return run_job(tmp_path_factory.mktemp("odd"), *both[0], *both[1])
+
+
+def within_a_cage_edge(seen: Seen, label: str, frame: int) -> None:
+    """Each vertex on either side has one of the other nearer than the cage's longest edge."""
+    coarse, fine = seen.array(label, COAT, frame), seen.array(label, FINE, frame)
+    faces = seen.array(label, COAT, frame, what="faces")
+    edge = np.linalg.norm(coarse[faces] - coarse[np.roll(faces, 1, axis=1)], axis=2).max()
+    assert np.max(cKDTree(coarse).query(fine)[0]) < edge
+    assert np.max(cKDTree(fine).query(coarse)[0]) < 0.5 * edge
+    assert np.abs(coarse.mean(axis=0) - fine.mean(axis=0)).max() < 0.25 * edge
+
+
+class TestRefinedInBlender:
+    def test_each_face_became_four(self, story: Seen) -> None:
+        assert story.found["first"] == story.found["second"] == ["FINISHED"]
+        for frame in (1, 3):
+            assert story.array("one", FINE, frame).shape == ((2 * CELLS + 1) ** 2, 3)
+            assert story.array("one", FINE, frame, what="faces").shape == (4 * CELLS**2, 4)
+
+    def test_it_lies_where_the_coarse_cloth_does(self, story: Seen) -> None:
+        assert np.abs(story.array("one", FINE, 3) - story.array("one", FINE, 1)).max() > 0.3, "must move"
+        for frame in (1, 3):
+            within_a_cage_edge(story, "one", frame)
+
+    def test_the_coarse_objects_are_as_they_were(self, story: Seen) -> None:
+        before, after = story.found["before"]["objects"], story.found["one"]["objects"]
+        assert set(after) - set(before) == {FINE}
+        for name, item in before.items():
+            changed = {key for key in item if item[key] != after[name][key]}
+            assert changed == ({"hidden", "selected"} if name == COAT else set())
+        assert after[COAT]["hidden"]
+        for key, values in story.arrays.items():
+            if key.startswith("before:"):
+                np.testing.assert_array_equal(values, story.arrays[key.replace("before:", "one:")])
+        assert story.found["one"]["range"][:2] == story.found["before"]["range"][:2]
+
+    def test_it_has_a_collection_and_a_name(self, story: Seen) -> None:
+        fine = story.found["one"]["objects"][FINE]
+        assert (fine["collections"], fine["selected"], fine["hidden"]) == (["PhysGraph"], True, False)
+        assert story.found["one"]["collections"] == ["Bodies", "PhysGraph"]
+
+    def test_uvs_are_those_of_the_grid(self, story: Seen) -> None:
+        uv = story.array("one", FINE, 3, what="uv:Pattern")
+        steps = uv.reshape(-1, 2) * 2 * CELLS
+        np.testing.assert_allclose(steps, steps.round(), atol=1e-4)
+        assert len(np.unique(steps.round(), axis=0)) == (2 * CELLS + 1) ** 2
+
+    def test_materials_are_the_same_on_the_same_faces(self, story: Seen) -> None:
+        objects = story.found["one"]["objects"]
+        assert objects[FINE]["slots"] == objects[COAT]["slots"] == ["Unused", "Denim blue", "Wool"]
+        assert story.found["one"]["materials"] == story.found["before"]["materials"]
+        for frame in (1, 3):
+            middle = story.array("one", FINE, frame, what="uv:Pattern").mean(axis=1)
+            np.testing.assert_array_equal(story.array("one", FINE, frame, what="material"), 1 + (middle[:, 0] > 0.5))
+
+    def test_the_hidden_body_pushes_as_it_is_seen(self, story: Seen) -> None:
+        body = story.array("one", BODY, 1)
+        middle, radius = body.mean(axis=0), np.linalg.norm(body - body.mean(axis=0), axis=1)
+        # Without its subdivision the body would keep the cloth further off.
+        assert radius.max() < 0.29
+        reach = {name: np.linalg.norm(story.array("one", name, 1) - middle, axis=1).min() for name in (COAT, FINE)}
+        assert reach[COAT] < radius.min() - 0.01
+        assert radius.min() - 1e-3 < reach[FINE] < 0.3
+
+    def test_the_command_was_told_what_the_panel_says(self, story: Seen) -> None:
+        report = Path(story.found["one"]["report"])
+        assert report.is_file()
+        said = json.loads(report.with_name("report.json").read_text())["garments"][0]
+        assert said["fabric"]["bend"] == pytest.approx(20e-6)
+        assert said["fabric"]["stretch"] == PRESETS["silk"].stretch
+        assert said["level"] == 1
+        assert story.found["two"]["report"] == ""
+
+    def test_refining_the_refined_object_renews_it(self, story: Seen) -> None:
+        objects = story.found["two"]["objects"]
+        assert set(objects) == set(story.found["one"]["objects"])
+        assert objects[FINE]["modifiers"] == [["MESH_SEQUENCE_CACHE", True], ["SOLIDIFY", True]]
+        assert objects[FINE]["points"] == (4 * CELLS + 1) ** 2
+        assert [path.startswith("//physgraph/") for path in story.found["two"]["caches"]] == [True]
+        assert len(list((story.folder / "physgraph").glob("*.refined.usdc"))) == 2
+
+    def test_it_survives_saving_and_opening(self, story: Seen) -> None:
+        assert story.found["opened"]["objects"][FINE] == story.found["two"]["objects"][FINE]
+
+    def test_the_panel_shows_every_setting(self, story: Seen) -> None:
+        drawn = story.found["drawn"]
+        shown = {name for kind, *names in drawn if kind == "prop" for name in names}
+        assert shown >= {"command", "preset", "use_stretch", "stretch", "use_bend", "bend", "level", "colliders"}
+        assert shown >= {"scene_frames", "report", "hide_coarse", "more"}
+        assert [names for kind, *names in drawn if kind == "operator"] == [["physgraph.refine"], ["wm.path_open"]]
+
+    def test_it_can_be_unregistered(self, story: Seen) -> None:
+        assert story.found["unregistered"] == [False, False]
+
+    def test_one_frame_needs_no_cache(self, odd: Seen) -> None:
+        for label in ("m", "cm"):
+            assert odd.found[f"refined {label}"] == ["FINISHED"]
+            assert odd.found[label]["objects"][FINE]["modifiers"] == []
+            within_a_cage_edge(odd, label, 3)
+
+    def test_a_scene_in_centimetres_is_as_large_as_in_metres(self, odd: Seen) -> None:
+        apart = odd.array("cm", FINE, 3) / 100.0 - odd.array("m", FINE, 3)
+        moved = odd.array("m", FINE, 3)[: (CELLS + 1) ** 2] - odd.array("m", COAT, 3)
+        assert np.abs(moved).max() > 5e-4
+        assert np.abs(apart).max() < 1e-2 * np.abs(moved).max()
+
+
+def test_what_goes_wrong_is_said(program: str, tmp_path: Path) -> None:
+    """Nothing selected, a wrong command, no garment, a wrong range, an error of the command."""
+    seen = run_job(
+        tmp_path,
+        step("scene", program, saved=str(tmp_path / "shot.blend")),
+        step("choose", level=1, more=QUICK),
+        step("select"),
+        step("refine", "nothing"),
+        step("select", COAT),
+        step("choose", "Bodies", scene_frames=False, frame_start=5, frame_end=2),
+        step("refine", "backwards"),
+        step("choose", scene_frames=True, more="--rest nonsense"),
+        step("refine", "option"),
+        step("select", BODY),
+        step("choose", "Bodies", more=""),
+        step("refine", "only bodies"),
+        step("scene", str(tmp_path / "nowhere"), saved=str(tmp_path / "shot.blend")),
+        step("refine", "command"),
+        step("look", "after"),
+    )
+    assert "Select the garments to refine" in seen.found["nothing"][0]
+    assert "the range ends before it starts" in seen.found["backwards"][0]
+    assert "'nonsense' is not a valid float" in seen.found["option"][0]
+    assert "select a garment" in seen.found["only bodies"][0]
+    assert "nowhere" in seen.found["command"][0]
+    assert "Edit > Preferences" in seen.found["command"][0]
+    assert FINE not in seen.found["after"]["objects"]
+    assert seen.found["after"]["collections"] == ["Bodies"]
+
+
+def test_blender_stays_usable_while_the_command_runs(program: str, tmp_path: Path) -> None:
+    """Esc ends the process and leaves no layer; a run waits for object mode; a failure is said whole."""
+    seen = run_job(
+        tmp_path,
+        step("scene", program, saved=str(tmp_path / "shot.blend")),
+        step("choose", "Bodies", level=1, more=QUICK),
+        step("tick", "escape", escape_after=5),
+        step("tick", "done", edit_mode=True),
+        step("look", "after"),
+        step("choose", "Bodies", level=1, more="--integrator nonsense"),
+        step("tick", "failed"),
+    ).found
+    assert [seen[label]["answer"] for label in ("escape", "done", "failed")] == [
+        ["CANCELLED"],
+        ["FINISHED"],
+        ["CANCELLED"],
+    ]
+    for label in ("escape", "done", "failed"):
+        assert (seen[label]["could press"], seen[label]["free"]) == (False, True)
+    assert seen["escape"]["code"] != 0
+    assert seen["escape"]["left"] == []
+    assert seen["escape"]["said"] == [["INFO", "Refining was cancelled"]]
+    assert seen["done"]["progress"] == [1.0, "about 0 s left 3 of 3 frames"]
+    assert ["progress"] in seen["done drawn"]
+    assert seen["done"]["modes"] == ["EDIT_MESH", "OBJECT"]
+    assert seen["done"]["said"] == [["INFO", f"refined {FINE}"]]
+    assert FINE in seen["after"]["objects"]
+    assert seen["failed"]["said"][0][0] == "ERROR"
+    assert "unknown integrator 'nonsense'" in seen["failed"]["said"][0][1]

@@ -1,0 +1,144 @@
+"""The part of Blender's add-on that needs no Blender: its manifest, its command lines, the processes it runs."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import physgraph_usd
+from physgraph_usd import cli
+from physgraph_usd.fabric import PRESETS
+
+ADDON = Path(__file__).parents[1] / "plugins" / "blender"
+QUICK = "--integrator quasi-newton --steps 4"
+
+
+@pytest.fixture(scope="module")
+def command() -> ModuleType:
+    """The add-on's module that needs no Blender."""
+    spec = importlib.util.spec_from_file_location("blender_addon_command", ADDON / "command.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_manifest_agrees_with_the_package() -> None:
+    manifest = tomllib.loads((ADDON / "blender_manifest.toml").read_text(encoding="utf-8"))
+    assert (manifest["id"], manifest["version"]) == ("physgraph_usd", physgraph_usd.__version__)
+    assert set(manifest["permissions"]) == {"files"}
+    assert manifest["type"] == "add-on"
+
+
+def test_the_presets_are_the_packages(command: ModuleType) -> None:
+    assert command.PRESETS == tuple(PRESETS)
+
+
+def test_the_defaults_ask_for_nothing_but_the_garment(command: ModuleType, tmp_path: Path) -> None:
+    files = command.files_of_run(tmp_path, "shot", ["Coat"])
+    settings = command.Settings((1, 24))
+    (line,) = command.command_lines("pg", settings, files, garments=["/root/Coat/mesh"], colliders=[])
+    expected = ["pg", "refine", str(tmp_path / "shot-Coat.v001.coarse.usdc")]
+    expected += ["-o", str(tmp_path / "shot-Coat.v001.refined.usdc"), "--root"]
+    expected += [str(tmp_path / "shot-Coat.v001.refined.usda"), "--garment", "/root/Coat/mesh"]
+    assert line == [*expected, "--frames", "1:24", "--level", "2", "--progress"]
+
+
+def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
+    files = command.files_of_run(tmp_path, "shot", ["Coat"])
+    more = "--device cuda --weights 'my file'"
+    settings = command.Settings((-3, 5), preset="denim", stretch=30.0, bend=4.7e-6, level=-1, report=True, more=more)
+    tag, refine = command.command_lines("pg", settings, files, garments=["/a", "/b"], colliders=["/c"])
+    cloth = str(files.cloth)
+    garments = ["--garment", "/a", "--garment", "/b"]
+    assert tag == ["pg", "tag", str(files.coarse), "-o", cloth, *garments, "--preset", "denim"]
+    assert refine[:3] == ["pg", "refine", cloth]
+    assert refine[refine.index("--garment") :] == [
+        *garments,
+        *("--collider", "/c", "--frames", "-3:5", "--level", "auto"),
+        *("--set", "physgraph:material:stretchStiffness=30", "--set", "physgraph:material:bendStiffness=4.7e-06"),
+        *("--report", str(files.report), "--progress", "--device", "cuda", "--weights", "my file"),
+    ]
+
+
+def test_the_command_understands_each_line(command: ModuleType, tmp_path: Path) -> None:
+    files = command.files_of_run(tmp_path, "shot", ["Coat"])
+    settings = command.Settings((-3, 5), preset="denim", stretch=1.0, bend=1e-6, level=-1, report=True, more=QUICK)
+    for _, name, *words in command.command_lines("pg", settings, files, garments=["/a"], colliders=["/c"]):
+        context = cli.main.commands[name].make_context(name, list(words))
+        assert context.params["garments"] == ("/a",)
+
+
+def test_a_new_run_has_new_files(command: ModuleType, tmp_path: Path) -> None:
+    first = command.files_of_run(tmp_path, "my shot", ["Coat ä", "Skirt/2"])
+    assert first.layer.name == "my_shot-Coat_ä-Skirt_2.v001.refined.usdc"
+    first.log.touch()
+    assert command.files_of_run(tmp_path, "my shot", ["Coat ä", "Skirt/2"]).log.name.endswith(".v002.log")
+    assert command.files_of_run(tmp_path, "my shot", ["Coat ä"]).log.name.endswith(".v001.log")
+    long = [command.files_of_run(tmp_path, "shot", ["x" * 100 + end]).log.name for end in "ab"]
+    assert long[0] != long[1]
+    assert max(map(len, long)) < 100
+
+
+def script(tmp_path: Path, text: str) -> list[str]:
+    """A command line that runs some Python."""
+    file = tmp_path / f"{len(list(tmp_path.iterdir()))}.py"
+    file.write_text(text, encoding="utf-8")
+    return [sys.executable, str(file)]
+
+
+def test_a_run_goes_through_its_lines_and_tells_progress(command: ModuleType, tmp_path: Path) -> None:
+    first = script(tmp_path, "import sys; sys.stderr.write('warning: thin\\nother words\\n')")
+    second = script(
+        tmp_path, "import sys; sys.stderr.write(' 25%  about 3 s left        1 of 4 frames\\n'); sys.exit(3)"
+    )
+    run = command.Run([first, second], tmp_path / "log")
+    run.wait()
+    assert run.progress() == (0.25, "about 3 s left 1 of 4 frames")
+    assert run.warnings() == ["thin"]
+    assert run.in_part
+
+
+def test_a_failure_says_all_that_the_command_said(command: ModuleType, tmp_path: Path) -> None:
+    words = "error: </root/Coat> at time code 3: no\nremedy: split it"
+    text = f"import sys; sys.stderr.write(' 25%  x  y\\n' + {words!r}); sys.exit(1)"
+    unreached = script(tmp_path, "raise SystemExit(7)")
+    run = command.Run([script(tmp_path, text), unreached], tmp_path / "log")
+    with pytest.raises(command.CommandError) as caught:
+        run.wait()
+    assert str(caught.value) == words
+
+
+def test_a_tag_that_ends_with_3_is_a_failure(command: ModuleType, tmp_path: Path) -> None:
+    lines = [script(tmp_path, "raise SystemExit(3)"), script(tmp_path, "")]
+    with pytest.raises(command.CommandError, match="ended with code 3"):
+        command.Run(lines, tmp_path / "log").wait()
+
+
+def test_cancelling_ends_the_process(command: ModuleType, tmp_path: Path) -> None:
+    run = command.Run([script(tmp_path, "import time; time.sleep(60)")], tmp_path / "log")
+    assert not run.poll()
+    run.cancel()
+    with pytest.raises(command.CommandError):
+        run.poll()
+
+
+def test_the_process_does_not_get_blenders_own_usd(
+    command: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in command.OF_BLENDER:
+        monkeypatch.setenv(name, "blender's")
+    text = f"import os, sys; sys.exit(any(name in os.environ for name in {command.OF_BLENDER!r}))"
+    command.Run([script(tmp_path, text)], tmp_path / "log").wait()
+
+
+def test_a_wrong_path_names_the_remedy(command: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(command.CommandError, match=r"nowhere.*No such file.*Preferences"):
+        command.Run([["nowhere/physgraph-usd"]], tmp_path / "log")
