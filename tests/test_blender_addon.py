@@ -21,10 +21,14 @@ COAT, FINE, BODY = "Coat ä.001", "Coat ä.001_refined", "Body"
 CELLS = 8
 QUICK = "--integrator quasi-newton --steps 4"
 
-in_blender = pytest.mark.skipif(
-    not os.environ.get("PHYSGRAPH_BPY_PYTHON"),
-    reason="PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy",
-)
+pytestmark = [
+    pytest.mark.blender,
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not os.environ.get("PHYSGRAPH_BPY_PYTHON"),
+        reason="PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy",
+    ),
+]
 
 
 class Seen(NamedTuple):
