@@ -21,12 +21,10 @@ from pathlib import Path
 
 from physgraph_usd.chart.options import ChartOptions
 from physgraph_usd.chart.run import chart_shot
-from physgraph_usd.chart.table import TOLERANCE
+from physgraph_usd.chart.table import JUDGED, TOLERANCE
 from physgraph_usd.samples import write_sample
 
 from .rows import say, table
-
-GAP = 0.03
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -38,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     for name in given.shots.split(","):
         runs = [times(name, given.minutes) for _ in range(given.runs)]
-        say(f"\n{name}, level 1, milliseconds of one core to a gap of {GAP:.0%}\n")
+        say(f"\n{name}, level 1, milliseconds of one core to a gap of {JUDGED:.0%}\n")
         say("\n".join(compared(runs)))
 
 
@@ -47,7 +45,7 @@ def times(name: str, minutes: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         shot = write_sample(name, Path(folder))
         options = ChartOptions(level=1, clock="cpu", count=1, budget_minutes=minutes)
-        return chart_shot(shot, Path(folder) / "chart", options).times_to(GAP)
+        return chart_shot(shot, Path(folder) / "chart", options).times_to(JUDGED)
 
 
 def compared(runs: Sequence[dict[str, float]]) -> list[str]:

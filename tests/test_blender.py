@@ -12,20 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from blender import NEEDS_BLENDER
 from layers import world_metres
 from pxr import Usd, UsdGeom, UsdShade
 
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.shot import inspect_shot, refine_shot
 
-pytestmark = [
-    pytest.mark.blender,
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        not os.environ.get("PHYSGRAPH_BPY_PYTHON"),
-        reason="PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy",
-    ),
-]
+pytestmark = NEEDS_BLENDER
 
 GARMENTS = {
     "tshirt": "/TshirtShot/Shirt",

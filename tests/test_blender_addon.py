@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from blender import NEEDS_BLENDER
 from scipy.spatial import cKDTree
 
 from physgraph_usd.fabric import PRESETS
@@ -21,14 +22,7 @@ COAT, FINE, BODY = "Coat ä.001", "Coat ä.001_refined", "Body"
 CELLS = 8
 QUICK = "--integrator quasi-newton --steps 4"
 
-pytestmark = [
-    pytest.mark.blender,
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        not os.environ.get("PHYSGRAPH_BPY_PYTHON"),
-        reason="PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy",
-    ),
-]
+pytestmark = NEEDS_BLENDER
 
 
 class Seen(NamedTuple):

@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 from ..page.document import document, table
 from .methods import DEFAULT, SMOOTH, UPSAMPLED
 from .styles import Style, styles
-from .table import Chart
+from .table import JUDGED, Chart
 from .words import FAR, changes, figures, percent, settings, title
 
 FLOOR = 1e-5
@@ -105,7 +105,7 @@ def _lead(chart: Chart) -> str:
             f"refine's default leaves {percent(place['gap'])} in {place['ms']:.0f} ms a frame and {where}: the fastest "
             f"to that gap, {place['fastest']}, needs {place['fastest_ms']:.0f} ms."
         )
-    times = chart.times_to(0.03)
+    times = chart.times_to(JUDGED)
     if times:
         order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in times.items())
         said.append(f"To a gap of 3%: {order}.")

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, SymmetricalLogLocator
 
 from .methods import DEFAULT, SMOOTH, UPSAMPLED
 from .styles import Style, styles
-from .table import Chart, Point
+from .table import JUDGED, Chart, Point
 from .words import FAR, Change, changes, percent, title
 
 FLOOR = 1e-4
@@ -77,7 +77,7 @@ def _curves(axes: Axes, chart: Chart, look: dict[str, Style]) -> None:
     axes.set_ylim(max(FLOOR, min(0.5 * least, 0.01)) if least > 0 else FLOOR, CEILING)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.axhline(0.03, color="#b0b0b0", linewidth=0.8, linestyle=":")
+    axes.axhline(JUDGED, color="#b0b0b0", linewidth=0.8, linestyle=":")
 
 
 def _line(axes: Axes, name: str, points: Sequence[Point], style: Style, heights: list[float]) -> None:
