@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from .errors import StageError
+from .integrate import LEARNED
 from .mesh.defects import defects
 from .options import RefineOptions
 from .report import RefineReport
@@ -40,13 +42,29 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
     return report
 
 
-def leave_out_what_never_was(report: RefineReport) -> None:
-    """Move contact of cloth with cloth from what is modelled to what is left out where no frame needed it."""
+def say_what_was(report: RefineReport) -> None:
+    """Say who made the steps, and move contact of cloth with cloth to what is left out where no frame needed it."""
     entries = [entry for frame in report.frames for entry in frame.get("garments", ())]
+    _say_who_integrated(report, entries)
     if any("cloth" in entry.get("contact", {}) for entry in entries):
         return
     if report.modelled.pop("self contact", None):
         report.left_out["self contact"] = "no two parts of the cloth came near one another in any frame"
+
+
+def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]]) -> None:
+    """The learned integrator's part of the steps as something modelled, or why it had none."""
+    movers: Counter[str] = Counter()
+    for entry in entries:
+        for level in entry.get("levels", ()):
+            movers.update(level["movers"])
+    asked = str(report.options["integrator"])
+    learned = {name: movers[name] for name in LEARNED if movers[name]}
+    for name, steps in learned.items():
+        report.modelled["network"] = f"{name} made {steps / movers.total():.0%} of the steps (--integrator {asked})"
+    if not learned:
+        reasons = sorted({str(entry["chosen"]) for entry in entries if "chosen" in entry})
+        report.left_out["network"] = f"--integrator {asked}" + "".join(f"; {reason}" for reason in reasons)
 
 
 def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> dict[str, Any]:
@@ -184,7 +202,6 @@ def _why_no_contact(opened: Shot) -> str:
 
 def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
-        "network": "not in this version; quasi-Newton integrates",
         "friction": "out of scope: shapes at rest under pressure alone; the guide and the tether hold cloth in place",
     }
     if "self contact" not in report.modelled:

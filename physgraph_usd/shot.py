@@ -19,7 +19,7 @@ import warp as wp
 from . import __version__
 from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
 from .contact.passed import told
-from .describe import begin_report, describe, describe_meshes, leave_out_what_never_was
+from .describe import begin_report, describe, describe_meshes, say_what_was
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .options import RefineOptions, json_of
 from .page.report import write_folder
@@ -230,7 +230,7 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
         writer.close()
         report.seconds["close"] = clock.perf_counter() - start
         report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report) + _passed(report)
-        leave_out_what_never_was(report)
+        say_what_was(report)
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]

@@ -63,8 +63,23 @@ class TestDone:
         assert data["garments"][0]["sources"]
         assert data["seconds"]["total"] >= data["seconds"]["frames"] > 0
         assert data["peak_memory_mb"] > 10
-        assert {"contact", "self contact", "network"} <= set(data["left_out"])
+        assert {"contact", "self contact"} <= set(data["left_out"])
         assert not (tmp_path / "fine.json.part").exists()
+
+    def test_the_report_says_who_integrated(self, shot: Path, tmp_path: Path):
+        asked = {
+            name: refine(shot, tmp_path / f"{name}.usdc", integrator=name, level=2)
+            for name in ("quasi-newton", "physgraph")
+        }
+        assert asked["quasi-newton"].left_out["network"] == "--integrator quasi-newton"
+        assert "network" not in asked["quasi-newton"].modelled
+        steps = [
+            level["movers"] for f in asked["physgraph"].frames for g in f["garments"] for level in g.get("levels", ())
+        ]
+        share = sum(each.get("physgraph", 0) for each in steps) / sum(sum(each.values()) for each in steps)
+        assert share > 0.0
+        assert asked["physgraph"].modelled["network"].startswith(f"physgraph made {share:.0%} of the steps")
+        assert "network" not in asked["physgraph"].left_out
 
     def test_progress_counts_up(self, shot: Path, tmp_path: Path):
         seen: list[tuple[int, int]] = []
