@@ -1,6 +1,6 @@
 """Cost of contact: the same frames with and without a body, and with and without cloth against cloth.
 
-    python -m benchmarks.contact
+    python -m benchmarks.contact [--device cuda]
 
 Drapes a sheet of about 100,000 fine vertices over a ball of 20,480 triangles. Prints the median milliseconds of a
 frame, in one run, over those without contact, and the same of processor time, which other work on the machine changes
@@ -10,6 +10,7 @@ the same of frames that start from the last one's detail, while the sheet's fold
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import sys
 import time
@@ -40,8 +41,17 @@ LANES = 2
 
 
 def main() -> None:
-    """Print the table."""
-    prepare_device("cpu")
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    device = parser.parse_args().device
+    prepare_device(device)
+    cold_frames(device)
+    warm_frames(device)
+
+
+def cold_frames(device: str) -> None:
+    """Print the table of frames by themselves, and what each form leaves."""
     scene, ball = _scene()
     sheets = [_draped(height) for height in (0.0, -0.003, -0.006)]
     far = MeshPose(ball.points + 100.0, ball.triangles)
@@ -53,7 +63,7 @@ def main() -> None:
         "body out of reach": ("quadratic", "off", far),
         "paper's form": ("linear", "spheres", ball),
     }
-    refiners = {name: _refiner(scene, form, cloth) for name, (form, cloth, _) in cases.items()}
+    refiners = {name: _refiner(scene, form, cloth, device=device) for name, (form, cloth, _) in cases.items()}
     times, work, solve, measure = ({name: list[float]() for name in cases} for _ in range(4))
     said: dict[str, Any] = {}
     count = 0
@@ -80,26 +90,27 @@ def main() -> None:
         say(f"\n{name}: left to the last projection {said[name]['projected']}")
         for path, values in said[name]["bodies"].items():
             say(f"{path}: before {values['before']}\nafter {values['after']}")
-    warm_frames(scene, ball)
 
 
-def warm_frames(scene: Scene, ball: MeshPose) -> None:
+def warm_frames(device: str) -> None:
     """Print the table of a sequence's frames, the first left out."""
+    scene, ball = _scene()
     cases = {"switched off": ("off", "off"), "contact": ("quadratic", "pairs"), "body only": ("quadratic", "off")}
-    refiners = {name: _refiner(scene, *forms, temporal="tether") for name, forms in cases.items()}
-    work, steps = ({name: list[float]() for name in cases} for _ in range(2))
+    refiners = {name: _refiner(scene, *forms, device=device, temporal="tether") for name, forms in cases.items()}
+    times, work, steps = ({name: list[float]() for name in cases} for _ in range(3))
     for index in range(WARM):
         points = _draped(0.0, phase=TRAVEL * index)
         for name, refiner in refiners.items():
-            worked = time.process_time()
+            began, worked = time.perf_counter(), time.process_time()
             state = refiner.solve(Frame(None, (GarmentFrame(points, PRESETS["jersey"]),), (ball,)))
+            times[name].append(1e3 * (time.perf_counter() - began))
             work[name].append(1e3 * (time.process_time() - worked))
             steps[name].append(sum(level["steps"] for level in state.telemetry[0]["levels"]))  # type: ignore[attr-defined]
-    say("\n| warm frames | processor ms | steps | over switched off |\n|---|---|---|---|")
-    base = statistics.median(work["switched off"][1:])
+    say("\n| warm frames | frame ms | steps | frame / switched off | of processor time |\n|---|---|---|---|---|")
+    bases = [statistics.median(values["switched off"][1:]) for values in (times, work)]
     for name in cases:
-        spent, made = (statistics.median(each[name][1:]) for each in (work, steps))
-        say(f"| {name} | {spent:.0f} | {made:.0f} | {spent / base:.2f} |")
+        frame, worked, made = (statistics.median(each[name][1:]) for each in (times, work, steps))
+        say(f"| {name} | {frame:.0f} | {made:.0f} | {frame / bases[0]:.2f} | {worked / bases[1]:.2f} |")
 
 
 def _scene() -> tuple[Scene, MeshPose]:
@@ -130,10 +141,10 @@ def _draped(height: float, phase: float = 0.0) -> np.ndarray:
     return np.stack([out * np.cos(angle), down + height, out * np.sin(angle)], axis=1)
 
 
-def _refiner(scene: Scene, form: str, cloth: str, *, temporal: str = "off") -> Refiner:
+def _refiner(scene: Scene, form: str, cloth: str, *, device: str, temporal: str = "off") -> Refiner:
     contact = ContactSettings(form, cloth=cloth)
     settings = SolveSettings(method_named("quasi-newton"), temporal=temporal, contact=contact)
-    return Refiner(replace(scene), settings, lanes=LANES)
+    return Refiner(replace(scene), settings, device=device, lanes=LANES)
 
 
 def say(line: str) -> None:
