@@ -38,7 +38,7 @@ class Size:
     frames: int
 
 
-SHORT = Size(SHORT_MINUTES, repeats=3, more=6, growth=2.0, reach=6.0, frames=2)
+SHORT = Size(SHORT_MINUTES, repeats=3, more=6, growth=2.0, reach=6.25, frames=2)
 LONG = Size(None, repeats=5, more=5, growth=1.5, reach=8.0, frames=3)
 
 
