@@ -1,4 +1,4 @@
-"""What is known of a shot before its first frame is solved: garments, values and their sources, terms on and off."""
+"""What is known of a shot before its first frame: garments, values and sources, terms on and off; and what was."""
 
 from __future__ import annotations
 
@@ -59,10 +59,11 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
         for level in entry.get("levels", ()):
             movers.update(level["movers"])
     asked = str(report.options["integrator"])
-    learned = {name: movers[name] for name in LEARNED if movers[name]}
-    for name, steps in learned.items():
-        report.modelled["network"] = f"{name} made {steps / movers.total():.0%} of the steps (--integrator {asked})"
-    if not learned:
+    name = next((each for each in LEARNED if movers[each]), None)
+    if name:
+        part = movers[name] / movers.total()
+        report.modelled["network"] = f"{name} made {part:.0%} of the steps (--integrator {asked})"
+    else:
         reasons = sorted({str(entry["chosen"]) for entry in entries if "chosen" in entry})
         report.left_out["network"] = f"--integrator {asked}" + "".join(f"; {reason}" for reason in reasons)
 
