@@ -9,7 +9,11 @@ import scipy.sparse.linalg as spl
 import torch
 from meshes import grid
 
-from physgraph_usd.integrate.dissection import DissectedSolver, dissect
+from physgraph_usd.errors import SolveError
+from physgraph_usd.integrate import fronts
+from physgraph_usd.integrate.dissection import dissect
+from physgraph_usd.integrate.metric import DeviceFactors, HostFactors
+from physgraph_usd.integrate.multifrontal import DissectedSolver, Elimination
 from physgraph_usd.mesh.topology import edges_of
 
 
@@ -38,12 +42,48 @@ def test_the_solve_is_the_direct_one(which: str, leaf: int):
     matrix = {"one sheet": lambda: laplacian(31, 23, rng), "several pieces": lambda: several(rng)}.get(
         which, lambda: sp.csr_matrix([[2.0]])
     )()
-    solver = DissectedSolver(matrix, dissect(matrix, leaf=leaf), dtype=torch.float64, device="cpu")
+    elimination = Elimination(matrix, device="cpu", leaf=leaf)
+    solver = DissectedSolver(elimination, torch.as_tensor(matrix.data), dtype=torch.float64)
     for _ in range(2):
         force = rng.normal(size=(matrix.shape[0], 3))
         expected = spl.spsolve(sp.csc_matrix(matrix), force).reshape(force.shape)
         found = solver.solve(torch.as_tensor(force)).numpy()
         assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("batch", [1, 4000])
+def test_fronts_of_many_sizes_are_cut_into_batches(batch: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(fronts, "BATCH", batch)
+    rng = np.random.default_rng(7)
+    matrix = several(rng)
+    solver = DissectedSolver(
+        Elimination(matrix, device="cpu", leaf=9), torch.as_tensor(matrix.data), dtype=torch.float64
+    )
+    force = rng.normal(size=(matrix.shape[0], 3))
+    found = solver.solve(torch.as_tensor(force)).numpy()
+    assert np.abs(matrix @ found - force).max() < 1e-9 * np.abs(force).max()
+
+
+def test_one_elimination_serves_all_matrices_of_its_pattern():
+    """What CUDA factorises is what the host does: another diagonal, another scale; equal ones to the last bit."""
+    rng = np.random.default_rng(4)
+    matrix = several(rng)
+    count = matrix.shape[0]
+    couplings = sp.csr_matrix(matrix - sp.diags(matrix.diagonal()))
+    host, device = HostFactors(couplings, torch.float64), DeviceFactors(couplings, torch.float64, "cpu")
+    force = torch.as_tensor(rng.normal(size=(count, 3)))
+    for scale, stiffness in ((1.0, 0.0), (0.03, 5.0)):
+        diagonal = torch.as_tensor(scale * (matrix.diagonal() + stiffness * rng.random(count)))
+        both = [each.factorised(scale, diagonal)(force) for each in (host, device, device)]
+        assert float((both[0] - both[1]).abs().max()) < 1e-9 * float(both[0].abs().max())
+        assert torch.equal(both[1], both[2])
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused():
+    matrix = laplacian(12, 12, np.random.default_rng(5))
+    values = torch.as_tensor(matrix.data)
+    with pytest.raises(SolveError, match="not positive definite"):
+        DissectedSolver(Elimination(matrix, device="cpu", leaf=9), -values, dtype=torch.float64)
 
 
 def test_every_vertex_is_eliminated_once_and_before_what_it_waits_for():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
+
 import numpy as np
 import scipy.sparse as sp
 import torch
@@ -9,7 +12,7 @@ from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ig
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .dissection import DissectedSolver, Dissection, dissect
+from .multifrontal import DissectedSolver, Elimination
 
 REGULARISATION = 1e-7
 """Added to the diagonal, relative to its mean: keeps loose parts without a guide definite."""
@@ -36,65 +39,97 @@ def kept_to_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
     return sp.csr_matrix(sp.diags(excess) - couplings)
 
 
-class Metric:
-    """H0, factorised: the same matrix for x, y and z."""
+Solver = Callable[[Tensor], Tensor]
+"""From right-hand sides to solutions, shape (V, 3)."""
 
-    def __init__(
-        self,
-        matrix: sp.csr_matrix,
-        *,
-        free: Bool[Tensor, "vertices 1"],
-        dtype: torch.dtype,
-        dissection: Dissection | None = None,
-    ) -> None:
+
+class Metric:
+    """H0, factorised: the same matrix for x, y and z.
+
+    Attributes:
+        diagonal: Of H0 [N/m], float64; 1 where a vertex may not move, shape (V,).
+        entries: Number of the matrix's entries.
+    """
+
+    def __init__(self, matrix: sp.csr_matrix, *, free: Bool[Tensor, "vertices 1"], dtype: torch.dtype) -> None:
         """Factorise a scalar Hessian at rest.
 
         Args:
             matrix: Symmetric positive semi-definite [N/m], shape (V, V).
             free: False where a vertex may not move: its row becomes the identity's.
             dtype: Scalar type of the right-hand sides.
-            dissection: For CUDA: an order that suits the matrix, where one is known.
         """
-        self._plain, self._dtype = matrix, dtype
-        mask = free.cpu().numpy().ravel()
-        diagonal = matrix.diagonal()
-        mean = float(diagonal[mask].mean()) if mask.any() else 1.0
-        # A unit mean diagonal keeps float32 pivots in range whatever the fabric and the level.
-        self._scale = 1.0 / mean if mean > 0 else 1.0
-        keep = sp.diags(mask.astype(np.float64))
-        shift = sp.diags(np.where(mask, REGULARISATION, 1.0))
-        self.matrix = sp.csr_matrix(self._scale * (keep @ matrix @ keep) + shift)
-        self._dissection, self._mask = None, free
-        self._kept = free.to(dtype)
-        self._scaled = self._scale * self._kept
-        if free.is_cuda:
-            self._dissection = dissection or dissect(self.matrix)
-            self._solver = DissectedSolver(self.matrix, self._dissection, dtype=dtype, device=str(free.device))
-            return
-        coo = self.matrix.tocoo()
-        solver = CholeskySolverD if dtype == torch.float64 else CholeskySolverF
-        rows, columns = (torch.as_tensor(of.astype(np.int32)) for of in (coo.row, coo.col))
-        values = torch.as_tensor(coo.data.astype(np.float64))
-        self._solver = solver(matrix.shape[0], rows, columns, values, MatrixType.COO) if len(mask) else None
+        self._kept, self._free = free.to(dtype), free.squeeze(1)
+        keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
+        couplings = sp.csr_matrix(keep @ (matrix - sp.diags(matrix.diagonal())) @ keep)
+        couplings.eliminate_zeros()
+        self.entries, device = couplings.nnz + couplings.shape[0], str(free.device)
+        self._factors = DeviceFactors(couplings, dtype, device) if free.is_cuda else HostFactors(couplings, dtype)
+        self._hold(torch.as_tensor(matrix.diagonal(), device=free.device))
 
-    def plus(self, diagonal: Float[Tensor, " vertices"]) -> Metric:
+    def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
         """The metric of the same cloth held by springs of given stiffness [N/m], factorised anew."""
-        springs = sp.diags(diagonal.double().cpu().numpy())
-        matrix = sp.csr_matrix(self._plain + springs)
-        return Metric(matrix, free=self._mask, dtype=self._dtype, dissection=self._dissection)
+        other = copy.copy(self)
+        other._hold(self._stiffness + springs.double())
+        return other
 
-    @property
-    def diagonal(self) -> Float[Tensor, " vertices"]:
-        """Diagonal of H0 [N/m], float64 on the CPU; 1 where a vertex may not move."""
-        diagonal = torch.as_tensor(self.matrix.diagonal() / self._scale)
-        return torch.where(self._mask.cpu().squeeze(1), diagonal, 1.0)
+    def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
+        """Factorise with a diagonal [N/m]."""
+        self._stiffness = stiffness
+        moved = stiffness[self._free].cpu().numpy()
+        # A unit mean diagonal keeps float32 pivots in range whatever the fabric and the level.
+        scale = 1.0 / float(moved.mean()) if (moved > 0).any() else 1.0
+        diagonal = torch.where(self._free, scale * stiffness + REGULARISATION, 1.0)
+        self._solver = self._factors.factorised(scale, diagonal)
+        self._scaled = scale * self._kept
+        self.diagonal = torch.where(self._free, diagonal / scale, 1.0)
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero where a vertex may not move."""
-        if isinstance(self._solver, DissectedSolver):
-            return self._solver.solve(force * self._scaled) * self._kept
-        out = torch.empty_like(force)
-        if self._solver is None:
+        return self._solver(force * self._scaled).mul_(self._kept)
+
+
+class HostFactors:
+    """Factors of matrices that differ in their diagonal, and in one factor of all else, on the CPU."""
+
+    def __init__(self, couplings: sp.csr_matrix, dtype: torch.dtype) -> None:
+        """Keep all but the diagonal, shape (V, V)."""
+        self._couplings, self._dtype = couplings, dtype
+
+    def factorised(self, scale: float, diagonal: Float[Tensor, " vertices"]) -> Solver:
+        """The solve of scale * couplings + diagonal."""
+        if not len(diagonal):
+            return torch.empty_like
+        coo = sp.coo_matrix(scale * self._couplings + sp.diags(diagonal.numpy()))
+        kind = CholeskySolverD if self._dtype == torch.float64 else CholeskySolverF
+        rows, columns = (torch.as_tensor(of.astype(np.int32)) for of in (coo.row, coo.col))
+        solver = kind(len(diagonal), rows, columns, torch.as_tensor(coo.data), MatrixType.COO)
+
+        def solve(force: Tensor) -> Tensor:
+            out = torch.empty_like(force)
+            solver.solve(force.contiguous(), out)
             return out
-        self._solver.solve((force * self._scaled).contiguous(), out)
-        return out.mul_(self._kept)
+
+        return solve
+
+
+class DeviceFactors:
+    """The same on CUDA, where only the first passes through the host."""
+
+    def __init__(self, couplings: sp.csr_matrix, dtype: torch.dtype, device: str) -> None:
+        """Find where all but the diagonal goes, shape (V, V)."""
+        count, each = couplings.shape[0], sp.coo_matrix(couplings)
+        rows, columns = (np.concatenate([ends, np.arange(count)]) for ends in (each.row, each.col))
+        order = np.lexsort((columns, rows))
+        starts = np.searchsorted(rows[order], np.arange(count + 1))
+        pattern = sp.csr_matrix((np.ones(len(order)), columns[order], starts), shape=(count, count))
+        values = np.concatenate([each.data, np.zeros(count)])[order]
+        self._values = torch.as_tensor(values, device=device)
+        self._diagonal = torch.as_tensor(np.flatnonzero(rows[order] == columns[order]), device=device)
+        self._elimination, self._dtype = Elimination(pattern, device=device), dtype
+
+    def factorised(self, scale: float, diagonal: Float[Tensor, " vertices"]) -> Solver:
+        """The solve of scale * couplings + diagonal."""
+        values = scale * self._values
+        values[self._diagonal] = diagonal
+        return DissectedSolver(self._elimination, values, dtype=self._dtype).solve

@@ -1,0 +1,257 @@
+"""Where every entry goes when a matrix of a known pattern is factorised front by front (`multifrontal`).
+
+A node's front is the dense matrix of its own vertices and of its border: the vertices above it that it is coupled to
+once all below it are eliminated. Nodes of one depth are put together in batches of fronts of one size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .dissection import Dissection
+
+SMALLEST = 0.7
+"""Least width of a batch's fronts, over that of its widest, to which all are padded."""
+BATCH = 1 << 24
+"""Most entries of a batch of fronts."""
+NOWHERE = 1 << 40
+"""A place that no buffer has: it keeps what is padding out of all results."""
+
+
+@dataclass(frozen=True, eq=False)
+class Received:
+    """What the nodes of a batch receive from one child each; `NOWHERE` where there is none.
+
+    Attributes:
+        rows: First places of the rows of its update, shape (nodes, border).
+        columns: Places in such a row, shape (nodes, border).
+        places: Row and column of each in the node's front, shape (nodes, border).
+    """
+
+    rows: Int[Tensor, "nodes border"]
+    columns: Int[Tensor, "nodes border"]
+    places: Int[Tensor, "nodes border"]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Nodes of one depth that are eliminated together, their fronts padded to one size.
+
+    A front has a node's own vertices first, its border from ``own`` on, and one more row and column for padding.
+
+    Attributes:
+        own: Most own vertices of a node.
+        side: Width of the fronts.
+        unit: Places on the diagonals of the flat fronts that no vertex has.
+        source: Entries of the matrix that the fronts begin with, shape (entries,).
+        target: Their places in the flat fronts, shape (entries,).
+        received: From a first and from a second child.
+        rows: First places of the own rows in the way up, shape (nodes, own).
+        columns: Places in such a row, shape (nodes, width).
+        down: First places, in the way down, of what a node adds to the rows of its border, shape (nodes, border).
+        updates: First places of the rows of the border's matrix in the depth's updates, shape (nodes, border).
+        ranks: Places in such a row, shape (nodes, border).
+    """
+
+    own: int
+    side: int
+    unit: Int[Tensor, " padded"]
+    source: Int[Tensor, " entries"]
+    target: Int[Tensor, " entries"]
+    received: tuple[Received, ...]
+    rows: Int[Tensor, "nodes own"]
+    columns: Int[Tensor, "nodes width"]
+    down: Int[Tensor, "nodes border"]
+    updates: Int[Tensor, "nodes border"]
+    ranks: Int[Tensor, "nodes border"]
+
+    def fronts(
+        self, values: Float[Tensor, " entries"], updates: Float[Tensor, " places"]
+    ) -> Float[Tensor, "nodes width width"]:
+        """The fronts, from the matrix's entries and the children's updates, whose last is zero."""
+        count, side = len(self.rows), self.side
+        flat = values.new_zeros(count * side * side)
+        flat[self.unit] = 1.0
+        flat[self.target] = values[self.source]
+        first = torch.arange(count, device=values.device).mul_(side * side)[:, None, None]
+        for child in self.received:
+            # A place that two children add to is met once in each turn.
+            where = first + child.places[:, :, None] * side + child.places[:, None, :]
+            flat[where] += updates[joined(child.rows, child.columns, updates)]
+        return flat.reshape(count, side, side)[:, :-1, :-1]
+
+
+def joined(
+    rows: Int[Tensor, "nodes rows"], columns: Int[Tensor, "nodes columns"], buffer: Tensor
+) -> Int[Tensor, "nodes rows columns"]:
+    """Places of rows' columns in a flat buffer; its last where one of the two is nowhere."""
+    return (rows[:, :, None] + columns[:, None, :]).clamp_(max=len(buffer) - 1)
+
+
+class Tree:
+    """The nodes of a dissection with the borders that a pattern gives them; vertices in the order of elimination.
+
+    The way up has a row for each vertex: its node's vertices, then the node's border. The way down has one, too: the
+    vertices of each node that has it in its border.
+
+    Attributes:
+        stages: First node of each depth, deepest first, and the number of nodes.
+        updates: Entries of the borders' matrices of each depth.
+        up_starts: First entry of each row of the way up, and their number, shape (V + 1,).
+        up_lists: Where the columns of each row of the way up begin among ``up_columns``, shape (V,).
+        up_columns: Columns of each node's rows; a vertex of the border counts from V, shape (columns,).
+        down_starts: First entry of each row of the way down, and their number, shape (V + 1,).
+        down_columns: Columns of the rows, shape (entries,).
+    """
+
+    def __init__(self, pattern: sp.csr_matrix, dissection: Dissection) -> None:
+        """Follow the elimination.
+
+        Args:
+            pattern: Symmetric pattern, shape (V, V).
+            dissection: An order for it.
+        """
+        count = self._count = pattern.shape[0]
+        self.stages, self._first, self._last = dissection.stages, dissection.starts[:-1], dissection.starts[1:]
+        self._size = self._last - self._first
+        node = np.repeat(np.arange(len(self._size)), self._size)
+        place = np.empty(count, np.int64)
+        place[dissection.order] = np.arange(count)
+        row, column = place[np.repeat(np.arange(count), np.diff(pattern.indptr))], place[pattern.indices]
+        kept = np.flatnonzero(column >= self._first[node[row]])
+        self._entry = kept[np.argsort(node[row[kept]], kind="stable")]
+        self._row, self._column = row[self._entry], column[self._entry]
+        self._entries = np.searchsorted(node[self._row], np.arange(len(self._size) + 1))
+        self._keys = self._borders(node[self._row], dissection.parent)
+        self._owner, self._vertex = np.divmod(self._keys, max(count, 1))
+        self._starts = np.searchsorted(self._owner, np.arange(len(self._size) + 1))
+        self._border = np.diff(self._starts)
+        self._children = _children(dissection.parent)
+        depth = np.repeat(np.arange(len(self.stages) - 1), np.diff(self.stages))
+        squares = np.concatenate([[0], np.cumsum(self._border**2)])
+        self.updates = np.diff(squares[self.stages])
+        self._update = squares[:-1] - squares[self.stages[depth]]
+        self._lay_out_ways(node)
+
+    def _borders(self, owner: np.ndarray, parent: np.ndarray) -> np.ndarray:
+        """Node times number of vertices plus vertex, of all vertices of all borders, ascending."""
+        beyond = self._column >= self._last[owner]
+        own, ends = owner[beyond] * self._count + self._column[beyond], np.searchsorted(owner[beyond], self.stages)
+        found, below = [], np.zeros(0, np.int64)
+        for begin, end in pairwise(ends):
+            child, vertex = np.divmod(below, max(self._count, 1))
+            above = vertex >= self._last[parent[child]]
+            passed = parent[child[above]] * self._count + vertex[above]
+            below = np.unique(np.concatenate([own[begin:end], passed]))
+            found.append(below)
+        return np.concatenate(found)
+
+    def _lay_out_ways(self, node: np.ndarray) -> None:
+        """The rows and columns of both ways; ``node`` is each vertex's."""
+        width = self._size + self._border
+        lists = np.cumsum(width) - width
+        self.up_starts = np.concatenate([[0], np.cumsum(width[node])])
+        self.up_lists = lists[node]
+        self.up_columns = np.empty(int(width.sum()), np.int64)
+        self.up_columns[ranges(lists, self._size)] = np.arange(self._count)
+        self.up_columns[ranges(lists + self._size, self._border)] = self._count + self._vertex
+        by_row = np.lexsort((self._owner, self._vertex))
+        sizes = self._size[self._owner[by_row]]
+        self._down = np.empty(len(by_row), np.int64)
+        self._down[by_row] = np.cumsum(sizes) - sizes
+        rows = np.bincount(self._vertex, weights=self._size[self._owner], minlength=self._count)
+        self.down_starts = np.concatenate([[0], np.cumsum(rows.astype(np.int64))])
+        self.down_columns = ranges(self._first[self._owner[by_row]], sizes)
+
+    def batches(self, begin: int, end: int) -> Iterator[np.ndarray]:
+        """The nodes of a depth, from one to another, in batches of about one width."""
+        width = (self._size + self._border)[begin:end]
+        nodes, width = begin + np.argsort(-width, kind="stable"), -np.sort(-width)
+        while len(nodes):
+            count = int((width >= SMALLEST * width[0]).sum())
+            count = max(1, min(count, BATCH // (int(width[0]) + 1) ** 2))
+            yield nodes[:count]
+            nodes, width = nodes[count:], width[count:]
+
+    def batch(self, nodes: np.ndarray, *, device: str) -> Batch:
+        """A batch of nodes of one depth, on a device."""
+        own, most = max(int(self._size[nodes].max()), 1), int(self._border[nodes].max())
+        side, mine, theirs = own + most + 1, np.arange(own), np.arange(most)
+        size, border = self._size[nodes, None], self._border[nodes, None]
+        inside, beyond = mine < size, theirs < border
+        unit = np.flatnonzero(~inside.ravel())
+        up = np.concatenate([self.up_starts, [NOWHERE]])
+        down = np.concatenate([self._down, [NOWHERE]])
+        columns = [np.where(inside, mine, NOWHERE), np.where(beyond, size + theirs, NOWHERE)]
+        received = [self._received(nodes, own, side, slot=slot) for slot in (0, 1)]
+
+        def put(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(values, device=device)
+
+        source, target = self._begun(nodes, own, side)
+        return Batch(
+            own=own,
+            side=side,
+            unit=put(unit // own * side**2 + unit % own * (side + 1)),
+            source=put(source),
+            target=put(target),
+            received=tuple(Received(*map(put, each)) for each in received if each is not None),
+            rows=put(up[np.where(inside, self._first[nodes, None] + mine, -1)]),
+            columns=put(np.concatenate(columns, axis=1)),
+            down=put(down[np.where(beyond, self._starts[nodes, None] + theirs, -1)]),
+            updates=put(np.where(beyond, self._update[nodes, None] + theirs * border, NOWHERE)),
+            ranks=put(np.where(beyond, theirs, NOWHERE)),
+        )
+
+    def _begun(self, nodes: np.ndarray, own: int, side: int) -> tuple[np.ndarray, np.ndarray]:
+        """`Batch.source` and `Batch.target`."""
+        counts = self._entries[nodes + 1] - self._entries[nodes]
+        chosen, number = ranges(self._entries[nodes], counts), np.repeat(np.arange(len(nodes)), counts)
+        row = self._row[chosen] - self._first[nodes[number]]
+        column = self._place(nodes[number], self._column[chosen], own)
+        beyond = column >= own
+        target = np.concatenate([row * side + column, (column * side + row)[beyond]])
+        number = np.concatenate([number, number[beyond]])
+        return np.concatenate([self._entry[chosen], self._entry[chosen[beyond]]]), number * side**2 + target
+
+    def _received(self, nodes: np.ndarray, own: int, side: int, *, slot: int) -> tuple[np.ndarray, ...] | None:
+        """What `Received` is made of, or None where no node has a child in that place."""
+        child = self._children[nodes, slot, None]
+        border = np.where(child >= 0, self._border[child], 0)
+        if not border.any():
+            return None
+        theirs = np.arange(border.max())
+        kept = theirs < border
+        vertex = self._vertex[np.where(kept, self._starts[child] + theirs, 0)]
+        places = np.where(kept, self._place(np.broadcast_to(nodes[:, None], kept.shape), vertex, own), side - 1)
+        rows = np.where(kept, self._update[child] + theirs * border, NOWHERE)
+        return rows, np.where(kept, theirs, NOWHERE), places
+
+    def _place(self, node: np.ndarray, vertex: np.ndarray, own: int) -> np.ndarray:
+        """Row of a vertex in the front of a node."""
+        rank = np.searchsorted(self._keys, node * self._count + vertex) - self._starts[node]
+        return np.where(vertex < self._last[node], vertex - self._first[node], own + rank)
+
+
+def ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """starts[0], starts[0] + 1, ..., counts[0] of them; then those of the others."""
+    before = np.cumsum(counts) - counts
+    return np.repeat(starts - before, counts) + np.arange(int(counts.sum()))
+
+
+def _children(parent: np.ndarray) -> np.ndarray:
+    """The two children of each node, -1 where there is none, shape (nodes, 2)."""
+    children = np.full((len(parent), 2), -1)
+    child = np.flatnonzero(parent >= 0)
+    above = parent[child]
+    second = np.concatenate([[False], above[1:] == above[:-1]])[: len(above)]
+    children[above, second.astype(int)] = child
+    return children

@@ -1,0 +1,201 @@
+"""A sparse Cholesky factor for CUDA: found by batches of dense matrices, solved by a handful of sparse products.
+
+A triangular solve walks the matrix row after row: on a GPU that takes 2 ms at 30,000 vertices and 11 ms at 330,000,
+however fast the memory is. After a nested dissection all blocks of one depth are independent of each other, so with the
+inverses of the diagonal blocks stored (Alvarado, Pothen and Schreiber 1993) a solve is one product a depth down the
+tree and one up again:
+
+    down, leaves first:   y_S = f_S - sum_C W_SC y_C                    C: descendants of S
+    up, root first:       x_S = A_SS'^-1 y_S - sum_B W_BS^T x_B         B: ancestors of S
+
+| symbol | here | meaning |
+|---|---|---|
+| S | a node | vertices of a leaf, or of the line that cuts a part |
+| A' | ``fronts`` | the matrix after the descendants are eliminated |
+| W_BS | ``w`` | A'_BS A'_SS^-1 |
+
+The factorisation is multifrontal (Duff and Reid 1983): the fronts of a depth are dense matrices of about one size, so a
+few calls of batched linear algebra in float64 eliminate them all. Where entries go is found once for a pattern; a
+matrix with other values takes milliseconds. Nothing is added to one place twice in a call, so equal matrices give equal
+factors.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportIndexIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from ..errors import SolveError
+from ..mesh.lanes import current_stream
+from ..mesh.stencil import SCALAR, VECTOR, vectors
+from .dissection import dissect
+from .fronts import Tree, joined
+
+BLOCK = 64
+"""Threads that share a row's sum on CUDA."""
+
+
+class Elimination:
+    """The elimination of all matrices of one pattern.
+
+    Attributes:
+        order: Vertices in the order of their elimination, shape (V,).
+        device: "cpu" or a CUDA device.
+        rows: First vertex of each depth in that order, deepest first, and their number.
+        tables: Of the way down and of the way up: first entries of the rows, first columns of the rows, columns.
+    """
+
+    def __init__(self, pattern: sp.csr_matrix, *, device: str, leaf: int | None = None) -> None:
+        """Find an order and where every entry goes.
+
+        Args:
+            pattern: Symmetric pattern, shape (V, V).
+            device: Where matrices are factorised and solved.
+            leaf: Vertices of a part that is not cut any further, or None for what suits CUDA.
+        """
+        cut = dissect(pattern) if leaf is None else dissect(pattern, leaf=leaf)
+        tree = Tree(pattern, cut)
+        self.device, self.order = device, torch.as_tensor(cut.order, device=device)
+        self.rows = cut.starts[cut.stages].tolist()
+        down = (tree.down_starts, tree.down_starts, tree.down_columns)
+        up = (tree.up_starts, tree.up_lists, tree.up_columns)
+        self.tables = tuple(
+            tuple(wp.array(part.astype(np.int32), dtype=wp.int32, device=device) for part in way) for way in (down, up)
+        )
+        self._sizes = int(tree.down_starts[-1]), int(tree.up_starts[-1])
+        self._depths = [
+            (int(updates), [tree.batch(nodes, device=device) for nodes in tree.batches(begin, end)])
+            for updates, (begin, end) in zip(tree.updates, pairwise(tree.stages.tolist()), strict=True)
+        ]
+
+    def factor(self, values: Float[Tensor, " entries"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """The entries of the way down and of the way up, each with one more that means nothing.
+
+        Args:
+            values: Entries of a positive definite matrix in the order of the pattern's, float64.
+            dtype: Of the result.
+
+        Raises:
+            SolveError: The matrix is not positive definite.
+        """
+        down, up = (torch.empty(size + 1, dtype=dtype, device=self.device) for size in self._sizes)
+        failed = torch.zeros((), dtype=torch.bool, device=self.device)
+        before = values.new_zeros(1)
+        for size, batches in self._depths:
+            updates = values.new_empty(size + 1)
+            for batch in batches:
+                fronts, own = batch.fronts(values, before), batch.own
+                inverse, info = _inverse(fronts[:, :own, :own])
+                failed |= info.any()
+                w = fronts[:, own:, :own] @ inverse
+                down[joined(batch.down, batch.columns[:, :own], down)] = w.to(dtype)
+                upward = torch.cat([inverse, -w.mT], dim=2)
+                up[joined(batch.rows, batch.columns, up)] = upward.to(dtype)
+                updates[joined(batch.updates, batch.ranks, updates)] = fronts[:, own:, own:] - w @ fronts[:, :own, own:]
+            updates[-1] = 0.0
+            before = updates
+        if bool(failed):
+            raise SolveError("the metric is not positive definite: a stiffness is negative or not finite")
+        return down, up
+
+
+def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses of symmetric matrices, and which of them are not positive definite."""
+    factors, info = torch.linalg.cholesky_ex(matrices)
+    unit = torch.eye(matrices.shape[1], dtype=matrices.dtype, device=matrices.device)
+    half = torch.linalg.solve_triangular(factors, unit.expand_as(matrices), upper=False)
+    return half.mT @ half, info
+
+
+class DissectedSolver:
+    """A symmetric positive definite matrix, factorised for many solves."""
+
+    def __init__(self, elimination: Elimination, values: Float[Tensor, " entries"], *, dtype: torch.dtype) -> None:
+        """Factorise.
+
+        Args:
+            elimination: That of the matrix's pattern.
+            values: The matrix's entries in the order of the pattern's, float64.
+            dtype: Scalar type of the right-hand sides.
+
+        Raises:
+            SolveError: The matrix is not positive definite.
+        """
+        device, rows, count = elimination.device, elimination.rows, len(elimination.order)
+        self._count, self._order, self._cuda = count, elimination.order, device != "cpu"
+        self._state = torch.zeros((2 * count, 3), dtype=dtype, device=device)
+        self._ways = elimination.factor(values, dtype)
+        self._launches = []
+        block = BLOCK if self._cuda else 1
+        depths = range(1, len(rows) - 1), range(len(rows) - 2, -1, -1)
+        for table, way, target, stages in zip(elimination.tables, self._ways, (0, count), depths, strict=True):
+            arrays = [*table, wp.from_torch(way), vectors(self._state)]
+            for first, size in ((rows[stage], rows[stage + 1] - rows[stage]) for stage in stages):
+                if size:
+                    inputs = [first, target, *arrays]
+                    command = wp.launch_tiled(
+                        _PRODUCT[dtype], dim=[size], inputs=inputs, block_dim=block, device=device, record_cmd=True
+                    )
+                    self._launches.append(command)
+        self._inverse = torch.empty_like(self._order)
+        self._inverse[self._order] = torch.arange(count, device=device)
+
+    def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The solution for three right-hand sides at once."""
+        torch.index_select(force, 0, self._order, out=self._state[: self._count])
+        stream = current_stream(str(force.device)) if self._cuda else None
+        for launch in self._launches:
+            launch.launch(stream=stream)
+        return self._state[self._count :][self._inverse]
+
+
+@wp.kernel
+def _product(
+    first: wp.int32,
+    target: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    lists: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=Any),
+    z: wp.array(dtype=Any),
+):
+    i, lane = wp.tid()
+    row = first + i
+    total = z[0] * values.dtype(0.0)
+    begin = starts[row]
+    listed = lists[row] - begin
+    k = begin + lane
+    while k < starts[row + 1]:
+        total += values[k] * z[columns[listed + k]]
+        k += wp.block_dim()
+    whole = wp.tile_sum(wp.tile(total, preserve_type=True))
+    if lane == 0:
+        result = whole[0]
+        if target == 0:
+            result = z[row] - result
+        z[target + row] = result
+
+
+_PRODUCT = {
+    dtype: wp.overload(
+        _product,
+        [
+            wp.int32,
+            wp.int32,
+            *[wp.array(dtype=wp.int32)] * 3,
+            wp.array(dtype=SCALAR[dtype]),
+            wp.array(dtype=VECTOR[dtype]),
+        ],
+    )
+    for dtype in VECTOR
+}
