@@ -1,13 +1,15 @@
 """Newton's VBD or XPBD as a quasi-static solver of our potential: run by a Python with ``newton`` and ``scipy``.
 
-    python newton_adapter.py problem.npz result.npz --solver vbd --steps 1,2,4 --repeats 3 --most-ms 5000
+    python newton_adapter.py problem.npz result.npz --solver vbd --steps 1,2,4 --repeats 3 --most-ms 5000 --device cpu
 
 The springs and hinges are ours, so is the potential that they minimise. What neither has a term for, the guide and
 gravity, is an external force that is renewed every step. Particles stop before each step, so a step is a proximal one:
-its masses only bound the guide's stiffness, and no time passes.
+its masses only bound the guide's stiffness, and no time passes. On CUDA a step is recorded once and replayed.
 Imports nothing of this package.
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 from __future__ import annotations
 
 import argparse
@@ -18,6 +20,7 @@ from typing import Any
 import newton  # pyright: ignore[reportMissingImports]
 import numpy as np
 import scipy.sparse as sp
+import warp as wp
 
 ITERATIONS = 3
 """Iterations of the solver in each step, between two looks at the external force: ten gained less per millisecond."""
@@ -30,32 +33,65 @@ COARSE_STEPS = 4
 """Steps of a coarse level for each step of the finest, as ours."""
 
 
+@wp.kernel
+def pull(
+    starts: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.float32),
+    load: wp.array(dtype=wp.vec3),
+    base: wp.array(dtype=wp.vec3),
+    x: wp.array(dtype=wp.vec3),
+    out: wp.array(dtype=wp.vec3),
+):
+    """Force of the guide and of gravity on each particle: load - K (x - base)."""
+    i = wp.tid()
+    total = load[i]
+    for k in range(starts[i], starts[i + 1]):
+        total -= values[k] * (x[columns[k]] - base[columns[k]])
+    out[i] = total
+
+
 @dataclass
 class Level:
-    """One level's problem, built once."""
+    """One level's problem, built once; ``pulled`` is what `pull` takes before the positions."""
 
     solver: Any
-    states: list[Any]
+    states: tuple[Any, Any]
     control: Any
     base: np.ndarray
-    load: np.ndarray
-    stiffness: sp.csr_matrix
+    pulled: list[wp.array]
+    graph: Any = None
 
     def solve(self, x: np.ndarray, steps: int) -> np.ndarray:
         """Make steps from positions [m]."""
-        here, there = self.states
+        here, _ = self.states
         here.particle_q.assign(x.astype(np.float32))
         for _ in range(steps):
-            x = here.particle_q.numpy().astype(np.float64)
-            here.particle_qd.zero_()
-            here.particle_f.assign((self.load - self.stiffness @ (x - self.base)).astype(np.float32))
-            self.solver.step(here, there, self.control, None, 1.0)
-            here, there = there, here
+            if self.graph is None:
+                self.step()
+            else:
+                wp.capture_launch(self.graph)
         return here.particle_q.numpy().astype(np.float64)
 
+    def step(self) -> None:
+        """One step, back into the state that it began in."""
+        here, there = self.states
+        here.particle_qd.zero_()
+        inputs = [*self.pulled, here.particle_q, here.particle_f]
+        wp.launch(pull, dim=len(self.base), inputs=inputs, device=here.particle_q.device)
+        self.solver.step(here, there, self.control, None, 1.0)
+        wp.copy(here.particle_q, there.particle_q)
 
-def build(problem: Any, index: int, solver: str) -> Level:
-    """One level as a Newton model."""
+    def record(self) -> None:
+        """Record a step for CUDA."""
+        self.solve(self.base, 1)
+        with wp.ScopedCapture(device=self.states[0].particle_q.device) as capture:
+            self.step()
+        self.graph = capture.graph
+
+
+def build(problem: Any, index: int, solver: str, device: str) -> Level:
+    """One level as a Newton model on a device."""
 
     def own(name: str) -> np.ndarray:
         return problem[f"{name}{index}"]
@@ -77,12 +113,16 @@ def build(problem: Any, index: int, solver: str) -> Level:
     builder.add_edges(k, ell, i, j, rest=own("rest_angle").tolist(), edge_ke=weight, edge_kd=[0.0] * len(weight))
     builder.edge_rest_length[:] = [1.0] * len(weight)
     builder.color(include_bending=True)
-    model = builder.finalize()
+    model = builder.finalize(device=device)
     solvers = {"vbd": newton.solvers.SolverVBD, "xpbd": newton.solvers.SolverXPBD}
     made = solvers[solver](model, iterations=ITERATIONS)
-    count = len(base)
-    stiffness = sp.csr_matrix((own("values"), own("columns"), own("starts")), shape=(count, count))
-    return Level(made, [model.state(), model.state()], model.control(), base, own("load"), stiffness)
+    pulled = [wp.array(own(name), dtype=wp.int32, device=device) for name in ("starts", "columns")]
+    pulled.append(wp.array(own("values"), dtype=wp.float32, device=device))
+    pulled += [wp.array(own(name), dtype=wp.vec3, device=device) for name in ("load", "base")]
+    level = Level(made, (model.state(), model.state()), model.control(), base, pulled)
+    if wp.get_device(device).is_cuda:
+        level.record()
+    return level
 
 
 def solve(levels: list[Level], maps: list[sp.csr_matrix], steps: int, *, nested: bool) -> np.ndarray:
@@ -106,11 +146,12 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--most-ms", type=float, default=1e4)
     parser.add_argument("--clock", choices=["wall", "cpu"], default="wall")
+    parser.add_argument("--device", default="cpu")
     given = parser.parse_args()
     clock = time.process_time if given.clock == "cpu" else time.perf_counter
     problem = np.load(given.problem)
     count = int(problem["levels"])
-    levels = [build(problem, index, given.solver) for index in range(count)]
+    levels = [build(problem, index, given.solver, given.device) for index in range(count)]
     maps = [sp.identity(len(levels[0].base), format="csr")]
     maps += [
         sp.csr_matrix((problem[f"map_values{i}"], problem[f"map_columns{i}"], problem[f"map_starts{i}"]))

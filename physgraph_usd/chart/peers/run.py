@@ -38,18 +38,20 @@ class Peer:
         adapter: The script that its Python runs.
         note: What of the problem it was given, in words.
         options: What its script is told beside the problem.
+        follows: Whether it computes where we do; otherwise on the CPU.
     """
 
     name: str
     adapter: str
     note: str
     options: tuple[str, ...] = ()
+    follows: bool = False
 
 
 OURS = "our springs, hinges, guide and gravity; no bodies; 3 iterations a step"
 PEERS = {
-    "newton": Peer("Newton VBD", "newton_adapter.py", OURS, ("--solver", "vbd")),
-    "newton-xpbd": Peer("Newton XPBD", "newton_adapter.py", OURS, ("--solver", "xpbd")),
+    "newton": Peer("Newton VBD", "newton_adapter.py", OURS, ("--solver", "vbd"), follows=True),
+    "newton-xpbd": Peer("Newton XPBD", "newton_adapter.py", OURS, ("--solver", "xpbd"), follows=True),
     "blender": Peer(
         "Blender cloth (own energy)",
         "blender_adapter.py",
@@ -141,6 +143,8 @@ def _run(
         line = [python, str(HERE / peer.adapter), str(given), str(result)]
         line += ["--steps", ",".join(map(str, steps)), "--repeats", str(plan.repeats)]
         line += ["--most-ms", str(plan.most_ms), "--clock", clock_name, *peer.options]
+        if peer.follows:
+            line += ["--device", str(group.levels[-1].device)]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
             last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
