@@ -1,6 +1,6 @@
 """What contact leaves in shots: vertices in bodies and crossings, before and after, in our form and in the paper's.
 
-    python -m benchmarks.contact_shots [--frames 5] [--level 2] [--form ours] [--shot NAME] [FOLDER]
+    python -m benchmarks.contact_shots [--frames 5] [--level 2] [--form ours] [--shot NAME] [--device cuda] [FOLDER]
 
 Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
 Prints a row a shot: the sums over frames and garments. The paper's form stands without our last projection, but with
@@ -104,9 +104,10 @@ def _plus(pair: tuple[int, int], before: int, after: int) -> tuple[int, int]:
 @click.option("--level", default=2, show_default=True)
 @click.option("--form", "forms", multiple=True, type=click.Choice(list(FORMS)), default=["ours", "paper"])
 @click.option("--shot", "shots", multiple=True, help="Only these.")
-def main(folder: Path | None, frames: int, level: int, forms: Sequence[str], shots: Sequence[str]) -> None:
+@click.option("--device", default="cpu", show_default=True)
+def main(folder: Path | None, frames: int, level: int, forms: Sequence[str], shots: Sequence[str], device: str) -> None:
     """Print the table."""
-    prepare_device("cpu")
+    prepare_device(device)
     say(f"{frames} frames in a row, level {level}; a -> b: before and after")
     say(
         "| shot | form | vertices | inside | % | deepest mm | pinched | body crossings | cloth crossings | garments "
@@ -119,7 +120,7 @@ def main(folder: Path | None, frames: int, level: int, forms: Sequence[str], sho
                 continue
             shot, first = open_one(name, Path(place), folder)
             for form in forms:
-                sums = run(shot, first, frames, level=level, settings=FORMS[form])
+                sums = run(shot, first, frames, level=level, settings=FORMS[form], device=device)
                 say(_row(name, form, sums))
 
 
@@ -131,7 +132,7 @@ def open_one(name: str, place: Path, folder: Path | None) -> tuple[Shot, int]:
     return open_shot(str(Path(folder or "") / name), garments=garments, colliders=colliders), first
 
 
-def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSettings) -> Sums:
+def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSettings, device: str = "cpu") -> Sums:
     """Refine some frames in a row.
 
     Args:
@@ -140,11 +141,12 @@ def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSett
         count: Number of frames.
         level: Subdivisions.
         settings: How contact is solved.
+        device: Where to compute.
     """
     from physgraph_usd.options import RefineOptions  # noqa: PLC0415
 
     solve = replace(RefineOptions().solve_settings(), contact=settings)
-    refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), lanes=LANES)
+    refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), device=device, lanes=LANES)
     sums, spent = Sums(), []
     for time_code in shot.scene.times[first : first + count]:
         frame = shot.frame(time_code)

@@ -1,13 +1,13 @@
 """Is refine's default on the front of speed against accuracy? Samples and, where they are there, real shots.
 
-    python -m benchmarks.front [--levels 1,2] [--shots flag,swatch] [--fresh]
+    python -m benchmarks.front [--levels 1,2] [--shots flag,swatch] [--device cuda] [--fresh]
 
 One cold frame of each shot at each level, contact included, measured as `physgraph-usd chart --clock cpu` does it:
-the processor time of one core, energies judged in float64. Rivals are quasi-Newton and `physgraph`, each through the
-levels and at the finest alone, and L-BFGS there, with growing steps. A ratio is the default's time
+the processor time of one core, on CUDA the wall's; energies judged in float64. Rivals are quasi-Newton and `physgraph`,
+each through the levels and at the finest alone, and L-BFGS there, with growing steps. A ratio is the default's time
 over the least of all to the same gap; up to 1.1 counts as level. Phi* is the least that anybody found, a nested solve
 of 48 steps in float64 and, where the default went to the finest level alone, one of 192 steps there among them. What
-was measured lies in build/front.CODE.jsonl: a run that was stopped goes on there while the code is the same.
+was measured lies in build/front.DEVICE.CODE.jsonl: a run that was stopped goes on there while the code is the same.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.usd.reader import Shot, open_shot
 
-JOURNAL = Path("build") / f"front.{code_of(Path(physgraph_usd.__file__).parent)}.jsonl"
-"""Rows of this code."""
+JOURNAL = f"front.{{}}.{code_of(Path(physgraph_usd.__file__).parent)}.jsonl"
+"""Rows of this code, by device."""
 SAMPLES: dict[str, float | None] = {
     "flag": 12.0,
     "swatch": None,
@@ -63,8 +63,8 @@ STEPS = {
     "quasi-newton": (2, 4, 8, 16),
     "quasi-newton-flat": (4, 16, 32, 48, 64),
     "lbfgs": (16, 32, 64, 128),
-    "physgraph": (2, 8),
-    "physgraph-flat": (8, 16, 32),
+    "physgraph": (2, 8, 16),
+    "physgraph-flat": (8, 16, 32, 64, 128, 256),
 }
 DEFAULT, START, LEAST = "default", "start", "least"
 LEAST_STEPS = {"quasi-newton": 48, "quasi-newton-flat": 192}
@@ -79,34 +79,37 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--levels", default="1,2")
     parser.add_argument("--shots", default=",".join((*SAMPLES, *REAL)), help="names, or their beginnings")
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--fresh", action="store_true", help="measure everything anew")
     given = parser.parse_args()
-    prepare_device("cpu")
-    JOURNAL.parent.mkdir(parents=True, exist_ok=True)
-    if given.fresh or not JOURNAL.exists():
-        JOURNAL.write_text("", encoding="utf-8")
+    prepare_device(given.device)
+    journal = Path("build") / JOURNAL.format(given.device.partition(":")[0])
+    journal.parent.mkdir(parents=True, exist_ok=True)
+    if given.fresh or not journal.exists():
+        journal.write_text("", encoding="utf-8")
     wanted = tuple(given.shots.split(","))
     names = [name for name in (*SAMPLES, *REAL) if name.startswith(wanted)]
     lines = []
     for level in map(int, given.levels.split(",")):
         for name in names:
-            if found := measured(name, level):
+            if found := measured(name, level, journal, given.device):
                 lines.append(placed(name, level, found))
     head = ("shot", "level", "vertices", "gap", "ms", "fastest to that gap", "ratio", "the default went")
     say(table(head, [line for line, _ in lines]))
     say(f"\non the front (up to {TOLERANCE:g}): {sum(on for _, on in lines)} of {len(lines)}")
 
 
-def measured(name: str, level: int) -> list[dict[str, Any]]:
+def measured(name: str, level: int, journal: Path, device: str) -> list[dict[str, Any]]:
     """All runs of a shot at a level; nothing where the shot is not there."""
     shot = open_one(name, level)
     if shot is None:
         return []
-    known = [row for row in read() if (row["shot"], row["level"]) == (name, level)]
+    known = [row for row in read(journal) if (row["shot"], row["level"]) == (name, level)]
     if not any(row["method"] == LEAST for row in known):
         time = SAMPLES[name] if name in SAMPLES else REAL[name][2]
         frame = plain_detail(shot.frame(time if time is not None else shot.scene.times[-1]))
-        known += Bench(name, level, shot, frame).run({(row["method"], row["steps"]) for row in known})
+        bench = Bench(shot, frame, {"shot": name, "level": level}, journal, device)
+        known += bench.run({(row["method"], row["steps"]) for row in known})
     return known
 
 
@@ -119,9 +122,9 @@ def open_one(name: str, level: int) -> Shot | None:
     return open_shot(str(file), garments=garments, colliders=colliders, level=level) if file.exists() else None
 
 
-def read() -> Iterator[dict[str, Any]]:
+def read(journal: Path) -> Iterator[dict[str, Any]]:
     """The journal's whole lines."""
-    for line in JOURNAL.read_text(encoding="utf-8").splitlines(keepends=True):
+    for line in journal.read_text(encoding="utf-8").splitlines(keepends=True):
         if line.endswith("\n"):
             yield json.loads(line)
 
@@ -129,11 +132,19 @@ def read() -> Iterator[dict[str, Any]]:
 class Bench:
     """Runs the methods on one frame."""
 
-    def __init__(self, name: str, level: int, shot: Shot, frame: Frame) -> None:
-        """Build the problem in both precisions."""
-        levels = [level] * len(shot.scene.garments)
-        self._about, self._frame = {"shot": name, "level": level}, frame
-        self._timed = Problem(shot.scene, levels, device="cpu", lanes=1, clock="cpu")
+    def __init__(self, shot: Shot, frame: Frame, about: dict[str, Any], journal: Path, device: str) -> None:
+        """Build the problem in both precisions.
+
+        Args:
+            shot: The shot.
+            frame: The frame.
+            about: The shot's name and the level, for the rows.
+            journal: Where rows go.
+            device: Where to solve.
+        """
+        levels = [about["level"]] * len(shot.scene.garments)
+        self._about, self._frame, self._journal = about, frame, journal
+        self._timed = Problem(shot.scene, levels, device=device, lanes=1, clock="cpu" if device == "cpu" else "wall")
         self._judge = Problem(shot.scene, levels, device="cpu", lanes=1, dtype=torch.float64)
         self._rows: list[dict[str, Any]] = []
 
@@ -174,7 +185,7 @@ class Bench:
 
     def _add(self, method: str, steps: int, **values: Any) -> None:
         row = self._about | {"method": method, "steps": steps} | values
-        with JOURNAL.open("a", encoding="utf-8") as file:
+        with self._journal.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         self._rows.append(row)
 

@@ -88,7 +88,7 @@ class Group:
         self._forces: list[LevelForces] = []
         self._stretch = 0.0
         # What an integrator records on CUDA lasts as long as the systems and itself.
-        self._systems_last, self._integrators = device != "cpu", dict[bool, Integrator]()
+        self._systems_last, self._integrators = device != "cpu", dict[object, Integrator]()
 
     def solve(
         self,
@@ -188,7 +188,7 @@ class Group:
         """Solve the frames that follow in another way; levels and metrics are kept."""
         if settings.potential != self._settings.potential:
             self._material = ()
-        self._settings, self._integrators = settings, {}
+        self._settings = settings
 
     def potential(
         self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()
@@ -339,9 +339,11 @@ class Group:
             warm=warm,
             device=self.levels[0].device,
         )
-        if choice.learned not in self._integrators:
-            self._integrators[choice.learned] = choice.integrator(self._settings.method.build)
-        self._integrator = self._integrators[choice.learned]
+        build = self._settings.method.build
+        who = None if choice.learned else build
+        if who not in self._integrators:
+            self._integrators[who] = choice.integrator(build)
+        self._integrator = self._integrators[who]
         if contact is not None and (choice.nested or warm):
             contact.forget()  # The choice looked at the upsampled cage, which is not where the level starts.
         return choice

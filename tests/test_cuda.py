@@ -139,6 +139,15 @@ def test_samples_are_refined_alike(tmp_path: Path, sample: str, integrator: str)
         assert np.median(np.linalg.norm(found - points["cpu"][path], axis=-1)) < 2e-3 * size
 
 
+def test_cloth_that_comes_near_after_the_first_steps(tmp_path: Path) -> None:
+    """The level's first steps are recorded, those among what is near are not: the one goes on where the other was."""
+    stage, out = write_sample("sleeve", tmp_path), tmp_path / "out.usda"
+    options = ["--device", "cuda", "--integrator", "physgraph", "--frames", "48", "--level", "2", "--steps", "2"]
+    result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(out), *options])
+    assert result.exit_code == 0, result.output
+    assert all(np.isfinite(points).all() for points in points_of(out).values())
+
+
 def points_of(layer: Path) -> dict[str, np.ndarray]:
     """Points of every mesh at every time sample, by path."""
     stage = Usd.Stage.Open(str(layer))

@@ -72,6 +72,25 @@ def test_resuming_keeps_the_memory():
     assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
 
 
+@pytest.mark.parametrize("made", [0, 1, 3, 7])
+def test_steps_that_are_no_longer_recorded_keep_the_memory(made: int, monkeypatch: pytest.MonkeyPatch):
+    """As where cloth comes near something after a level's first steps: that system is met only once."""
+    system, x = problem()
+    network = random_network(LOCAL, seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    one, other = LearnedMetric(network), Recorder(network)
+    a, b = one.start(system, x), other.start(system, x)
+    for _ in range(made):
+        a, b = one.step(system, a), other.step(system, b)
+    monkeypatch.setattr(Recorder, "records", lambda *_: False)
+    a, b = one.resume(system, a), other.resume(system, b)
+    assert not isinstance(b.memory, Place)
+    assert b.memory.step == made
+    for _ in range(3):
+        a, b = one.step(system, a), other.step(system, b)
+        assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
+
+
 def test_a_step_that_another_shortened_is_followed():
     """As the guard does it: a step is proposed, half of it taken back, then half of the rest; memory is kept."""
     system, x = problem()

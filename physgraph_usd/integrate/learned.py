@@ -90,13 +90,14 @@ class LearnedMetric:
         """Evaluate the carry's positions under forces that changed a little; the last displacements are kept."""
         energy, force = system.energy_and_force(carry.x)
         image = system.apply_smooth_inverse(force)
-        if isinstance(carry.memory, Place):
-            before, recording = carry.memory.recording, self._recorded(system)
-            assert recording is not None
-            if recording is not before:
-                recording.take_over(before)
-            return recording.go_on(carry.x, energy, force, image)
-        old: _Memory = carry.memory
+        old = carry.memory
+        if isinstance(old, Place):
+            before, recording = old.recording, self._recorded(system)
+            if recording is not None:
+                if recording is not before:
+                    recording.take_over(before)
+                return recording.go_on(carry.x, energy, force, image)
+            old = self._released(before, graph_of(system))
         memory = replace(old, images=(image, *old.images[1:]), forces=(force, *old.forces[1:]))
         return Carry(carry.x, energy, force, image, self.name, memory)
 
@@ -163,6 +164,23 @@ class LearnedMetric:
         while len(self._recordings) > RECORDINGS:
             del self._recordings[next(iter(self._recordings))]
         return known
+
+    def _released(self, recording: Recording, graph: Graph) -> _Memory:
+        """What a recording knows, for steps that are not recorded: those of a system that is met only once."""
+        rows, made, last = recording.rows.clone(), int(recording.step), SECANTS - 1
+        before = tuple(recording.images.clone())
+        pairs: tuple[Secant, ...] = ()
+        if "secant" in self._network.config.vectors:
+            first = max(SECANTS - made, 0)
+            pairs = tuple(secant_of(*rows[k:FORCE:SECANTS], graph=graph) for k in range(first, SECANTS))
+        return _Memory(
+            images=(rows[IMAGE], *before[:made]),
+            forces=(rows[FORCE], recording.force_before.clone())[: made + 1],
+            moves=(rows[last], rows[last - 1])[:made],
+            pairs=pairs,
+            step=made,
+            graph=graph,
+        )
 
     def _propose_recorded(self, recording: Recording, graph: Graph) -> Tensor:
         """The displacement of the next step [m] out of a recording's buffers."""
