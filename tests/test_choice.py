@@ -11,7 +11,7 @@ from cloth import frame_of, refiner_of, sheet, solved, wave
 from folds import frame_with, named, refiner_with, square
 from sheets import garment_of
 
-from physgraph_usd.integrate.choice import LONGER, Choice, choose
+from physgraph_usd.integrate.choice import LONGER, LONGER_CUDA, Choice, choose
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.options import RefineOptions
 
@@ -75,8 +75,8 @@ def test_the_network_makes_the_steps_on_cuda_and_where_levels_are_many(
     assert found.learned == learned
     assert ("physgraph" in found.reason) == learned
     assert found.integrator(QuasiNewton).name == ("physgraph" if learned else "quasi-newton")
-    deep = subdivisions > 1 and not warm
-    assert choose(None, subdivisions, Seen(0.01), **options).learned == deep
+    cold = not warm and (device == "cuda" or subdivisions > 1)
+    assert choose(None, subdivisions, Seen(0.01), **options).learned == cold
     assert not choose(None, subdivisions, Seen(1.0, crossed=True), **options).learned
     assert not choose(True, subdivisions, None, **options).learned
 
@@ -86,6 +86,15 @@ def test_a_cage_nearly_at_rest_is_passed_over(move: float, crowding: float, nest
     for subdivisions in (2, 3):
         assert choose(None, subdivisions, Seen(crowding), remaining=lambda: move).nested == nested
         assert not choose(None, subdivisions, None, remaining=lambda: move, warm=True).nested
+
+
+@pytest.mark.parametrize(("move", "contact", "nested"), [(0.3, 0.0, False), (0.5, 0.0, True), (0.3, 0.5, True)])
+def test_on_cuda_coarse_levels_serve_cages_far_from_rest(move: float, contact: float, nested: bool):
+    found = choose(None, 2, Seen(contact), remaining=lambda: move, device="cuda")
+    assert (found.nested, found.learned) == (nested, True)
+    assert found.steps == (1 if nested else LONGER_CUDA)
+    crossed = choose(None, 2, Seen(1.0, crossed=True), remaining=lambda: move, device="cuda")
+    assert (crossed.nested, crossed.learned) == (True, False)
 
 
 def test_refine_leaves_it_open():

@@ -135,11 +135,10 @@ class Contact:
         depths = self.depths(x)
         touching = [area * (depth > 0) for area, depth in zip(self._areas, depths, strict=True)]
         area = sum((each.sum() for each in touching), torch.zeros_like(x[0, 0]))
-        if not float(area) > 0:
-            return torch.zeros((), dtype=torch.float64, device=x.device)
+        stiffness = torch.where(area > 0, self._stiffness / area, torch.zeros_like(area))
         energy = torch.zeros((), dtype=torch.float64, device=x.device)
         for planes, depth, share in zip(self.planes, depths, touching, strict=True):
-            weight = self._stiffness / area * share
+            weight = stiffness * share
             force[planes.vertex.long()] += weight.unsqueeze(1) * planes.normal
             energy = energy + (weight * depth).sum(dtype=torch.float64)
         return energy

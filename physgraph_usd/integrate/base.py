@@ -95,7 +95,8 @@ class System:
         free: False where a vertex may not move, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
         level: The level's mesh; None for a system that has none.
-        lasting: Whether it is met again, in the next frame or for another descent: recording its steps then pays.
+        lasting: Whether it is met again, in the next frame or for another descent.
+        expected: Most steps that are to be made; recording them pays where they are many, or where it is met again.
         field: The forces.
         metric: H0.
         evaluations: Number of force evaluations so far.
@@ -113,7 +114,7 @@ class System:
         lasting: bool = False,
     ) -> None:
         """Join a force field with its metric and its mask."""
-        self.lasting = lasting
+        self.lasting, self.expected = lasting, 0
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())

@@ -42,6 +42,8 @@ LONGEST = 5.0
 """Most edge lengths that a vertex moves in a step."""
 RECORDINGS = 6
 """Recordings kept: of the levels of a garment, or of two."""
+WORTH = 6
+"""Steps from which those of a system that is met only once are recorded: recording costs as much as four."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,18 +150,24 @@ class LearnedMetric:
         return limited(move, system.spacing) * system.free
 
     def records(self, system: System) -> bool:
-        """Whether a system's steps are recorded: on CUDA, once trained, where the system is met again."""
+        """Whether a system's steps are recorded: on CUDA, once trained, where it is met again or takes many."""
         few = system.level is None or len(system.level.spans) <= MOST_GARMENTS
-        return self._record and system.lasting and system.spacing.is_cuda and few
+        pays = system.lasting or system.expected >= WORTH
+        return self._record and pays and system.spacing.is_cuda and few
 
     def _recorded(self, system: System) -> Recording | None:
-        """The recording of a system's steps, where they are recorded; those of the last few systems are kept."""
+        """The recording of a system's steps, where they are recorded.
+
+        Those of the last few systems that are met again are kept, and the last of another.
+        """
         if not self.records(system):
             return None
         known = self._recordings.pop(system, None)
         if known is None:
             graph = graph_of(system)
             known = Recording(system, lambda recording: self._propose_recorded(recording, graph))
+            for other in [each for each in self._recordings if not (each.lasting or system.lasting)]:
+                del self._recordings[other]
         self._recordings[system] = known
         while len(self._recordings) > RECORDINGS:
             del self._recordings[next(iter(self._recordings))]

@@ -15,6 +15,7 @@ a garment and one more product replace the two loops of `secants.secant_directio
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false, reportReturnType=false
 from __future__ import annotations
 
+import functools
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -152,7 +153,7 @@ class Recording:
             graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side), uncollected():
-                graph.capture_begin(capture_error_mode="relaxed")
+                graph.capture_begin(pool=_pool(self.x.device), capture_error_mode="relaxed")
                 self._step()
                 graph.capture_end()
             torch.cuda.current_stream().wait_stream(side)
@@ -179,6 +180,13 @@ class Recording:
         self.x.copy_(x)
         self.energy.copy_(energy)
         self.step += 1.0
+
+
+@functools.cache
+def _pool(device: torch.device) -> Any:
+    """Memory that all recordings on a device share: they are replayed one after another, and keep nothing in it."""
+    with torch.cuda.device(device):
+        return torch.cuda.graph_pool_handle()
 
 
 @contextmanager

@@ -92,6 +92,7 @@ def solve_level(
     began = time.perf_counter()
     report = LevelReport(level, x.shape[0])
     before = (system.evaluations, system.metric_solves)
+    system.expected = budget.steps
     carry = integrator.start(system, x) if resume is None else resumed(integrator, system, resume)
     _require_finite(carry, level)
     report.energy_before = carry.energy
