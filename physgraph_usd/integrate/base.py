@@ -167,8 +167,12 @@ class System:
 
     def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
         """RMS of H0^-1 F over the free vertices, in local edge lengths."""
+        return float(self.relative_move(preconditioned))
+
+    def relative_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """`remaining_move` where it was computed, float64."""
         relative = preconditioned.square().sum(dim=1) / self.spacing.square()
-        return float((relative.sum(dtype=torch.float64) / self.free.sum().clamp_min(1)).sqrt())
+        return (relative.sum(dtype=torch.float64) / self.free.sum().clamp_min(1)).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +187,7 @@ class Carry:
         mover: Who made the last step: the integrator's name, "halved", "quartered", "fallback" or "stayed".
         memory: The integrator's own state.
         setbacks: Corrections of the guard in a row, up to this step.
+        remaining: `System.remaining_move` at x, where the integrator knows it.
     """
 
     x: Float[Tensor, "vertices 3"]
@@ -192,6 +197,7 @@ class Carry:
     mover: str = ""
     memory: Any = None
     setbacks: int = 0
+    remaining: float | None = None
 
     def moved_by(self, mover: str) -> Carry:
         """The same carry under another mover's name."""

@@ -52,7 +52,7 @@ class Recording:
     Attributes:
         system: The system.
         x: Positions [m].
-        energy: [J], float64 scalar.
+        known: Energy [J] and remaining move in edge lengths, float64, shape (2,).
         rows: What the direction combines, shape (17, V, 3).
         images: H0^-1 F one and two steps ago [m], shape (2, V, 3).
         force_before: Force one step ago [N].
@@ -71,7 +71,7 @@ class Recording:
         count, like = len(system.spacing), {"dtype": system.spacing.dtype, "device": system.spacing.device}
         self.x, self.force_before = torch.zeros((count, 3), **like), torch.zeros((count, 3), **like)
         self.rows, self.images = torch.zeros((ROWS, count, 3), **like), torch.zeros((2, count, 3), **like)
-        self.energy = torch.zeros((), dtype=torch.float64, device=like["device"])
+        self.known = torch.zeros(2, dtype=torch.float64, device=like["device"])
         self.step = torch.zeros((), device=like["device"])
         level = system.level
         self._spans = (slice(0, count),) if level is None else level.spans
@@ -117,7 +117,8 @@ class Recording:
         self._from = place.version
         self.version += 1
         x, force, image = self.x.clone(), self.rows[FORCE].clone(), self.rows[IMAGE].clone()
-        return Carry(x, float(self.energy), force, image, "physgraph", Place(self, self.version))
+        energy, remaining = self.known.tolist()  # One wait for both.
+        return Carry(x, energy, force, image, "physgraph", Place(self, self.version), remaining=remaining)
 
     def follow(self, carry: Carry, x: Tensor, energy: float, force: Tensor, image: Tensor) -> Carry:
         """Put a step from a carry to x in the place of the one that was made from there last."""
@@ -153,7 +154,7 @@ class Recording:
             graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side), uncollected():
-                graph.capture_begin(pool=_pool(self.x.device), capture_error_mode="relaxed")
+                graph.capture_begin(pool=_anchor(self.x.device).pool(), capture_error_mode="relaxed")
                 self._step()
                 graph.capture_end()
             torch.cuda.current_stream().wait_stream(side)
@@ -178,15 +179,20 @@ class Recording:
         new += [(rows[IMAGE] - image).unsqueeze(0), force.unsqueeze(0), image.unsqueeze(0)]
         rows.copy_(torch.cat(new))
         self.x.copy_(x)
-        self.energy.copy_(energy)
+        self.known.copy_(torch.stack([energy.double(), system.relative_move(image)]))
         self.step += 1.0
 
 
 @functools.cache
-def _pool(device: torch.device) -> Any:
-    """Memory that all recordings on a device share: they are replayed one after another, and keep nothing in it."""
-    with torch.cuda.device(device):
-        return torch.cuda.graph_pool_handle()
+def _anchor(device: torch.device) -> torch.cuda.CUDAGraph:
+    """A graph that stays, and with it the memory that all recordings on a device share.
+
+    They are replayed one after another and leave nothing in it.
+    """
+    graph, one = torch.cuda.CUDAGraph(), torch.zeros((), device=device)
+    with torch.cuda.device(device), torch.cuda.graph(graph):
+        one.add_(1.0)
+    return graph
 
 
 @contextmanager

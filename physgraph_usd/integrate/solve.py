@@ -131,6 +131,8 @@ def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) ->
 
 
 def _remaining_move(system: System, carry: Carry) -> float:
+    if carry.remaining is not None:
+        return carry.remaining
     known = carry.preconditioned
     return system.remaining_move(known if known is not None else system.apply_metric_inverse(carry.force))
 
