@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import pytest
 import torch
 from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.integrate.base import System
-from physgraph_usd.integrate.learned import LearnedMetric
+from physgraph_usd.integrate.fused import fused_physgraph
+from physgraph_usd.integrate.learned import LearnedMetric, graph_of
 from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
 from physgraph_usd.integrate.recorded import Place
 from physgraph_usd.integrate.weights import random_network
@@ -70,6 +74,24 @@ def test_resuming_keeps_the_memory():
         a, b = one.step(system, a), other.step(system, b)
     a, b = one.step(system, one.resume(system, a)), other.step(system, other.resume(system, b))
     assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
+
+
+def test_a_recording_keeps_what_its_kernels_write_to():
+    """A cache of a few would drop it while later levels and garments come by."""
+    system, x = problem()
+    network = random_network(LOCAL, seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    integrator = Recorder(network)
+    carry = integrator.start(system, x)
+    fused = integrator._fused(system, graph_of(system))
+    kept = weakref.ref(fused)
+    del fused
+    fused_physgraph.cache_clear()
+    gc.collect()
+    assert kept() is not None
+    del integrator, carry
+    gc.collect()
+    assert kept() is None
 
 
 @pytest.mark.parametrize("made", [0, 1, 3, 7])

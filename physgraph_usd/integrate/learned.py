@@ -28,7 +28,7 @@ from torch import Tensor
 from ..errors import SolveError
 from .around import Around
 from .base import Carry, Surface, System
-from .fused import can_fuse, fused_physgraph
+from .fused import FusedPhysgraph, can_fuse, fused_physgraph
 from .guard import Guard
 from .network import Graph, Physgraph
 from .paper_network import PaperNetwork, Ways
@@ -125,19 +125,30 @@ class LearnedMetric:
         """The displacement of the next step [m]."""
         memory: _Memory = carry.memory
         assert memory.graph is not None
-        whole = partial(self._vector, system=system, carry=carry)
-        return self._combined(system, carry.x, whole, step=memory.step, graph=memory.graph)
+        whole, fused = partial(self._vector, system=system, carry=carry), self._fused(system, memory.graph)
+        return self._combined(system, carry.x, whole, step=memory.step, graph=memory.graph, fused=fused)
+
+    def _fused(self, system: System, graph: Graph) -> FusedPhysgraph | None:
+        """The network as one kernel for a system, where there is one."""
+        if not self._fuse or system.spacing.dtype != torch.float32:
+            return None
+        lanes = 1 if system.level is None else system.level.lanes
+        starts = (*(span.start for span in graph.spans), len(system.spacing))
+        return fused_physgraph(self._network, starts, LONGEST, device=str(system.spacing.device), lanes=lanes)
 
     def _combined(
-        self, system: System, x: Tensor, whole: Callable[[str], Tensor], *, step: int | Tensor, graph: Graph
+        self,
+        system: System,
+        x: Tensor,
+        whole: Callable[[str], Tensor],
+        *,
+        step: int | Tensor,
+        graph: Graph,
+        fused: FusedPhysgraph | None,
     ) -> Float[Tensor, "vertices 3"]:
         """The network's combination of vectors [m]; ``whole`` gives those without a dot in their name."""
         names = self._network.config.vectors
-        if self._fuse and x.dtype == torch.float32:
-            lanes = 1 if system.level is None else system.level.lanes
-            device = str(system.spacing.device)
-            starts = (*(span.start for span in graph.spans), len(system.spacing))
-            fused = fused_physgraph(self._network, starts, LONGEST, device=device, lanes=lanes)
+        if fused is not None:
             around = cache(lambda: Around(_level(system), x))
             bases = vectors_of(fused.bases, whole, around=around)
             return fused(bases, system.spacing, system.reach, step, around=around)
@@ -165,7 +176,9 @@ class LearnedMetric:
         known = self._recordings.pop(system, None)
         if known is None:
             graph = graph_of(system)
-            known = Recording(system, lambda recording: self._propose_recorded(recording, graph))
+            # A recording keeps what its kernels write to: what is cached for all may be dropped.
+            propose = partial(self._propose_recorded, graph=graph, fused=self._fused(system, graph))
+            known = Recording(system, propose)
             for other in [each for each in self._recordings if not (each.lasting or system.lasting)]:
                 del self._recordings[other]
         self._recordings[system] = known
@@ -190,7 +203,7 @@ class LearnedMetric:
             graph=graph,
         )
 
-    def _propose_recorded(self, recording: Recording, graph: Graph) -> Tensor:
+    def _propose_recorded(self, recording: Recording, *, graph: Graph, fused: FusedPhysgraph | None) -> Tensor:
         """The displacement of the next step [m] out of a recording's buffers."""
         system, rows = recording.system, recording.rows
         diagonal = system.rest_diagonal.unsqueeze(1)
@@ -204,7 +217,8 @@ class LearnedMetric:
             "diagonal": lambda: rows[FORCE] / diagonal,
             "diagonal1": lambda: recording.force_before / diagonal,
         }
-        return self._combined(system, recording.x, lambda name: known[name](), step=recording.step, graph=graph)
+        x, step = recording.x, recording.step
+        return self._combined(system, x, lambda name: known[name](), step=step, graph=graph, fused=fused)
 
     def _vector(self, name: str, *, system: System, carry: Carry) -> Tensor:
         """One of `network.VECTORS` [m]; zero where the past does not reach so far."""
