@@ -36,7 +36,7 @@ from .solve_settings import SolveSettings
 
 TORN = 0.5
 """The same percentile of a result beyond which a frame that started warm is solved again from cold."""
-WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.25, 1.0
+WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
 
