@@ -167,6 +167,18 @@ class TestRest:
         assert (np.linalg.norm(fine[:, 1:], axis=1) < 0.35).all()
 
 
+def test_cloth_is_lifted_so_far_and_no_farther():
+    start = torch.rand((50, 3), generator=torch.Generator().manual_seed(5))
+    way = torch.nn.functional.normalize(torch.randn((50, 3), generator=torch.Generator().manual_seed(6)), dim=1)
+    length = torch.linspace(0.0, 3.0, 50)
+    x, most = start + length.unsqueeze(1) * way, torch.full((50,), 1.2)
+    found = physgraph_usd.contact.bodies.no_farther(x, start, most)
+    near = length <= 1.2
+    assert torch.equal(found[near], x[near])
+    assert torch.allclose(found[~near], (start + 1.2 * way)[~near], atol=1e-6)
+    assert physgraph_usd.contact.bodies.no_farther(x, start, 10.0 * most) is x
+
+
 class TestLeftOut:
     def test_a_far_body_changes_no_bit(self):
         far = mesh_pose((ball()[0] + 10.0, ball()[1]))

@@ -29,8 +29,20 @@ from .track import Track
 PINCHED = 0.5
 """Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
 
+LIFT = 2.0
+"""Farthest that cloth is lifted over what comes through its faces, in edge lengths: a spike would show more."""
 STALLED = 6
 """How often faces that a body comes through are moved in vain, once none more comes clear."""
+
+
+def no_farther(
+    x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"], most: Float[Tensor, " vertices"]
+) -> Float[Tensor, "vertices 3"]:
+    """Positions on the way from where each vertex started to x, no farther than most [m]; x itself where none is."""
+    way = x - start
+    length = way.norm(dim=1)
+    far = length > most
+    return torch.where(far.unsqueeze(1), start + way * (most / length).unsqueeze(1), x) if bool(far.any()) else x
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +89,7 @@ class LevelBodies:
             Positions [m]; x itself when none had to move; and the passes that it took.
         """
         out, passes = self._out(x)
-        best, least, stalled = out, len(self._level.triangles) + 1, 0
+        first, best, least, stalled = out, out, len(self._level.triangles) + 1, 0
         for _ in range(self._settings.lifts):
             lifted, faces = self._over_corners(out)
             if faces < least:
@@ -85,8 +97,8 @@ class LevelBodies:
             stalled += 1
             if not faces or stalled > STALLED:
                 break
-            out, passes = lifted, passes + 1
-        return best, passes
+            out, passes = no_farther(lifted, first, LIFT * self._level.spacing), passes + 1
+        return (best if best is first else self.push_out(best)), passes
 
     def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Free vertices moved to the least clearance, wherever bodies come through faces [m]."""
