@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import scipy.sparse as sp
 import torch
 
 from physgraph_usd.contact import metric as contact_metric
+from physgraph_usd.contact.cloth import ClothView
+from physgraph_usd.contact.frame import LevelContact
 from physgraph_usd.contact.metric import HeldMetric
+from physgraph_usd.forces.contact import Contact
 from physgraph_usd.integrate.metric import Metric
 
 
@@ -46,5 +50,20 @@ class TestHeldMetric:
         metric = HeldMetric(plain, stiff)
         assert metric.serves(0.0 * stiff)
         assert metric.serves(9.0 * stiff)
-        assert not metric.serves(9.0 * stiff, tangled=True)
         assert not metric.serves(11.0 * stiff)
+
+
+@pytest.mark.parametrize("tangled", [True, False])
+def test_cloth_that_crosses_cloth_is_not_worth_a_factor(tangled, monkeypatch):
+    plain, _ = chain()
+    made: list[torch.Tensor] = []
+    whole = Metric.plus
+    monkeypatch.setattr(Metric, "plus", lambda self, stiff: made.append(stiff) or whole(self, stiff))
+    pushed = torch.linspace(0.0, 5.0, 12, dtype=torch.float64)
+    monkeypatch.setattr(Contact, "diagonal", lambda *_: pushed)
+    cloth, touch = object.__new__(ClothView), object.__new__(Contact)
+    cloth.tangled = tangled
+    metric = LevelContact(None, cloth, rounds=3).metric(plain, [touch], torch.zeros((12, 3), dtype=torch.float64))
+    assert isinstance(metric, HeldMetric)
+    assert len(made) == (not tangled)
+    assert torch.equal(metric.stiff, 3.0 * pushed)  # The rough part takes it up all the same.

@@ -57,11 +57,13 @@ class LevelContact:
         if not terms:
             return plain
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
+        if self.tangled:
+            return HeldMetric(plain, stiff, factored=False)
         if self._held is None and not bool((stiff > 0).any()):
             return plain  # Things are near, but nothing pushes yet.
         if self._held is None:
             self._held = HeldMetric(plain, stiff)
-        elif not self._held.serves(stiff, tangled=self.tangled):
+        elif not self._held.serves(stiff):
             self._held = HeldMetric(plain, torch.maximum(stiff, self._held.stiff))
         return self._held
 

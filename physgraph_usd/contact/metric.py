@@ -11,7 +11,8 @@
 
 H0 answers smooth moves well and rough ones as cloth at rest would. What touches leaves rough errors: planes that turn
 from vertex to vertex, cloth that was pushed out. The diagonal answers those, so few steps get far. Above `REFACTORED`
-vertices K is left out of the first term: a factor would cost more than the steps that it saves.
+vertices K is left out of the first term: a factor would cost more than the steps that it saves. So it is while cloth
+crosses cloth: what pushes changes sides after every few steps.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from ..integrate.metric import Metric
 
 SMOOTH, ROUGH = 0.1, 2.0
 """Weights of the two answers."""
-MISSING, MISSING_TANGLED = 0.9, 0.3
-"""Part of the stiffness of what touches that a metric may lack before it is made anew, and the same while cloth crosses
-cloth and what pushes changes sides. What it has too much does no harm: what touched once in a level's rounds touches
-again; and a new metric costs a factor and drops what was learned of the curvature."""
+MISSING = 0.9
+"""Part of the stiffness of what touches that a metric may lack before it is made anew. What it has too much does no
+harm: what touched once in a level's rounds touches again; and a new metric costs a factor and drops what was learned of
+the curvature."""
 REFACTORED = 60_000
 """Vertices up to which a level's factor takes up the stiffness of what touches."""
 
@@ -35,21 +36,21 @@ REFACTORED = 60_000
 class HeldMetric:
     """A level's metric while something touches its cloth."""
 
-    def __init__(self, plain: Metric, stiff: Float[Tensor, " vertices"]) -> None:
+    def __init__(self, plain: Metric, stiff: Float[Tensor, " vertices"], *, factored: bool = True) -> None:
         """Take up a stiffness.
 
         Args:
             plain: The level's metric.
             stiff: K [N/m].
+            factored: Whether the first term takes it up, where that pays.
         """
         self.stiff = stiff
-        self._smooth = plain.plus(stiff) if len(stiff) <= REFACTORED else plain
+        self._smooth = plain.plus(stiff) if factored and len(stiff) <= REFACTORED else plain
         self._rough = (ROUGH / (plain.diagonal.to(stiff) + stiff)).unsqueeze(1)
 
-    def serves(self, stiff: Float[Tensor, " vertices"], *, tangled: bool = False) -> bool:
+    def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
         """Whether it holds enough of another stiffness [N/m]."""
-        most = MISSING_TANGLED if tangled else MISSING
-        return float((stiff - self.stiff).clamp_min(0.0).sum()) <= most * float(stiff.sum())
+        return float((stiff - self.stiff).clamp_min(0.0).sum()) <= MISSING * float(stiff.sum())
 
     @property
     def diagonal(self) -> Float[Tensor, " vertices"]:
