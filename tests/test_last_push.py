@@ -42,6 +42,20 @@ class TestParts:
         assert bool(pinched(surface, x, found, way, longest=0.02, lost=lost))
         assert not bool(pinched(surface, x, found, way, longest=0.06, lost=lost))
 
+    @pytest.mark.parametrize("along", [0.5, -0.5])
+    def test_a_face_that_a_part_comes_through_is_no_way_out_there(self, along: float):
+        """A ball of 5 cm in the middle of a slab's top, whose corners lie bare: beside it one leaves through the top.
+
+        Half a millimetre under the top or over it, in the ball, one would only change sides.
+        """
+        surface = surfaces(together(box((1.0, 0.2, 1.0)), ball(0.05, at=(0.02, 0.1, 0.01))))[0]
+        x = torch.tensor([[0.02, 0.1 - 1e-3 * along, 0.01], [0.3, 0.1 - 5e-4, 0.01]])
+        x = x - torch.as_tensor(surface.origin).to(x)
+        way = surface.exit(x, surface.closest(x, torch.full((2,), torch.inf)))
+        assert not bool(surface.inside(way.point + 1e-3 * way.normal).any())
+        assert 0.03 < float(way.distance[0]) < 0.06
+        assert float(way.distance[1]) == pytest.approx(5e-4, rel=1e-3)
+
 
 class TestCorners:
     @pytest.mark.parametrize("level", [0, 1, 2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -29,6 +29,15 @@ class Nearest:
     side: Float[Tensor, " points"]
     rim: Bool[Tensor, " points"]
     face: Int[Tensor, " points"]
+
+    def some(self, which: Int[Tensor, " some"]) -> Nearest:
+        """Those of some points."""
+        return Nearest(**{each.name: getattr(self, each.name)[which] for each in fields(self)})
+
+    def with_those(self, which: Int[Tensor, " some"], others: Nearest) -> Nearest:
+        """The same with others for some points."""
+        names = [each.name for each in fields(self)]
+        return Nearest(**{name: getattr(self, name).index_put((which,), getattr(others, name)) for name in names})
 
 
 @runtime_checkable

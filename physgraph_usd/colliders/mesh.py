@@ -116,7 +116,7 @@ class MeshSurface:
         self._buried: Tensor | None = None
         self._overlaps: Tensor | None = None
         self._up: Tensor | None = None
-        self._skin: tuple[wp.Mesh, Tensor] | None = None
+        self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
 
@@ -124,7 +124,8 @@ class MeshSurface:
         """Move the surface to another pose of the same topology."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
         self.mesh.refit()
-        self._buried, self._overlaps, self._up, self._skin = None, None, None, None
+        self._buried, self._overlaps, self._up = None, None, None
+        self._skins.clear()
 
     def _place(self, pose: MeshPose) -> np.ndarray:
         """Recentre a pose; vertices that no face uses are put on one that a face does."""
@@ -185,15 +186,26 @@ class MeshSurface:
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
         """The closest points on faces that lie bare; where body parts overlap, the nearest face may be deep inside.
 
-        A face lies bare when none of its corners is inside the surface.
+        A face lies bare when none of its corners is inside the surface. Another part may still come through its middle:
+        what would land in that looks for a face that none comes through.
         """
-        if not self.closed or not len(x) or not bool(self._is_buried(found.face).any()):
+        if not self.closed or not len(x):
             return found
-        skin = self._bare()
+        way = self._closest_bare(x, found, whole=False) if bool(self._is_buried(found.face).any()) else found
+        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
+        doubtful = torch.nonzero(self._is_unsure(way.face)).squeeze(1)
+        doubtful = doubtful[self.inside(way.point[doubtful] + lift * way.normal[doubtful])]
+        if not len(doubtful):
+            return way
+        return way.with_those(doubtful, self._closest_bare(x[doubtful], way.some(doubtful), whole=True))
+
+    def _closest_bare(self, x: Tensor, known: Nearest, *, whole: bool) -> Nearest:
+        """The closest points on faces that lie bare, or do so as a whole; what is known where there are none."""
+        skin = self._bare(whole)
         if skin is None:
-            return found
+            return known
         mesh, faces = skin
-        bare = self._closest(mesh, x, torch.full_like(found.distance, float("inf")))
+        bare = self._closest(mesh, x, torch.full_like(known.distance, float("inf")))
         return replace(bare, face=faces[bare.face.long()])
 
     def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
@@ -239,15 +251,17 @@ class MeshSurface:
             normal.index_put_((self._corners[:, corner],), area, accumulate=True)
         return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
-    def _bare(self) -> tuple[wp.Mesh, Tensor] | None:
-        """The faces that lie bare and their numbers; None when there are none."""
-        if self._skin is None:
+    def _bare(self, whole: bool) -> tuple[wp.Mesh, Tensor] | None:
+        """The faces that lie bare, or that no other passes through besides, and their numbers; None without any."""
+        if whole not in self._skins:
             every = torch.arange(len(self._corners), device=self._device)
-            faces = torch.nonzero(~self._is_buried(every)).squeeze(1)
-            if len(faces):
-                triangles = self.triangles[faces.cpu().numpy()]
-                self._skin = (_hierarchy(self.mesh.points, triangles, False), faces.to(torch.int32))
-        return self._skin
+            hidden = self._is_buried(every)
+            faces = torch.nonzero(~(hidden | self._is_unsure(every)) if whole else ~hidden).squeeze(1)
+            if not len(faces):
+                return None
+            triangles = self.triangles[faces.cpu().numpy()]
+            self._skins[whole] = (_hierarchy(self.mesh.points, triangles, False), faces.to(torch.int32))
+        return self._skins[whole]
 
     def _run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
         """Launch over points in slices on several threads."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -69,7 +69,7 @@ class Track:
         within = torch.nonzero(sign < 0).squeeze(1)
         kept = distance.isfinite()
         if len(within):
-            near = _at(found, within)
+            near = found.some(within)
             way = self.surface.exit(asked[within], near)
             distance[within], point[within], outward[within] = way.distance, way.point, way.normal
             held = None if self.held is None else self.held[which[within]]
@@ -105,8 +105,3 @@ class Track:
         if bool(ask.any()):
             sign[ask] = 1.0 - 2.0 * self.surface.inside(asked[ask]).to(sign)
         return sign
-
-
-def _at(found: Nearest, which: Tensor) -> Nearest:
-    """Some of the closest points."""
-    return Nearest(**{each.name: getattr(found, each.name)[which] for each in fields(found)})
