@@ -1,6 +1,7 @@
 """What contact leaves in shots: vertices in bodies and crossings, before and after, in our form and in the paper's.
 
-    python -m benchmarks.contact_shots [--frames 5] [--level 2] [--form ours] [--shot NAME] [--device cuda] [FOLDER]
+    python -m benchmarks.contact_shots [--frames 5] [--whole] [--level 2] [--form ours] [--shot NAME]
+        [--device cuda] [FOLDER]
 
 Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
 Prints a row a shot: the sums over frames and garments. The paper's form stands without our last projection, but with
@@ -101,14 +102,23 @@ def _plus(pair: tuple[int, int], before: int, after: int) -> tuple[int, int]:
 @click.command()
 @click.argument("folder", required=False, type=click.Path(path_type=Path))
 @click.option("--frames", default=5, show_default=True)
+@click.option("--whole", is_flag=True, help="All frames of each shot.")
 @click.option("--level", default=2, show_default=True)
 @click.option("--form", "forms", multiple=True, type=click.Choice(list(FORMS)), default=["ours", "paper"])
 @click.option("--shot", "shots", multiple=True, help="Only these.")
 @click.option("--device", default="cpu", show_default=True)
-def main(folder: Path | None, frames: int, level: int, forms: Sequence[str], shots: Sequence[str], device: str) -> None:
+def main(
+    folder: Path | None,
+    frames: int,
+    whole: bool,
+    level: int,
+    forms: Sequence[str],
+    shots: Sequence[str],
+    device: str,
+) -> None:
     """Print the table."""
     prepare_device(device)
-    say(f"{frames} frames in a row, level {level}; a -> b: before and after")
+    say(f"{'all frames' if whole else f'{frames} frames in a row'}, level {level}; a -> b: before and after")
     say(
         "| shot | form | vertices | inside | % | deepest mm | pinched | body crossings | cloth crossings | garments "
         "| frames worse | strain p99 | s/frame |"
@@ -119,8 +129,9 @@ def main(folder: Path | None, frames: int, level: int, forms: Sequence[str], sho
             if shots and not any(each in name for each in shots):
                 continue
             shot, first = open_one(name, Path(place), folder)
+            first, count = (0, len(shot.scene.times)) if whole else (first, frames)
             for form in forms:
-                sums = run(shot, first, frames, level=level, settings=FORMS[form], device=device)
+                sums = run(shot, first, count, level=level, settings=FORMS[form], device=device)
                 say(_row(name, form, sums))
 
 

@@ -15,7 +15,7 @@ from test_untangle import BOTH, UPPER
 from physgraph_usd.contact.cloth import ClothContact
 from physgraph_usd.contact.cloth_mesh import ClothMesh
 from physgraph_usd.contact.frame import FrameContact
-from physgraph_usd.contact.measure import pinched
+from physgraph_usd.contact.measure import depths, pinched
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.contact.squeeze import squeezed
 
@@ -41,6 +41,8 @@ class TestParts:
         assert not bool(pinched(surface, x, found, way, longest=0.02))
         assert bool(pinched(surface, x, found, way, longest=0.02, lost=lost))
         assert not bool(pinched(surface, x, found, way, longest=0.06, lost=lost))
+        # The report counts it as the solve leaves it.
+        assert [bool(depths(surface, x, -found.distance, 0.02, lost=each)[1]) for each in (None, lost)] == [False, True]
 
     @pytest.mark.parametrize("along", [0.5, -0.5])
     def test_a_face_that_a_part_comes_through_is_no_way_out_there(self, along: float):

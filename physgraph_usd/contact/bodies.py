@@ -273,6 +273,7 @@ class FrameBodies:
         x: Float[Tensor, "vertices 3"],
         *,
         held: Bool[Tensor, " vertices"] | None = None,
+        lost: Bool[Tensor, " vertices"] | None = None,
     ) -> dict[str, object]:
         """What is in each body and what crosses it, before and after, as plain values.
 
@@ -281,6 +282,7 @@ class FrameBodies:
             base: The upsampled cage [m].
             x: The result [m].
             held: Vertices that count as pinched between overlapping parts, however short the way out, or None.
+            lost: Vertices of cloth that lies between overlapping parts, or None.
         """
         bodies: dict[str, object] = {}
         for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
@@ -288,12 +290,11 @@ class FrameBodies:
             after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
             through = len(track.pierced(finest, x, after.abs()))
+            left = {"held": held, "lost": lost, "crossings": through}
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {
                 "before": asdict(penetration(surface, finest, base + shift, before, longest=track.longest)),
-                "after": asdict(
-                    penetration(surface, finest, x + shift, after, longest=track.longest, held=held, crossings=through)
-                ),
+                "after": asdict(penetration(surface, finest, x + shift, after, longest=track.longest, **left)),
             }
         return {"bodies": bodies}
 

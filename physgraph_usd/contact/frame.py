@@ -106,6 +106,7 @@ class FrameContact:
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._aim: Tensor | None = None
         self._held: Tensor | None = None
+        self._lost: Tensor | None = None
         self._bodies, self._cloth = bodies, cloth
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
         self._views: dict[int, LevelContact] = {}
@@ -149,7 +150,9 @@ class FrameContact:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
             if bodies is not None and self._cloth is not None and self.aim is not self._coarse:
-                bodies.lose(hidden_between(level, base, bodies, self._cloth.mesh(level)))
+                lost = hidden_between(level, base, bodies, self._cloth.mesh(level))
+                bodies.lose(lost)
+                self._lost = lost if level is self._levels[-1] else self._lost
             cloth = self._cloth_at(level, base)
             if cloth is not None and level is self._levels[-1] and self._judge is not None:
                 cloth.allowed = self._judge.before
@@ -301,7 +304,8 @@ class FrameContact:
         view, crossing = self._judge or self.at(finest).cloth, torch.zeros_like(finest.free[:, 0])
         said: dict[str, object] = {}
         if self._bodies is not None:
-            said |= self._bodies.measure(finest, finest.base.apply(self._coarse), x, held=self._held)
+            base = finest.base.apply(self._coarse)
+            said |= self._bodies.measure(finest, base, x, held=self._held, lost=self._lost)
         if view is not None:
             cloth, crossing = view.measure(x)
             said |= {"cloth": cloth} if cloth else {}

@@ -55,6 +55,7 @@ def penetration(
     *,
     longest: float,
     held: Bool[Tensor, " vertices"] | None = None,
+    lost: Bool[Tensor, " vertices"] | None = None,
     crossings: int | None = None,
 ) -> Penetration:
     """Measure one garment group against one surface.
@@ -66,10 +67,11 @@ def penetration(
         signed: Signed distances at x, lower bounds where they are positive [m].
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
         held: Vertices that count as pinched there however short the way out, or None.
+        lost: Vertices of cloth that lies between overlapping parts, or None.
         crossings: How many edges pass through faces, where that is known.
     """
     free = level.free[:, 0]
-    depth, stays = depths(surface, x, signed, longest, held=held)
+    depth, stays = depths(surface, x, signed, longest, held=held, lost=lost)
     deep = (depth > DEEP) & ~stays
     inside = int((deep & free).sum())
     deepest = float((depth * (free & ~stays)).max()) if len(depth) else 0.0
@@ -90,6 +92,7 @@ def depths(
     longest: float,
     *,
     held: Bool[Tensor, " vertices"] | None = None,
+    lost: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
     """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched.
 
@@ -99,14 +102,15 @@ def depths(
         signed: Signed distances at x, lower bounds where they are positive [m].
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
         held: Vertices that count as pinched there however short the way out, or None.
+        lost: Vertices of cloth that lies between overlapping parts, or None.
     """
     depth, stays = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
     within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
     if len(within):
         found = surface.closest(x[within], torch.full_like(signed[within], float("inf")))
         way = surface.exit(x[within], found)
-        kept = None if held is None else held[within]
-        depth[within], stays[within] = way.distance, pinched(surface, x[within], found, way, longest=longest, held=kept)
+        known = {name: each[within] for name, each in (("held", held), ("lost", lost)) if each is not None}
+        depth[within], stays[within] = way.distance, pinched(surface, x[within], found, way, longest=longest, **known)
     return depth, stays
 
 
