@@ -164,15 +164,19 @@ def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSett
         began = time.perf_counter()
         state = refiner.solve(frame)
         spent.append(time.perf_counter() - began)
-        seen = []
-        for entry in state.telemetry:
-            taken_over = "levels" not in entry  # The frame before was the same.
-            if not taken_over and not any(entry is each for each in seen):  # Garments solved together share one.
-                seen.append(entry)
-                sums.add(entry)
+        for entry in groups_of(state.telemetry):
+            sums.add(entry)
         sums.vertices += sum(len(points) for points in state.points if points is not None)
     sums.seconds = sorted(spent)[len(spent) // 2]
     return sums
+
+
+def groups_of(telemetry: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What is told of each group of garments, once: those that are solved together share their levels.
+
+    Groups taken over from the frame before have none, and are left out.
+    """
+    return list({id(entry["levels"]): entry for entry in telemetry if "levels" in entry}.values())
 
 
 def _row(name: str, form: str, sums: Sums) -> str:
