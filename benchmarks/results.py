@@ -166,7 +166,7 @@ def _children() -> float:
 
 @click.command()
 @click.option("--short", is_flag=True, help="Less than 15 minutes on two cores.")
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=PAGE, help="Page to write.")
+@click.option("-o", "--out", type=click.Path(dir_okay=False, path_type=Path), default=PAGE, help="Page to write.")
 @click.option("--only", multiple=True, type=click.Choice([part.name for part in PARTS]), help="Measure only these.")
 @click.option("--fresh", is_flag=True, help="Measure everything anew.")
 def main(short: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:

@@ -195,7 +195,7 @@ CELLS = Path("build") / f"stability.{code_of(Path(physgraph_usd.__file__).parent
 @click.option("--case", "chosen", type=int, multiple=True, help="Only this case: prints it, writes and keeps nothing.")
 @click.option("--short", is_flag=True, help=f"Leave out {SLOW}; less than 15 minutes on two cores.")
 @click.option("--fresh", is_flag=True, help="Measure every cell anew.")
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=PAGE, help="Page to write.")
+@click.option("-o", "--out", type=click.Path(dir_okay=False, path_type=Path), default=PAGE, help="Page to write.")
 def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
     """Measure the cases S1 to S40 by method and write the table."""
     wp.config.log_level = wp.LOG_WARNING
