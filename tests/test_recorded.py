@@ -27,6 +27,12 @@ def problem() -> tuple[System, torch.Tensor]:
     return finest_system(group_of(mesh, rest, level=2, dtype=torch.float32), wave(rest))
 
 
+def network_of(config: PhysgraphConfig) -> Physgraph:
+    network = random_network(config, seed=3, scale=0.1)
+    assert isinstance(network, Physgraph)
+    return network
+
+
 class Recorder(LearnedMetric):
     """Records although it is not on CUDA: it then runs a step's kernels one by one."""
 
@@ -37,8 +43,7 @@ class Recorder(LearnedMetric):
 @pytest.mark.parametrize("config", [LOCAL, ALL])
 def test_recorded_steps_are_the_same_steps(config: PhysgraphConfig):
     system, x = problem()
-    network = random_network(config, seed=3, scale=0.1)
-    assert isinstance(network, Physgraph)
+    network = network_of(config)
     one, other = LearnedMetric(network), Recorder(network)
     a, b = one.start(system, x), other.start(system, x)
     assert isinstance(b.memory, Place)
@@ -52,8 +57,7 @@ def test_recorded_steps_are_the_same_steps(config: PhysgraphConfig):
 
 def test_a_carry_of_the_past_is_stepped_from_where_it_was():
     system, x = problem()
-    network = random_network(LOCAL, seed=3, scale=0.1)
-    assert isinstance(network, Physgraph)
+    network = network_of(LOCAL)
     integrator = Recorder(network)
     start = integrator.start(system, x)
     first = integrator.step(system, start)
@@ -66,8 +70,7 @@ def test_a_carry_of_the_past_is_stepped_from_where_it_was():
 
 def test_resuming_keeps_the_memory():
     system, x = problem()
-    network = random_network(LOCAL, seed=3, scale=0.1)
-    assert isinstance(network, Physgraph)
+    network = network_of(LOCAL)
     one, other = LearnedMetric(network), Recorder(network)
     a, b = one.start(system, x), other.start(system, x)
     for _ in range(3):
@@ -79,8 +82,7 @@ def test_resuming_keeps_the_memory():
 def test_a_recording_keeps_what_its_kernels_write_to():
     """A cache of a few would drop it while later levels and garments come by."""
     system, x = problem()
-    network = random_network(LOCAL, seed=3, scale=0.1)
-    assert isinstance(network, Physgraph)
+    network = network_of(LOCAL)
     integrator = Recorder(network)
     carry = integrator.start(system, x)
     fused = integrator._fused(system, graph_of(system))
@@ -98,8 +100,7 @@ def test_a_recording_keeps_what_its_kernels_write_to():
 def test_steps_that_are_no_longer_recorded_keep_the_memory(made: int, monkeypatch: pytest.MonkeyPatch):
     """As where cloth comes near something after a level's first steps: that system is met only once."""
     system, x = problem()
-    network = random_network(LOCAL, seed=3, scale=0.1)
-    assert isinstance(network, Physgraph)
+    network = network_of(LOCAL)
     one, other = LearnedMetric(network), Recorder(network)
     a, b = one.start(system, x), other.start(system, x)
     for _ in range(made):
@@ -116,8 +117,7 @@ def test_steps_that_are_no_longer_recorded_keep_the_memory(made: int, monkeypatc
 def test_a_step_that_another_shortened_is_followed():
     """As the guard does it: a step is proposed, half of it taken back, then half of the rest; memory is kept."""
     system, x = problem()
-    network = random_network(LOCAL, seed=3, scale=0.1)
-    assert isinstance(network, Physgraph)
+    network = network_of(LOCAL)
     ends = []
     for integrator in (LearnedMetric(network), Recorder(network)):
         carry = integrator.start(system, x)
