@@ -116,11 +116,13 @@ def view_of(
     *,
     thickness: float = 0.001,
     stiffness: float = 1e5,
+    form: str = "pairs",
 ) -> ClothView:
     """The finest level's cloth in a frame whose upsampled cage is at given positions."""
     lasting = ClothContact(levels, garments)
     each = torch.full((len(garments),), thickness, dtype=base.dtype)
-    return ClothView(lasting, levels[-1], base, thickness=each, settings=ContactSettings(cloth_stiffness=stiffness))
+    settings = ContactSettings(cloth=form, cloth_stiffness=stiffness)
+    return ClothView(lasting, levels[-1], base, thickness=each, settings=settings)
 
 
 def refiner_with(

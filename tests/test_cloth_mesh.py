@@ -10,7 +10,8 @@ import torch
 from brute import Soup, beside, between_edges, crossings, on_triangles
 from folds import SHAPES, Cloth, crumpled, flat, folded, levels_of, named, placed, square, strip
 
-from physgraph_usd.contact.cloth_mesh import ClothMesh, Pairs
+from physgraph_usd.contact.cloth_mesh import ClothMesh
+from physgraph_usd.contact.nearest import Pairs
 from physgraph_usd.level import Level
 
 REACH = 0.06
@@ -307,3 +308,57 @@ def test_rings_grow_by_edges():
         expected = np.linalg.matrix_power(near, rings)[7] > 0
         np.testing.assert_array_equal(mesh.grown(start, rings).numpy(), expected)
     assert not mesh.grown(torch.zeros_like(start), 3).any()
+
+
+class TestAskedAgain:
+    """What was closest before serves where nothing has moved: the same as everything asked anew, bit for bit."""
+
+    @pytest.mark.parametrize("name", SCENES)
+    @pytest.mark.parametrize("part", [0.003, 0.1, 0.5])
+    def test_beside_what_moved(self, name: str, part: float):
+        level, x = scene(name)
+        rng = np.random.default_rng(5)
+        near = reach(level) / 4.0
+        which = torch.as_tensor(rng.random(len(x)) < part) | (torch.arange(len(x)) == 7)
+        there = x + which.unsqueeze(1) * torch.as_tensor(rng.normal(0.0, 0.02, x.shape), dtype=x.dtype)
+        mesh = moved(level, x)
+        before = mesh.nearest(everything(level), near)
+        kept = [each.clone() for each in (before.x, before.face, before.weight, before.edge, before.place)]
+        mesh.move(there)
+        anew = mesh.nearest(everything(level), near)
+        again = mesh.nearest(everything(level), near, known=before, moved=which)
+        assert not torch.equal(anew.pairs(level).weight, before.pairs(level).weight)
+        assert torch.equal(again.face, anew.face)
+        assert torch.equal(again.edge, anew.edge)
+        for ours, theirs in zip(vars(again.pairs(level)).values(), vars(anew.pairs(level)).values(), strict=True):
+            assert torch.equal(ours, theirs)
+        after = (before.x, before.face, before.weight, before.edge, before.place)
+        assert all(torch.equal(a, b) for a, b in zip(kept, after, strict=True)), "what was known is not written to"
+
+    def test_what_something_moved_away_from(self):
+        level, x = two_sheets()
+        other = level.vertex_garment.long() == 1
+        mesh = moved(level, x)
+        before = mesh.nearest(everything(level), reach(level))
+        mesh.move(x + other.unsqueeze(1) * torch.tensor([1.0, 0.0, 0.0], dtype=x.dtype))
+        anew = mesh.nearest(everything(level), reach(level))
+        again = mesh.nearest(everything(level), reach(level), known=before, moved=other)
+        assert bool((before.face != anew.face)[~other].any())
+        assert torch.equal(again.face, anew.face)
+        assert torch.equal(again.edge, anew.edge)
+
+    def test_only_beside_what_moved(self):
+        """A vertex far from what moved keeps what it had, also where it has crept a little."""
+        level, x = scene("folded")
+        mesh = moved(level, x)
+        near = reach(level) / 4.0
+        before = mesh.nearest(everything(level), near)
+        one = torch.arange(len(x)) == int((before.face >= 0).any(dim=1).nonzero()[0])
+        crept = x + 1e-4 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
+        mesh.move(crept)
+        again = mesh.nearest(everything(level), near, known=before, moved=one)
+        asked = (again.x == crept).all(dim=1)
+        assert bool(asked[one].all())
+        assert 0.0 < float(asked.double().mean()) < 0.5
+        assert torch.equal(again.x[~asked], before.x[~asked])
+        assert torch.equal(again.weight[:, ~asked], before.weight[:, ~asked])

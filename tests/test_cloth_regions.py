@@ -26,6 +26,7 @@ from folds import (
     rolled,
     square,
     strip,
+    view_of,
 )
 from meshes import mesh_of
 from sheets import rotation
@@ -260,3 +261,11 @@ class TestGarments:
         assert alone.points[0].tobytes() == off.points[0].tobytes()
         felt = self.solve([cage], [named(cloth)])
         assert felt.points[0].tobytes() != off.points[0].tobytes()
+
+    def test_the_papers_spheres_where_no_two_vertices_are_near(self):
+        cloth = square(4)
+        levels = levels_of(named(cloth))
+        view = view_of(levels, [named(cloth)], levels[-1].rest, form="spheres")
+        assert view.term(levels[-1].rest) is None
+        crumple = placed(levels[-1], lambda p: crumpled(p, 3, size=0.8))
+        assert view.term(crumple) is not None

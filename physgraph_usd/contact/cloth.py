@@ -21,10 +21,11 @@ from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
 from ..scene import Garment
 from .broad_phase import touch_one_another
-from .cloth_mesh import ClothMesh, Crossings, Pairs
+from .cloth_mesh import ClothMesh, Crossings
+from .nearest import Nearest, Pairs
 from .regions import Regions
 from .settings import ContactSettings
-from .untangle import cut_off, gaps_out
+from .untangle import cut_off, gaps_out, swapped_by
 
 LEAST_OFFSET = 0.25
 """Part of the thickness that parts keep where the input has them closer."""
@@ -42,8 +43,9 @@ SPHERE = 0.8
 """R of the paper's form, in mean edges (PAPER A13)."""
 AHEAD = 0.5
 """How much farther than the thickness it is looked for pairs above the cage, in mean edges: the move of a round."""
-STALE, FEW = 0.2, 1e-3
-"""Pairs are found anew once more than this part of the vertices has moved by more than so many edges."""
+STALE, FEW, MOST = 0.2, 1e-3, 0.5
+"""Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
+has, and everywhere where more than the last part has."""
 LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
 OUT = 0.5
@@ -71,9 +73,9 @@ class ClothState:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Pairs, and the positions in which they were found."""
+    """What is closest to what, and the pairs that it makes."""
 
-    x: Tensor
+    nearest: Nearest
     pairs: Pairs
 
 
@@ -200,6 +202,8 @@ class ClothView:
         level, points = self._level, x.double().cpu().numpy()
         radius = SPHERE * float(level.spacing.mean())
         pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+        if not len(pairs):
+            return None
         garment = level.vertex_garment.cpu().numpy()[pairs]
         kept = self._lasting.meets[garment[:, 0], garment[:, 1]]
         kept &= ~np.asarray(self._mesh.within_two[pairs[:, 0], pairs[:, 1]]).ravel().astype(bool)
@@ -214,13 +218,15 @@ class ClothView:
     def _near(self, x: Tensor) -> tuple[Pairs | None, Crossings]:
         """What is near what, and what crosses.
 
-        Pairs found before serve again while hardly anything has moved; where nothing crossed at the start of a level,
-        only its end is looked at again.
+        Pairs found before serve again away from what has moved since, and where hardly anything has; where nothing
+        crossed at the start of a level, only its end is looked at again.
         """
         known, none = self._found, Crossings.none(x.device)
-        if known is not None and not self.tangled:
-            moved = (x - known.x).norm(dim=1) > STALE * self._level.spacing
-            if float(moved.to(x.dtype).mean()) < FEW:
+        moved, part = None, 1.0
+        if known is not None:
+            moved = (x - known.nearest.x).norm(dim=1) > STALE * self._level.spacing
+            part = float(moved.to(x.dtype).mean())
+            if part < FEW and not self.tangled:
                 return known.pairs, none
         busy = self._regions.busy(x, self._reach)
         if not bool(busy.any()):
@@ -228,9 +234,11 @@ class ClothView:
             return None, none
         crossings = self.look(x).crossings if self._sides is None or self.tangled else none
         self._mesh.move(x)
-        pairs = self._mesh.pairs(busy, torch.full_like(self._level.spacing, self._reach))
-        self._found = _Found(x, pairs)
-        return pairs, crossings
+        before = None if known is None or part > MOST else known.nearest
+        reach = torch.full_like(self._level.spacing, self._reach)
+        nearest = self._mesh.nearest(busy, reach, known=before, moved=moved)
+        self._found = _Found(nearest, nearest.pairs(self._level))
+        return self._found.pairs, crossings
 
     def mend(self, x: Float[Tensor, "vertices 3"], good: ClothState | None = None) -> ClothState:
         """Smooth the move from good positions, and then take it back, wherever something crosses that did not.
@@ -330,7 +338,7 @@ class ClothView:
         ordered = self._lasting.order[garment[:, 0]] != self._lasting.order[garment[:, 1]]
         ordered &= ~self._lasting.order[garment].isnan().any(dim=1)
         off = cut_off(self._mesh, crossings) if crossings.count else torch.zeros_like(self._level.free[:, 0])
-        swapped, undecided = _swapped(off[corners], pairs.face, self._is_split(off)[garment])
+        swapped, undecided = swapped_by(off[corners], pairs.face, self._is_split(off)[garment])
         kept = (~self._corners(crossings)[corners].any(dim=1) & ~undecided) | ordered
         pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
         corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
@@ -377,20 +385,3 @@ class ClothView:
         cosine = (out * normal).sum(dim=1) * self._lasting.outward[owner]
         cosine = torch.where(first_is_outer, cosine, -cosine)
         return cosine < -FRONTAL
-
-
-def _swapped(
-    off: Bool[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], split: Bool[Tensor, "pairs 2"]
-) -> tuple[Bool[Tensor, " pairs"], Bool[Tensor, " pairs"]]:
-    """Which pairs are to change sides, and which are beside a contour and have none.
-
-    Args:
-        off: Whether each corner is of a piece that is cut off.
-        face: Whether the pair is a vertex and a face.
-        split: Whether the first and the second garment of each pair have such pieces at all.
-    """
-    first = torch.where(face, off[:, 0], off[:, :2].all(dim=1))
-    second = torch.where(face, off[:, 1:].all(dim=1), off[:, 2:].all(dim=1))
-    both = first & second
-    swapped = both | (first & ~split[:, 1]) | (second & ~split[:, 0])
-    return swapped, (first ^ second) & ~swapped

@@ -20,22 +20,8 @@ from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges
 from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
+from .nearest import Nearest, Pairs
 from .proximity import edges_near, faces_near, vertex_normals
-
-
-@dataclass(frozen=True, eq=False)
-class Pairs:
-    """Pairs of material points that are near one another.
-
-    Attributes:
-        corners: Vertices, shape (N, 4), int32: a vertex and a face, or two edges.
-        weight: From the second point to the first, shape (N, 4).
-        face: Whether the pair is a vertex and a face, shape (N,).
-    """
-
-    corners: Int[Tensor, "pairs 4"]
-    weight: Float[Tensor, "pairs 4"]
-    face: Bool[Tensor, " pairs"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,26 +123,40 @@ class ClothMesh:
         return self._normal
 
     def pairs(self, busy: Bool[Tensor, " vertices"], reach: Float[Tensor, " vertices"]) -> Pairs:
+        """The closest parts above and below what is busy, as pairs; arguments are those of `nearest`."""
+        return self.nearest(busy, reach).pairs(self.level)
+
+    def nearest(
+        self,
+        busy: Bool[Tensor, " vertices"],
+        reach: Float[Tensor, " vertices"],
+        *,
+        known: Nearest | None = None,
+        moved: Bool[Tensor, " vertices"] | None = None,
+    ) -> Nearest:
         """The closest parts above and below what is busy.
 
         Args:
             busy: Which vertices to ask; edges near what they find are asked too.
             reach: Distance beyond which nothing is near [m].
-
-        Returns:
-            Vertex-face pairs, then edge-edge pairs; an edge-edge pair occurs once.
+            known: What was closest before some vertices moved: what is not within reach of those is not asked again.
+            moved: Those vertices.
         """
+        assert self._at is not None
         self.normals()
-        limit = reach.to(torch.float32).contiguous()
-        of_faces = self._vertex_face(busy, limit)
+        limit, x, level = reach.to(torch.float32).contiguous(), self._at[0], self.level
+        if known is None or moved is None:
+            again, found = torch.ones_like(busy), Nearest.none(x, len(level.edges))
+            beside = again
+        else:
+            again = self._beside(moved, float(limit.max())) | known.beside_moved(level, moved)
+            found, beside = known.again(x, again), self.grown(again, 1)
+        self._ask_faces(busy & again, limit, found)
         # An edge near another has a vertex near a face, or next to one that is.
-        close = torch.zeros_like(busy)
-        close[of_faces[0].reshape(-1)] = True
-        of_edges = self._edge_edge(self.grown(close, 1), limit)
-        face = torch.zeros(len(of_faces[0]) + len(of_edges[0]), dtype=torch.bool, device=busy.device)
-        face[: len(of_faces[0])] = True
-        corners, weight = (torch.cat(both) for both in zip(of_faces, of_edges, strict=True))
-        return Pairs(corners.to(torch.int32).contiguous(), weight.to(self.level.dtype).contiguous(), face)
+        close = self.grown(found.close(level), 1) & beside
+        found.edge[(close | again)[level.edges.long()].any(dim=1)] = -1
+        self._ask_edges(close, limit, found)
+        return found
 
     def crossings(self, busy: Bool[Tensor, " vertices"]) -> Crossings:
         """Edges with a busy end that pass through faces."""
@@ -179,8 +179,7 @@ class ClothMesh:
             moved: Vertices that have moved since.
             busy: As `crossings` takes it.
         """
-        near, clusters = moved.clone(), self._clusters
-        clusters.run(clusters_beside, [_flags(moved), *clusters.faces[:2], _flags(near)])
+        near = self._beside(moved, 0.0)
         found = self.crossings(near & busy)
         ends = self.level.edges.long()[known.edge]
         kept = ~near[ends].any(dim=1) & ~moved[self.triangles[known.face]].any(dim=1)
@@ -207,45 +206,27 @@ class ClothMesh:
         np.add.at(table, (ends.min(axis=1), ends.max(axis=1)), 1)
         return table
 
-    def _vertex_face(self, asked: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners and weights of the pairs of a vertex and a face."""
-        face = torch.full((len(asked), 2), -1, dtype=torch.int32, device=asked.device)
+    def _beside(self, moved: Bool[Tensor, " vertices"], reach: float) -> Bool[Tensor, " vertices"]:
+        """Given vertices, and those of all clusters that may be nearer to a cluster of one than a reach [m]."""
+        near, clusters = moved.clone(), self._clusters
+        clusters.run(clusters_beside, [wp.float32(reach), _flags(moved), *clusters.faces[:2], _flags(near)])
+        return near
+
+    def _ask_faces(self, asked: Bool[Tensor, " vertices"], reach: Tensor, found: Nearest) -> None:
+        """Write the closest faces of the vertices that are asked."""
         best = torch.empty((len(asked), 2), dtype=torch.float32, device=asked.device)
-        either = [torch.empty((len(asked), 3), dtype=torch.float32, device=asked.device) for _ in range(2)]
         clusters = self._clusters
         inputs = [*self._asked(asked, reach), *clusters.vertices, *clusters.faces, *clusters.face_boxes]
-        outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(face, dtype=wp.vec2i)]
-        clusters.run(faces_near, [*inputs, *outputs, *[_vectors(each) for each in either]])
-        corners, weights = [], []
-        for side, weight in enumerate(either):
-            found = torch.nonzero(face[:, side] >= 0).squeeze(1)
-            three = self.triangles[face[found, side].long()]
-            corners.append(torch.cat([found.unsqueeze(1), three], dim=1))
-            weights.append(torch.cat([torch.ones_like(weight[found, :1]), -weight[found]], dim=1))
-        return torch.cat(corners), torch.cat(weights)
+        outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.face, dtype=wp.vec2i)]
+        clusters.run(faces_near, [*inputs, *outputs, *[_vectors(each) for each in found.weight]])
 
-    def _edge_edge(self, asked: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners and weights of the pairs of two edges, of which one has an end that is asked."""
-        count = len(self.level.edges)
-        other = torch.full((count, 2), -1, dtype=torch.int32, device=asked.device)
-        best, *either = (torch.empty((count, 2), dtype=torch.float32, device=asked.device) for _ in range(3))
-        pairs = [wp.from_torch(other, dtype=wp.vec2i), *[wp.from_torch(each, dtype=wp.vec2f) for each in either]]
-        inputs = [*self._asked(asked, reach), *self._clusters.edges, *self._clusters.edge_boxes]
-        inputs.append(wp.from_torch(best, dtype=wp.vec2f))
-        self._clusters.run(edges_near, [*inputs, *pairs])
-        first, second, along = [], [], []
-        for side, place in enumerate(either):
-            found = torch.nonzero(other[:, side] >= 0).squeeze(1)
-            first.append(found)
-            second.append(other[found, side].long())
-            along.append(place[found])
-        a, b, st = torch.cat(first), torch.cat(second), torch.cat(along)
-        # The pair that either edge found is one pair.
-        key = torch.minimum(a, b) * len(self.level.edges) + torch.maximum(a, b)
-        kept = torch.as_tensor(np.unique(key.cpu().numpy(), return_index=True)[1], device=a.device)
-        a, b, s, t = a[kept], b[kept], st[kept, 0], st[kept, 1]
-        ends = self.level.edges.long()
-        return torch.cat([ends[a], ends[b]], dim=1), torch.stack([1 - s, s, t - 1, -t], dim=1)
+    def _ask_edges(self, asked: Bool[Tensor, " vertices"], reach: Tensor, found: Nearest) -> None:
+        """Write the closest edges of those that have an end that is asked."""
+        best = torch.empty((len(found.edge), 2), dtype=torch.float32, device=asked.device)
+        clusters = self._clusters
+        inputs = [*self._asked(asked, reach), *clusters.edges, *clusters.edge_boxes]
+        outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.edge, dtype=wp.vec2i)]
+        clusters.run(edges_near, [*inputs, *outputs, *[wp.from_torch(each, dtype=wp.vec2f) for each in found.place]])
 
     def _asked(self, asked: Tensor, reach: Tensor) -> list[object]:
         """What both proximity kernels are told first."""

@@ -158,12 +158,13 @@ def clusters_beside(
     around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
+    reach: wp.float32,
     given: wp.array(dtype=wp.bool),
     first_face: wp.array(dtype=wp.int32),
     triangles: wp.array(dtype=wp.vec3i),
     beside: wp.array(dtype=wp.bool),
 ):
-    """Mark the corners of the faces of all clusters whose boxes meet that of one with a face at a given vertex."""
+    """Mark the corners of the faces of all clusters whose boxes are within reach of one with a given vertex."""
     i = first + wp.tid()
     found = wp.int32(0)
     for m in range(first_face[i], first_face[i + 1]):
@@ -172,7 +173,8 @@ def clusters_beside(
                 found = 1
     if found == 0:
         return
-    query = wp.bvh_query_aabb(tree, low[i], high[i])
+    grow = wp.vec3f(reach)
+    query = wp.bvh_query_aabb(tree, low[i] - grow, high[i] + grow)
     j = wp.int32(0)
     while wp.bvh_query_next(query, j):
         for m in range(first_face[j], first_face[j + 1]):

@@ -68,7 +68,8 @@ class Clusters:
         )
         self._of_points[0]({})
         self._at: tuple[Tensor, int] | None = None
-        self._tree = wp.Bvh(*self._boxes)
+        # Empty clusters would spoil the tree that is usual on CUDA, which sorts boxes by their middles.
+        self._tree = wp.Bvh(*self._boxes, constructor="sah")
         table = self._array(np.asarray(meets).ravel())
         self._shared = [
             self._tree.id,

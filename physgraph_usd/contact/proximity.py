@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .cluster_kernels import FAR, are_apart, has, overlap
+from .cluster_kernels import FAR, are_apart, has
 
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
@@ -98,6 +98,13 @@ def between(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, g: wp.vec2i, s: float, t: 
 def belongs(distance: float, rest_distance: float, cosine: float):
     """Whether a part of the same garment is a neighbour in the plane, where it belongs."""
     return wp.abs(cosine) < IN_PLANE and distance > CLOSED_IN * rest_distance
+
+
+@wp.func
+def within(least: wp.vec3f, most: wp.vec3f, low: wp.vec3f, high: wp.vec3f, reach: float):
+    """Whether two boxes are at most so far apart: of what boxes grown by it meet, half is farther away."""
+    apart = wp.max(wp.max(low - most, least - high), wp.vec3f(0.0))
+    return wp.dot(apart, apart) <= reach * reach
 
 
 @wp.func
@@ -217,13 +224,12 @@ def faces_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             continue
         for k in range(begin, end):
             v = vertices[k]
-            p, grow = x[v], wp.vec3f(wp.max(best[v][0], best[v][1]))
-            lower, upper = p - grow, p + grow
-            if not asked[v] or not overlap(lower, upper, low[j], high[j]):
+            p, farthest = x[v], wp.max(best[v][0], best[v][1])
+            if not asked[v] or not within(p, p, low[j], high[j], farthest):
                 continue
             for m in range(first_face[j], first_face[j + 1]):
                 t = triangles[m]
-                if not overlap(lower, upper, face_low[m], face_high[m]) or has(t, v):
+                if not within(p, p, face_low[m], face_high[m], farthest) or has(t, v):
                     continue
                 if same:
                     if is_face_beside(v, t, starts, beside):
@@ -234,6 +240,8 @@ def faces_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
                 if distance > wp.max(best[v][0], best[v][1]) or distance < LEAST:
                     continue
                 cosine = wp.dot(way, normal[v]) / distance
+                if distance > wp.where(cosine > 0.0, best[v][0], best[v][1]):
+                    continue
                 if same:
                     if belongs(distance, wp.length(rest[v] - at_rest(t, weight, rest)), cosine):
                         continue
@@ -332,14 +340,13 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             a, b, e = edges[k][0], edges[k][1], number[k]
             if not (asked[a] or asked[b]):
                 continue
-            p, q, grow = x[a], x[b], wp.vec3f(wp.max(best[e][0], best[e][1]))
-            lower, upper = edge_low[k] - grow, edge_high[k] + grow
-            if not overlap(lower, upper, low[j], high[j]):
+            lower, upper, farthest = edge_low[k], edge_high[k], wp.max(best[e][0], best[e][1])
+            if not within(lower, upper, low[j], high[j], farthest):
                 continue
             for m in range(first_edge[j], first_edge[j + 1]):
-                if not overlap(lower, upper, edge_low[m], edge_high[m]) or share_an_end(edges[k], edges[m]):
+                if not within(lower, upper, edge_low[m], edge_high[m], farthest) or share_an_end(edges[k], edges[m]):
                     continue
-                places = places_inside(p, q, x[edges[m][0]], x[edges[m][1]])
+                places = places_inside(x[a], x[b], x[edges[m][0]], x[edges[m][1]])
                 if places[0] < 0.0:
                     continue
                 way = between(x, edges[k], edges[m], places[0], places[1])
@@ -347,6 +354,8 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
                 if distance > wp.max(best[e][0], best[e][1]) or distance < LEAST:
                     continue
                 cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
+                if distance > wp.where(cosine > 0.0, best[e][0], best[e][1]):
+                    continue
                 if same:
                     if is_own_edge(edges[k], edges[m], places, distance, cosine, rest, starts, beside):
                         continue

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .cloth_mesh import ClothMesh, Pairs
+from .cloth_mesh import ClothMesh
+from .nearest import Pairs
 
 TURNS = 24
 """How often pairs and bodies push in turn."""

@@ -157,3 +157,20 @@ def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor
     second = (torch.linalg.cross(p - r, point - r) * normal).sum(dim=1) / whole
     weight = torch.stack([first, second, 1.0 - first - second], dim=1).clamp_min(0.0)
     return weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-30)
+
+
+def swapped_by(
+    off: Bool[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], split: Bool[Tensor, "pairs 2"]
+) -> tuple[Bool[Tensor, " pairs"], Bool[Tensor, " pairs"]]:
+    """Which pairs are to change sides, and which are beside a contour and have none.
+
+    Args:
+        off: Whether each corner is of a piece that is cut off.
+        face: Whether the pair is a vertex and a face.
+        split: Whether the first and the second garment of each pair have such pieces at all.
+    """
+    first = torch.where(face, off[:, 0], off[:, :2].all(dim=1))
+    second = torch.where(face, off[:, 1:].all(dim=1), off[:, 2:].all(dim=1))
+    both = first & second
+    swapped = both | (first & ~split[:, 1]) | (second & ~split[:, 0])
+    return swapped, (first ^ second) & ~swapped

@@ -6,8 +6,9 @@ item writes its own places only, so the number of lanes changes no bit of the re
 
 from __future__ import annotations
 
+import copy
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
@@ -19,6 +20,9 @@ LEAST_PER_LANE = 4000
 """Items below which another lane costs more than it saves."""
 LEAST_QUERIES = 250
 """The same where each item asks a hierarchy or stands for many elements."""
+SLICES, LEAST_SLICE = 8, 32
+"""Slices of a lane there, and the least of them: some items cost a hundred times as much as others, so whoever is free
+takes the next."""
 
 
 class Launch:
@@ -44,14 +48,14 @@ class Launch:
             lanes: Most threads to use on the CPU.
             least: Items below which another of them costs more than it saves.
         """
-        lanes = max(1, min(lanes, size // least)) if device == "cpu" else 1
+        self._lanes = lanes = max(1, min(lanes, size // least)) if device == "cpu" else 1
         self._device = None if device == "cpu" else device
-        bounds = np.linspace(0, size, lanes + 1).astype(int).tolist()
+        slices = min(SLICES * lanes, size // LEAST_SLICE) if lanes > 1 and least < LEAST_PER_LANE else lanes
+        bounds = np.linspace(0, size, slices + 1).astype(int).tolist()
+        whole = wp.launch(kernel, dim=size, inputs=[0, *inputs], device=device, record_cmd=True)
         self._commands: list[wp.Launch] = []
-        for a, b in pairwise(bounds):
-            command = wp.launch(kernel, dim=b - a, inputs=[a, *inputs], device=device, record_cmd=True)
-            if b > a and command is not None:
-                self._commands.append(command)
+        if whole is not None and size:
+            self._commands = [whole] if slices == 1 else [_part(whole, a, b) for a, b in pairwise(bounds)]
 
     def change(self, changed: Mapping[int, wp.array]) -> None:
         """Replace some inputs from now on, by their place in ``inputs``."""
@@ -67,11 +71,27 @@ class Launch:
             for command in self._commands:
                 command.launch(stream=stream)
             return
-        others = [_pool(len(self._commands)).submit(command.launch) for command in self._commands[1:]]
-        for command in self._commands[:1]:
-            command.launch()
+        left = iter(self._commands)  # A list's iterator hands each command to one thread only.
+        others = [_pool(self._lanes).submit(_run, left) for _ in range(self._lanes - 1)]
+        _run(left)
         for other in others:
             other.result()
+
+
+def _part(whole: wp.Launch, begin: int, end: int) -> wp.Launch:
+    """The same launch over some of its items: packing all parameters anew would take longer than many a slice."""
+    part = copy.copy(whole)
+    part.params = list(whole.params)
+    part.fwd_args = list(whole.fwd_args or ())  # They keep the arrays alive.
+    part.set_dim(end - begin)
+    part.set_param_at_index(0, begin)
+    return part
+
+
+def _run(commands: Iterator[wp.Launch]) -> None:
+    """Launch what is left."""
+    for command in commands:
+        command.launch()
 
 
 def current_stream(device: str) -> wp.Stream:
