@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
+from ..resolution import edge_strain
 from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh, Crossings
@@ -37,6 +38,8 @@ SMOOTHINGS = 4
 """Passes that smooth the move round new crossings before any takes it back: a smooth move crosses nothing."""
 MENDS = 8
 """Most passes in all; after them the best positions found are taken."""
+TAUT = 1.25
+"""How many times as much mending may strain the cloth, if more does not cross else: it shows more than crossings do."""
 TURNED = 0.5
 """Cosine beyond which the way from one part to another counts as turned round since the input: one passed through."""
 SPHERE = 0.8
@@ -248,15 +251,15 @@ class ClothView:
             good: Positions to fall back on; the upsampled cage when None.
 
         Returns:
-            The positions found that have the fewest crossings; no more than the good ones have, but where that cannot
-            be had.
+            The positions found that have the fewest crossings and are not much more taut; no more crossings than the
+            good ones have, but where that cannot be had.
         """
         best = state = self.look(x)
         if not state.crossings.count:
             return state
         good = good or self.before
         zone = self._mesh.grown(self._corners(good.crossings), ZONE)
-        shift = x - good.x
+        shift, most = x - good.x, TAUT * self.strain(x)
         for attempt in range(MENDS):
             corners = self._mesh.corners_of(state.crossings)
             too_many = self._excess(state, good) > 0
@@ -272,8 +275,16 @@ class ClothView:
             # What is not mended keeps its place to the last bit, and need not be looked at again.
             still = (new_shift == shift).all(dim=1, keepdim=True)
             shift, state = new_shift, self.look(torch.where(still, state.x, good.x + new_shift))
-            best = min(best, state, key=lambda each: (self._excess(each, good), each.crossings.count))
+            best = min(best, state, key=lambda each: self._rank(each, good, most))
         return best
+
+    def _rank(self, state: ClothState, good: ClothState, most: float) -> tuple[int, bool, int]:
+        """What is better is less: excess over good positions, more strain than may be, crossings."""
+        return self._excess(state, good), self.strain(state.x) > most, state.crossings.count
+
+    def strain(self, x: Float[Tensor, "vertices 3"]) -> float:
+        """What all but the hundredth part of the edges are strained by at most."""
+        return edge_strain(self._level, x)["p99"]
 
     def worse(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether more crosses than may, in all or between garments."""

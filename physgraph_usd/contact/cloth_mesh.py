@@ -18,6 +18,7 @@ from torch import Tensor
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges
+from .again import edges_again, faces_again
 from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
 from .nearest import Nearest, Pairs
@@ -85,7 +86,9 @@ class ClothMesh:
         corner = np.argsort(triangles.ravel(), kind="stable")
         starts = np.concatenate([[0], np.cumsum(np.bincount(triangles.ravel(), minlength=level.vertex_count))])
         about = [wp.array(each.astype(np.int32), dtype=wp.int32, device=level.device) for each in (starts, corner // 3)]
-        about.append(wp.array(triangles, dtype=wp.vec3i, device=level.device))
+        self._triangles = wp.array(triangles, dtype=wp.vec3i, device=level.device)
+        self._edges = wp.array(edges, dtype=wp.vec2i, device=level.device)
+        about.append(self._triangles)
         points = [_vectors(each) for each in (self._position, self._normal)]
         self._find_normals = Launch(
             vertex_normals, level.vertex_count, [*about, *points], device=level.device, lanes=level.lanes
@@ -139,7 +142,8 @@ class ClothMesh:
         Args:
             busy: Which vertices to ask; edges near what they find are asked too.
             reach: Distance beyond which nothing is near [m].
-            known: What was closest before some vertices moved: what is not within reach of those is not asked again.
+            known: What was closest before some vertices moved: what is not within reach of those is not asked again,
+                and only the closest points on it are found anew.
             moved: Those vertices.
         """
         assert self._at is not None
@@ -149,8 +153,9 @@ class ClothMesh:
             again, found = torch.ones_like(busy), Nearest.none(x, len(level.edges))
             beside = again
         else:
-            again = self._beside(moved, float(limit.max())) | known.beside_moved(level, moved)
-            found, beside = known.again(x, again), self.grown(again, 1)
+            found = known.copy()
+            again = self._beside(moved, float(limit.max())) | known.beside_moved(level, moved) | self._slid(found)
+            found, beside = found.without(again, x=x), self.grown(again, 1)
         self._ask_faces(busy & again, limit, found)
         # An edge near another has a vertex near a face, or next to one that is.
         close = self.grown(found.close(level), 1) & beside
@@ -211,6 +216,19 @@ class ClothMesh:
         near, clusters = moved.clone(), self._clusters
         clusters.run(clusters_beside, [wp.float32(reach), _flags(moved), *clusters.faces[:2], _flags(near)])
         return near
+
+    def _slid(self, found: Nearest) -> Bool[Tensor, " vertices"]:
+        """Move what is closest to the closest points of now; the ends of edges whose points slide off an end."""
+        slid = torch.zeros(len(found.edge), dtype=torch.bool, device=found.edge.device)
+        x, given = _vectors(self._position), {"device": self.level.device, "lanes": self.level.lanes}
+        faces = [wp.from_torch(found.face, dtype=wp.vec2i), *[_vectors(each) for each in found.weight]]
+        Launch(faces_again, len(found.face), [x, self._triangles, *faces], **given)({})
+        edges = [wp.from_torch(found.edge, dtype=wp.vec2i)]
+        edges += [wp.from_torch(each, dtype=wp.vec2f) for each in found.place]
+        Launch(edges_again, len(found.edge), [x, self._edges, *edges, wp.from_torch(slid)], **given)({})
+        ends = torch.zeros_like(found.face[:, 0], dtype=torch.bool)
+        ends[self.level.edges.long()[slid].reshape(-1)] = True
+        return ends
 
     def _ask_faces(self, asked: Bool[Tensor, " vertices"], reach: Tensor, found: Nearest) -> None:
         """Write the closest faces of the vertices that are asked."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -53,11 +53,14 @@ class Nearest:
         place = torch.zeros((2, edges, 2), dtype=torch.float32, device=x.device)
         return Nearest(x, face, weight, edge, place)
 
-    def again(self, x: Float[Tensor, "vertices 3"], where: Bool[Tensor, " vertices"]) -> Nearest:
-        """The same to be written to, with nothing near some vertices, which are looked at anew at x [m]."""
-        face = torch.where(where.unsqueeze(1), torch.full_like(self.face, -1), self.face)
+    def copy(self) -> Nearest:
+        """The same, to be written to."""
+        return Nearest(self.x, self.face.clone(), self.weight.clone(), self.edge.clone(), self.place.clone())
+
+    def without(self, where: Bool[Tensor, " vertices"], *, x: Float[Tensor, "vertices 3"]) -> Nearest:
+        """The same with nothing near some vertices, which are looked at anew at x [m]."""
         at = torch.where(where.unsqueeze(1), x, self.x)
-        return Nearest(at, face, self.weight.clone(), self.edge.clone(), self.place.clone())
+        return replace(self, x=at, face=torch.where(where.unsqueeze(1), torch.full_like(self.face, -1), self.face))
 
     def beside_moved(self, level: Level, moved: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:
         """Vertices, and ends of edges, whose closest part has a vertex that moved."""

@@ -18,6 +18,7 @@ from ..integrate.base import Carry, Integrator, System
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
 from ..level import Level
+from .cloth import TAUT
 from .frame import LevelContact, Touch
 from .metric import SMOOTH, HeldMetric
 
@@ -126,6 +127,7 @@ def untangle_last(
     if view.cloth is None or not view.cloth.look(x).crossings.count:
         return x, reports
     best = view.cloth.mend(x)
+    most = TAUT * view.cloth.strain(best.x)
     for _ in range(LAST_TRIES):
         if not best.crossings.count:
             break
@@ -134,7 +136,7 @@ def untangle_last(
         )
         reports += made
         state = view.cloth.mend(out)
-        if state.crossings.count >= best.crossings.count:
+        if state.crossings.count >= best.crossings.count or view.cloth.strain(state.x) > most:
             break
         best = state
     return best.x, reports
