@@ -354,12 +354,12 @@ class TestAskedAgain:
         near = reach(level) / 4.0
         before = mesh.nearest(everything(level), near)
         one = torch.arange(len(x)) == int((before.face >= 0).any(dim=1).nonzero()[0])
-        crept = x * 1.0001
+        crept = x + 0.003 * x[:, [1, 2, 0]] * torch.tensor([1.0, 0.0, 0.0])
         mesh.move(crept)
         again = mesh.nearest(everything(level), near, known=before, moved=one)
         asked = (again.x == crept).all(dim=1)
         assert bool(asked[one].all())
-        assert 0.0 < float(asked.double().mean()) < 0.7
+        assert 0.0 < float(asked.double().mean()) < 0.8
         assert torch.equal(again.x[~asked], before.x[~asked])
         assert torch.equal(again.face[~asked], before.face[~asked])
         kept = ~asked & (again.face[:, 0] >= 0)

@@ -244,3 +244,34 @@ class TestMend:
         x = torch.where(level.free, x, base)
         assert view.look(x).crossings.count > 50
         assert view.mend(x).crossings.count == 0
+
+    def test_what_may_cross_is_not_mended_by_tearing(self, monkeypatch: pytest.MonkeyPatch):
+        """Two sheets that cross elsewhere, and more, in an input that is also torn there where they cross now."""
+        cloths = square(4), square(4)
+        garments = [named(cloths[0], "A"), named(cloths[1], "B")]
+        levels = levels_of(*garments)
+        x = levels[-1].rest.clone()
+        upper = torch.arange(len(x)) >= len(x) // 2
+        x[upper, 1] += 0.004
+        base, right = x.clone(), x[:, 0] > 0.0
+        base[upper & right, 1] -= 0.008
+        base[upper & ~right, 0] += 0.03 * (torch.arange(int((upper & ~right).sum())) % 2)
+        x[torch.argmin((x - torch.tensor([-0.04, 0.004, 0.0])).norm(dim=1) + 10.0 * ~upper), 1] -= 0.008
+        view = view_of(levels, garments, base)
+        state, most = view.look(x), view.most_strain(x)
+        assert 0 < state.crossings.count < view.before.crossings.count
+        mended = view.mend(x)
+        assert 0 < mended.crossings.count <= state.crossings.count
+        assert not view.is_taut(mended.x, most)
+        monkeypatch.setattr(ClothView, "is_taut", lambda *_: False)
+        torn = view.mend(x)
+        assert torn.crossings.count < mended.crossings.count
+        monkeypatch.undo()
+        assert view.is_taut(torn.x, most)
+
+    def test_little_strain_is_no_tear(self):
+        _, view, base = views("flat")
+        assert not view.is_taut(base, view.most_strain(base))
+        assert not view.is_taut(1.4 * base, view.most_strain(base))
+        assert view.is_taut(1.6 * base, view.most_strain(base))
+        assert view.most_strain(1.6 * base) == pytest.approx(1.25 * 0.6, rel=0.05)

@@ -7,6 +7,7 @@ report's measure says so.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,6 @@ from torch import Tensor
 
 from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
-from ..resolution import edge_strain
 from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh, Crossings
@@ -38,15 +38,15 @@ SMOOTHINGS = 4
 """Passes that smooth the move round new crossings before any takes it back: a smooth move crosses nothing."""
 MENDS = 8
 """Most passes in all; after them the best positions found are taken."""
-TAUT = 1.25
-"""How many times as much mending may strain the cloth, if more does not cross else: it shows more than crossings do."""
+TAUT, SLACK = 1.25, 0.5
+"""How many times as much mending may strain the cloth beyond some strain: that shows more than a few crossings do."""
 TURNED = 0.5
 """Cosine beyond which the way from one part to another counts as turned round since the input: one passed through."""
 SPHERE = 0.8
 """R of the paper's form, in mean edges (PAPER A13)."""
 AHEAD = 0.5
 """How much farther than the thickness it is looked for pairs above the cage, in mean edges: the move of a round."""
-STALE, FEW, MOST = 0.2, 1e-3, 0.5
+STALE, FEW, MOST = 0.1, 1e-3, 0.5
 """Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
 has, and everywhere where more than the last part has."""
 LOCAL = 0.2
@@ -127,6 +127,7 @@ class ClothView:
     Attributes:
         tangled: Whether anything crossed where the term was asked for last.
         allowed: What may cross in the end: the input, where another cage is followed; else None.
+        spared: Whether mending strains the cloth no more than a little.
     """
 
     def __init__(
@@ -156,6 +157,7 @@ class ClothView:
         self._looked: ClothState | None = None
         self.tangled = False
         self.allowed: ClothState | None = None
+        self.spared = True
         self._reach = float(thickness.max()) + (AHEAD if level.index else 1.0) * float(level.spacing.mean())
 
     @cached_property
@@ -219,10 +221,9 @@ class ClothView:
         return Spheres(level, ends, radius=limit, stiffness=self._settings.sphere_stiffness, area=area)
 
     def _near(self, x: Tensor) -> tuple[Pairs | None, Crossings]:
-        """What is near what, and what crosses.
+        """What is near what, and what crosses; where nothing did at a level's start, only its end is looked at again.
 
-        Pairs found before serve again away from what has moved since, and where hardly anything has; where nothing
-        crossed at the start of a level, only its end is looked at again.
+        Pairs found before serve again away from what has moved since.
         """
         known, none = self._found, Crossings.none(x.device)
         moved, part = None, 1.0
@@ -251,15 +252,16 @@ class ClothView:
             good: Positions to fall back on; the upsampled cage when None.
 
         Returns:
-            The positions found that have the fewest crossings and are not much more taut; no more crossings than the
-            good ones have, but where that cannot be had.
+            The positions with the fewest crossings that are not much more taut; no more than the good ones have, but
+            where that cannot be had.
         """
         best = state = self.look(x)
         if not state.crossings.count:
             return state
         good = good or self.before
-        zone = self._mesh.grown(self._corners(good.crossings), ZONE)
-        shift, most = x - good.x, TAUT * self.strain(x)
+        zone = self._mesh.grown(self._mesh.crossed(good.crossings), ZONE)
+        shift, most = x - good.x, self.most_strain(x) if self.spared else math.inf
+        least = self._rank(best, good, most)
         for attempt in range(MENDS):
             corners = self._mesh.corners_of(state.crossings)
             too_many = self._excess(state, good) > 0
@@ -275,16 +277,21 @@ class ClothView:
             # What is not mended keeps its place to the last bit, and need not be looked at again.
             still = (new_shift == shift).all(dim=1, keepdim=True)
             shift, state = new_shift, self.look(torch.where(still, state.x, good.x + new_shift))
-            best = min(best, state, key=lambda each: self._rank(each, good, most))
+            rank = self._rank(state, good, most)
+            best, least = (state, rank) if rank < least else (best, least)
         return best
 
     def _rank(self, state: ClothState, good: ClothState, most: float) -> tuple[int, bool, int]:
-        """What is better is less: excess over good positions, more strain than may be, crossings."""
-        return self._excess(state, good), self.strain(state.x) > most, state.crossings.count
+        """Less is better: excess over good positions, more strain than may be, crossings."""
+        return self._excess(state, good), self.is_taut(state.x, most), state.crossings.count
 
-    def strain(self, x: Float[Tensor, "vertices 3"]) -> float:
-        """What all but the hundredth part of the edges are strained by at most."""
-        return edge_strain(self._level, x)["p99"]
+    def is_taut(self, x: Float[Tensor, "vertices 3"], most: float) -> bool:
+        """Whether a hundredth of the edges is strained by more than that."""
+        return self._mesh.strain(x) > most
+
+    def most_strain(self, x: Float[Tensor, "vertices 3"]) -> float:
+        """How far mending may strain cloth that is at x [m]."""
+        return max(TAUT * self._mesh.strain(x), SLACK)
 
     def worse(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether more crosses than may, in all or between garments."""
@@ -293,7 +300,7 @@ class ClothView:
 
     def round_crossings(self, x: Float[Tensor, "vertices 3"], *, rings: int) -> Bool[Tensor, " vertices"]:
         """Vertices within some rings of what crosses at x [m]."""
-        return self._mesh.grown(self._corners(self.look(x).crossings), rings)
+        return self._mesh.grown(self._mesh.crossed(self.look(x).crossings), rings)
 
     def _excess(self, state: ClothState, good: ClothState) -> int:
         """By how much more crosses than in good positions, in all or between garments."""
@@ -314,7 +321,7 @@ class ClothView:
             table = self._mesh.between(state.crossings)
             apart = int(np.triu(table, 1).sum())
             said[name] = {"crossings": state.crossings.count, "between_garments": apart}
-        return said, self._corners(after.crossings)
+        return said, self._mesh.crossed(after.crossings)
 
     def _smoothed(self, shift: Tensor, where: Bool[Tensor, " vertices"], *, passes: int) -> Tensor:
         """Displacements averaged over neighbours again and again within a region; held outside."""
@@ -336,12 +343,6 @@ class ClothView:
             inner = inner_next
         return kept.unsqueeze(1)
 
-    def _corners(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
-        """Vertices of what crosses."""
-        out = torch.zeros_like(self._level.free[:, 0])
-        out[self._mesh.corners_of(crossings).reshape(-1)] = True
-        return out
-
     def _gaps(self, pairs: Pairs, x: Float[Tensor, "vertices 3"], crossings: Crossings) -> Gaps:
         """Planes between parts, each on the side that it had at the start or, if ordered, that it should have."""
         corners = pairs.corners.long()
@@ -350,7 +351,7 @@ class ClothView:
         ordered &= ~self._lasting.order[garment].isnan().any(dim=1)
         off = cut_off(self._mesh, crossings) if crossings.count else torch.zeros_like(self._level.free[:, 0])
         swapped, undecided = swapped_by(off[corners], pairs.face, self._is_split(off)[garment])
-        kept = (~self._corners(crossings)[corners].any(dim=1) & ~undecided) | ordered
+        kept = (~self._mesh.crossed(crossings)[corners].any(dim=1) & ~undecided) | ordered
         pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
         corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
         start = x if self._sides is None else self._sides

@@ -203,6 +203,18 @@ class ClothMesh:
         """Vertices of the edge and of the face of each crossing."""
         return torch.cat([self.level.edges.long()[crossings.edge], self.triangles[crossings.face]], dim=1)
 
+    def crossed(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
+        """Vertices of what crosses."""
+        out = torch.zeros_like(self.level.free[:, 0])
+        out[self.corners_of(crossings).reshape(-1)] = True
+        return out
+
+    def strain(self, x: Float[Tensor, "vertices 3"]) -> float:
+        """What all but the hundredth part of the edges are strained by at most, at x [m]."""
+        ends, rest = self.level.edges.long(), self.level.rest_length
+        strain = ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) / rest - 1.0).abs()
+        return float(strain.kthvalue(1 + int(0.99 * (len(rest) - 1))).values)
+
     def between(self, crossings: Crossings) -> np.ndarray:
         """Number of listed crossings between garments, the lower number first, shape (G, G)."""
         garment = self.level.vertex_garment.cpu().numpy()

@@ -197,19 +197,29 @@ class FrameContact:
             moved["repaired"] = {"vertices": int((shift > 0).sum()), "largest_mm": round(1e3 * float(shift.max()), 4)}
         if self._seams is not None:
             x = self._seams.close(finest, finest.base.apply(self.aim), x)
-        mended = x = x if view.cloth is None else view.cloth.mend(x).x
-        passes = 0
-        if view.bodies is not None:
-            x, passes = view.bodies.project(mended)
-            if view.cloth is not None and view.cloth.look(x).crossings.count:
-                x = self._least_crossed(view.cloth, view.bodies, mended, x)
-        if view.cloth is not None and view.cloth.worse(x):
-            x = self._not_worse(view.cloth, view.bodies, mended, x)
+        mended, x, passes = self._mended(view, x)
         if view.bodies is not None:
             moved["projected"] = moves(mended, x, passes)
         if self._seams is not None:
             x = self._seams.close(finest, finest.base.apply(self.aim), x)
         return x, mended, moved
+
+    def _mended(self, view: LevelContact, solved: Tensor) -> tuple[Tensor, Tensor, int]:
+        """Cloth before and after bodies pushed what was mended, and their passes; taut cloth only where it must be."""
+        mended, x, passes, cloth, bodies = solved, solved, 0, view.cloth, view.bodies
+        for spared in (True, False):
+            if cloth is not None:
+                cloth.spared = spared
+                mended = x = cloth.mend(solved).x
+            if bodies is not None:
+                self._hold(bodies, None)
+                x, passes = bodies.project(mended)
+                if cloth is not None and cloth.look(x).crossings.count:
+                    x = self._least_crossed(cloth, bodies, mended, x)
+            if cloth is None or not cloth.worse(x):
+                return mended, x, passes
+        assert cloth is not None
+        return mended, self._not_worse(cloth, bodies, mended, x), passes
 
     def _least_crossed(self, cloth: ClothView, bodies: LevelBodies, mended: Tensor, x: Tensor) -> Tensor:
         """Push cloth along that bodies push onto; where more crosses than in the input even then, leave more of it.

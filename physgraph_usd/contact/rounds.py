@@ -18,7 +18,6 @@ from ..integrate.base import Carry, Integrator, System
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
 from ..level import Level
-from .cloth import TAUT
 from .frame import LevelContact, Touch
 from .metric import SMOOTH, HeldMetric
 
@@ -127,7 +126,7 @@ def untangle_last(
     if view.cloth is None or not view.cloth.look(x).crossings.count:
         return x, reports
     best = view.cloth.mend(x)
-    most = TAUT * view.cloth.strain(best.x)
+    most = view.cloth.most_strain(best.x)
     for _ in range(LAST_TRIES):
         if not best.crossings.count:
             break
@@ -136,7 +135,7 @@ def untangle_last(
         )
         reports += made
         state = view.cloth.mend(out)
-        if state.crossings.count >= best.crossings.count or view.cloth.strain(state.x) > most:
+        if state.crossings.count >= best.crossings.count or view.cloth.is_taut(state.x, most):
             break
         best = state
     return best.x, reports
