@@ -22,6 +22,7 @@ from .detail import Carried, MovingFrames, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
+from .forces.seam import SewnForces
 from .integrate.base import Integrator, System
 from .integrate.choice import Choice, choose
 from .integrate.metric import Metric
@@ -265,7 +266,7 @@ class Group:
         cloth = self._cloth if settings.cloth != "off" and self._cloth.meets.any() else None
         if not len(self.levels[0].triangles):
             return None
-        seams = Seams.find(self.levels[0], coarse, self._stretch) if settings.cloth != "off" else None
+        seams = Seams.find(self.levels[0], coarse)
         if cloth is None and not touching and seams is None:
             return None
         weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
@@ -366,11 +367,12 @@ class Group:
             return x, [report], ()
 
         def system(touched: Sequence[Touch], at: Tensor) -> System:
-            if not touched:
+            if not touched and view.seam is None:
                 return alone
             assert isinstance(alone.field, ForceModule)
             assert isinstance(alone.metric, Metric)
             field = ForceModule((*alone.field.forces, *touched))
+            field = field if view.seam is None else SewnForces(field, view.seam)
             held = view.metric(alone.metric, touched, at)
             return System(field, held, free=level.free, spacing=level.spacing, level=level)
 

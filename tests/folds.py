@@ -16,6 +16,7 @@ from physgraph_usd.colliders.pose import Collider, MeshPose, Pose
 from physgraph_usd.contact.cloth import ClothContact, ClothView
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.fabric import Fabric
+from physgraph_usd.forces.seam import Seam
 from physgraph_usd.level import Level, build_levels, refine_garments
 from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.pipeline import Refiner
@@ -117,12 +118,13 @@ def view_of(
     thickness: float = 0.001,
     stiffness: float = 1e5,
     form: str = "pairs",
+    seam: Seam | None = None,
 ) -> ClothView:
     """The finest level's cloth in a frame whose upsampled cage is at given positions."""
     lasting = ClothContact(levels, garments)
     each = torch.full((len(garments),), thickness, dtype=base.dtype)
     settings = ContactSettings(cloth=form, cloth_stiffness=stiffness)
-    return ClothView(lasting, levels[-1], base, thickness=each, settings=settings)
+    return ClothView(lasting, levels[-1], base, thickness=each, settings=settings, seam=seam)
 
 
 def refiner_with(

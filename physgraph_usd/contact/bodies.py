@@ -19,6 +19,7 @@ from torch import Tensor
 from ..colliders.base import Surface
 from ..colliders.sign import signed_distances
 from ..forces.contact import Contact, Planes
+from ..forces.seam import Seam
 from ..level import Level
 from .corners import lift_over
 from .measure import DEEP, depths, penetration
@@ -61,10 +62,15 @@ class Touching:
 
 
 class LevelBodies:
-    """One level's view of the bodies."""
+    """One level's view of the bodies.
+
+    Attributes:
+        seam: What is sewn together, and stays so where bodies push; or None without seams.
+    """
 
     def __init__(self, level: Level, tracks: Sequence[Track], settings: ContactSettings) -> None:
         """Keep what is known of the distances."""
+        self.seam: Seam | None = None
         self._level, self._tracks, self._settings = level, tuple(tracks), settings
         self._reach = float(level.spacing.mean())
 
@@ -149,7 +155,7 @@ class LevelBodies:
             if not moved or (together and float(total.abs().max()) < 1e-7):
                 break
             passes += 1
-        return out, passes
+        return (out if self.seam is None else self.seam.closed(out)), passes
 
     def _pushes(self, track: Track, x: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices that are under their least clearance to a surface, and the ways to it."""

@@ -18,11 +18,13 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from ..forces.seam import Seam
 from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
 from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh, Crossings
+from .mend import falling_off, smoothed
 from .nearest import Nearest, Pairs
 from .regions import Regions
 from .settings import ContactSettings
@@ -138,6 +140,7 @@ class ClothView:
         *,
         thickness: Float[Tensor, " garments"],
         settings: ContactSettings,
+        seam: Seam | None = None,
     ) -> None:
         """Take the frame.
 
@@ -147,10 +150,12 @@ class ClothView:
             base: The upsampled cage [m]: distances that it has are not widened.
             thickness: Of each garment [m].
             settings: How contact is solved, in SI.
+            seam: What is sewn together, and stays so; or None without seams.
         """
         self._settings = settings
         self._lasting, self._level, self._base = lasting, level, base
-        self._mesh, self._regions = lasting.mesh(level), lasting.regions(level)
+        self._mesh, self._regions, self._seam = lasting.mesh(level), lasting.regions(level), seam
+        self._mesh.sew(np.zeros((0, 2), np.int64) if seam is None else seam.pairs)
         self._thickness, self._stiffness = thickness, settings.cloth_stiffness
         self._sides: Tensor | None = None
         self._found: _Found | None = None
@@ -170,6 +175,10 @@ class ClothView:
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
             self._looked = self._look(x, self._looked)
         return self._looked
+
+    def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions with their seams closed [m]."""
+        return x if self._seam is None else self._seam.closed(x)
 
     def _look(self, x: Tensor, known: ClothState | None) -> ClothState:
         """Find what crosses; where few vertices have moved since what is known, only beside them."""
@@ -271,12 +280,13 @@ class ClothView:
             back = torch.zeros_like(zone)
             back[corners[new].reshape(-1)] = True
             if attempt < SMOOTHINGS:
-                new_shift = self._smoothed(shift, self._mesh.grown(back, attempt + 1), passes=4 << attempt)
+                new_shift = smoothed(self._mesh, shift, self._mesh.grown(back, attempt + 1), passes=4 << attempt)
             else:
-                new_shift = shift * self._falling_off(back, attempt - SMOOTHINGS + 1)
+                new_shift = shift * falling_off(self._mesh, back, attempt - SMOOTHINGS + 1)
             # What is not mended keeps its place to the last bit, and need not be looked at again.
             still = (new_shift == shift).all(dim=1, keepdim=True)
-            shift, state = new_shift, self.look(torch.where(still, state.x, good.x + new_shift))
+            state = self.look(self.closed(torch.where(still, state.x, good.x + new_shift)))
+            shift = new_shift if self._seam is None else state.x - good.x
             rank = self._rank(state, good, most)
             best, least = (state, rank) if rank < least else (best, least)
         return best
@@ -322,26 +332,6 @@ class ClothView:
             apart = int(np.triu(table, 1).sum())
             said[name] = {"crossings": state.crossings.count, "between_garments": apart}
         return said, self._mesh.crossed(after.crossings)
-
-    def _smoothed(self, shift: Tensor, where: Bool[Tensor, " vertices"], *, passes: int) -> Tensor:
-        """Displacements averaged over neighbours again and again within a region; held outside."""
-        which = np.flatnonzero((where & self._level.free[:, 0]).cpu().numpy())
-        rows = self._mesh.beside[which]
-        share = 1.0 / np.maximum(np.asarray(rows.sum(axis=1)), 1.0)
-        values = shift.cpu().numpy().copy()
-        for _ in range(passes):
-            values[which] = share * (rows @ values)
-        return torch.as_tensor(values).to(shift)
-
-    def _falling_off(self, back: Bool[Tensor, " vertices"], rings: int) -> Float[Tensor, "vertices 1"]:
-        """0 within some rings of given vertices, rising to 1 over as many rings more."""
-        inner = self._mesh.grown(back, rings - 1)
-        kept = 1.0 - inner.to(self._base)
-        for step in range(rings):
-            inner_next = self._mesh.grown(inner, 1)
-            kept = torch.where(inner_next & ~inner, torch.full_like(kept, (step + 1) / (rings + 1)), kept)
-            inner = inner_next
-        return kept.unsqueeze(1)
 
     def _gaps(self, pairs: Pairs, x: Float[Tensor, "vertices 3"], crossings: Crossings) -> Gaps:
         """Planes between parts, each on the side that it had at the start or, if ordered, that it should have."""

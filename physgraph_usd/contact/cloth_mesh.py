@@ -12,12 +12,11 @@ import scipy.sparse as sp
 import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csgraph
 from torch import Tensor
 
 from ..level import Level
 from ..mesh.lanes import Launch
-from ..mesh.topology import find_edges
+from ..mesh.topology import find_edges, joined_by
 from .again import edges_again, faces_again
 from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
@@ -56,7 +55,8 @@ class ClothMesh:
 
     Attributes:
         level: The level.
-        beside: Adjacency of its vertices, shape (V, V).
+        beside: Adjacency of its vertices, also across seams, shape (V, V).
+        sewn: Pairs of vertices taken for one, shape (N, 2).
         opposite: Vertices opposite each edge in the first two of its faces, -1 where there is none, shape (E, 2).
     """
 
@@ -77,12 +77,9 @@ class ClothMesh:
         self.triangles = level.triangles.long()
         self._clusters = ClusteredParts(level, self.beside, _owned_sides(edges, triangles), meets=meets)
         self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
-        self._static = {
-            "rest": _vectors(level.rest.to(torch.float32).contiguous()),
-            "starts": wp.array(self.beside.indptr.astype(np.int32), dtype=wp.int32, device=level.device),
-            "ring": wp.array(self.beside.indices.astype(np.int32), dtype=wp.int32, device=level.device),
-        }
-
+        self._rest = level.rest.to(torch.float32).contiguous()
+        self._apart, self.sewn = self.beside, np.zeros((0, 2), np.int64)
+        self._rings = self._arrays(self.beside)
         corner = np.argsort(triangles.ravel(), kind="stable")
         starts = np.concatenate([[0], np.cumsum(np.bincount(triangles.ravel(), minlength=level.vertex_count))])
         about = [wp.array(each.astype(np.int32), dtype=wp.int32, device=level.device) for each in (starts, corner // 3)]
@@ -104,7 +101,25 @@ class ClothMesh:
     @cached_property
     def whole(self) -> np.ndarray:
         """What each vertex hangs together with: a number of each piece, shape (V,)."""
-        return joined_by(self.level.edges.cpu().numpy(), self.level.vertex_count)
+        return joined_by(np.concatenate([self.level.edges.cpu().numpy(), self.sewn]), self.level.vertex_count)
+
+    def sew(self, pairs: Int[np.ndarray, "pairs 2"]) -> None:
+        """From now on take pairs of vertices for one: what is beside either is beside both, and no pair with it."""
+        if np.array_equal(pairs, self.sewn):
+            return
+        self.sewn, count = pairs, self.level.vertex_count
+        for name in ("whole", "within_two"):
+            self.__dict__.pop(name, None)
+        same = sp.identity(count, dtype=np.float32, format="csr")
+        if len(pairs):
+            group = joined_by(pairs, count)
+            member = sp.csr_matrix((np.ones(count, np.float32), (np.arange(count), group)))
+            same = sp.csr_matrix(member @ member.T)
+        beside = sp.csr_matrix(same @ self._apart @ same + same)
+        beside.setdiag(0.0)
+        beside.eliminate_zeros()
+        beside.data[:] = 1.0
+        self.beside, self._rings = beside, self._arrays(beside)
 
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions [m]; what is asked afterwards is asked of them.
@@ -261,13 +276,12 @@ class ClothMesh:
     def _asked(self, asked: Tensor, reach: Tensor) -> list[object]:
         """What both proximity kernels are told first."""
         moving = [_vectors(self._position), _flags(asked), wp.from_torch(reach), _vectors(self._normal)]
-        return [self._static["starts"], self._static["ring"], *moving, self._static["rest"]]
+        return [*self._rings, *moving, _vectors(self._rest)]
 
-
-def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
-    """The piece of each of some vertices, by the edges that hold them together, shape (V,)."""
-    graph = sp.coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return csgraph.connected_components(graph, directed=False)[1]
+    def _arrays(self, beside: sp.csr_matrix) -> list[wp.array]:
+        """An adjacency as kernels read it: where each row starts, and the neighbours."""
+        each = (beside.indptr.astype(np.int32), beside.indices.astype(np.int32))
+        return [wp.array(values, dtype=wp.int32, device=self.level.device) for values in each]
 
 
 def _adjacency(edges: np.ndarray, count: int) -> sp.csr_matrix:

@@ -31,7 +31,7 @@ SQUEEZED = 2.0
 """Distance to which cloth is moved apart then, in thicknesses: what bodies push moves faces, whose middles sag."""
 HOLDS = 6
 """How often more of what is between overlapping parts of a body is left there, while pushing it out makes it cross."""
-Touch = Contact | SelfContact | Spheres | Seam
+Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
 
 
@@ -43,7 +43,7 @@ class LevelContact:
         bodies: Its view of the bodies, or None when there are none.
         cloth: Its view of the cloth, or None when cloth is not to touch cloth.
         rounds: How often in the level's steps pairs and planes are found anew.
-        seam: Springs that hold seams together, or None without seams.
+        seam: What is sewn together, or None without seams.
     """
 
     bodies: LevelBodies | None
@@ -54,6 +54,7 @@ class LevelContact:
 
     def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric | HeldMetric:
         """The metric of a level whose cloth is held by what touches at x [m]; the same one while it serves."""
+        plain = plain if self.seam is None else plain.merged(self.seam.label)
         if not terms:
             return plain
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
@@ -75,7 +76,11 @@ class LevelContact:
     def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
         """The forces of what is near positions x [m]; empty where nothing is."""
         parts = [part.term(x) for part in (self.bodies, self.cloth) if part is not None]
-        return tuple(term for term in (*parts, self.seam) if term is not None)
+        return tuple(term for term in parts if term is not None)
+
+    def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions with their seams closed [m]."""
+        return x if self.seam is None else self.seam.closed(x)
 
 
 class FrameContact:
@@ -117,10 +122,10 @@ class FrameContact:
         """The cage that the fine cloth follows [m]: the input, but where that is pinched or crosses."""
         if self._aim is None:
             self._aim = self._coarse
-            if self._cloth is not None and self._seams is None:
+            if self._cloth is not None:
                 cage = self._levels[0]
                 bodies = None if self._bodies is None else self._bodies.at(cage, self._levels[-1])
-                self._aim = repaired_cage(
+                repaired = repaired_cage(
                     cage,
                     self._coarse,
                     bodies=bodies,
@@ -128,18 +133,18 @@ class FrameContact:
                     gap=float(self._thickness.mean()),
                     crosses=self.crossed,
                 )
+                seam = self._seam_at(cage, self._coarse)
+                self._aim = repaired if seam is None or repaired is self._coarse else seam.closed(repaired)
         return self._aim
 
     @property
     def crossed(self) -> bool:
-        """Whether the cage crosses itself; not looked at where seams hold points together."""
+        """Whether the cage crosses itself."""
         return self._crossed
 
     @cached_property
     def _crossed(self) -> bool:
         """The same, found once."""
-        if self._cloth is None or self._seams is not None:
-            return False
         cage = self._levels[0]
         view = self._cloth_at(cage, cage.base.apply(self._coarse))
         return view is not None and view.before.crossings.count > 0
@@ -149,14 +154,15 @@ class FrameContact:
         if level.index not in self._views:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
+            seam, cloth = self._seam_at(level, base), self._cloth_at(level, base)
+            if bodies is not None:
+                bodies.seam = seam
             if bodies is not None and self._cloth is not None and self.aim is not self._coarse:
                 lost = hidden_between(level, base, bodies, self._cloth.mesh(level))
                 bodies.lose(lost)
                 self._lost = lost if level is self._levels[-1] else self._lost
-            cloth = self._cloth_at(level, base)
             if cloth is not None and level is self._levels[-1] and self._judge is not None:
                 cloth.allowed = self._judge.before
-            seam = None if self._seams is None else self._seams.term(level, base)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
         return self._views[level.index]
 
@@ -178,7 +184,13 @@ class FrameContact:
         """A new view of one level's cloth, upsampled to given positions [m]."""
         if self._cloth is None:
             return None
-        return ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings)
+        seam = self._seam_at(level, base)
+        base = base if seam is None else seam.closed(base)
+        return ClothView(self._cloth, level, base, thickness=self._thickness, settings=self._settings, seam=seam)
+
+    def _seam_at(self, level: Level, base: Float[Tensor, "vertices 3"]) -> Seam | None:
+        """What is sewn together at a level, upsampled to given positions [m]."""
+        return None if self._seams is None else self._seams.at(level, base)
 
     def finish(
         self, x: Float[Tensor, "vertices 3"]
@@ -189,19 +201,14 @@ class FrameContact:
             Positions [m], x itself where nothing had to move; the same before bodies pushed, where the next frame
             starts: it is where forces rest, so that equal frames stay equal; and what had to move.
         """
-        finest = self._levels[-1]
-        view = self.at(finest)
+        view = self.at(self._levels[-1])
         moved: dict[str, object] = {}
         if self.aim is not self._coarse:
             shift = (self.aim - self._coarse).norm(dim=1)
             moved["repaired"] = {"vertices": int((shift > 0).sum()), "largest_mm": round(1e3 * float(shift.max()), 4)}
-        if self._seams is not None:
-            x = self._seams.close(finest, finest.base.apply(self.aim), x)
-        mended, x, passes = self._mended(view, x)
+        mended, x, passes = self._mended(view, view.closed(x))
         if view.bodies is not None:
             moved["projected"] = moves(mended, x, passes)
-        if self._seams is not None:
-            x = self._seams.close(finest, finest.base.apply(self.aim), x)
         return x, mended, moved
 
     def _mended(self, view: LevelContact, solved: Tensor) -> tuple[Tensor, Tensor, int]:

@@ -44,7 +44,7 @@ def taken_back(
     out, back = x, torch.zeros_like(mesh.level.free[:, 0])
     while cloth.worse(out) and not bool(back.all()):
         back = mesh.grown(back | cloth.round_crossings(out, rings=0), rings)
-        out = returned(mesh, x, good.x, where=back, rings=rings)
+        out = cloth.closed(returned(mesh, x, good.x, where=back, rings=rings))
         rings *= 2
     return out
 

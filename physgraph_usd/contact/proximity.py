@@ -231,9 +231,8 @@ def faces_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
                 t = triangles[m]
                 if not within(p, p, face_low[m], face_high[m], farthest) or has(t, v):
                     continue
-                if same:
-                    if is_face_beside(v, t, starts, beside):
-                        continue
+                if is_face_beside(v, t, starts, beside):
+                    continue
                 weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
                 way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
                 distance = wp.length(way)
@@ -279,6 +278,7 @@ def box_of_edges(
 
 @wp.func
 def is_own_edge(
+    same: bool,
     e: wp.vec2i,
     g: wp.vec2i,
     places: wp.vec2f,
@@ -288,9 +288,10 @@ def is_own_edge(
     starts: wp.array(dtype=wp.int32),
     beside: wp.array(dtype=wp.int32),
 ):
-    """Whether an edge of the same garment is next to another, or in its plane, where it belongs."""
-    if belongs(distance, wp.length(between(rest, e, g, places[0], places[1])), cosine):
-        return True
+    """Whether an edge is next to another or, of the same garment, in its plane, where it belongs."""
+    if same:
+        if belongs(distance, wp.length(between(rest, e, g, places[0], places[1])), cosine):
+            return True
     return are_beside(e, g, starts, beside)
 
 
@@ -356,9 +357,8 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
                 cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
                 if distance > wp.where(cosine > 0.0, best[e][0], best[e][1]):
                     continue
-                if same:
-                    if is_own_edge(edges[k], edges[m], places, distance, cosine, rest, starts, beside):
-                        continue
+                if is_own_edge(same, edges[k], edges[m], places, distance, cosine, rest, starts, beside):
+                    continue
                 side = keep_nearest(e, number[m], distance, cosine, best, other)
                 if side > 0:
                     above[e] = places

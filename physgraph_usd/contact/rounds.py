@@ -68,9 +68,10 @@ def solve_touching(
         budget: When to stop.
     """
     most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS * (outward is None)
+    x = view.closed(x)
     x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
     if outward is not None:
-        x = leave_saddle(make_system(touched, x), level, x, outward=outward)
+        x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
     # A warm frame has no coarse levels that settle contact before; much cloth on cloth settles slowly.
     share = budget.steps if finest and (outward is None or crowded(touched, x)) else None
     x, more, touched = solve_rounds(
@@ -104,6 +105,7 @@ def untangle(
     while view.tangled and len(reports) < most and (not reports or reports[-1].stopped != "budget"):
         short = replace(budget, steps=STEPS, tolerance=0.0)
         x, report = solve_level(make_system(terms, x), integrator, x, level=level, budget=short)
+        x = view.closed(x)
         reports.append(report)
         terms = view.terms(x)
     return x, reports, terms
@@ -187,7 +189,7 @@ def solve_rounds(
         )
         if isinstance(system.metric, HeldMetric):
             report.remaining_move = system.remaining_move(system.metric.smooth(kept[-1].force))
-        last = system
+        last, x = system, view.closed(x)
         reports.append(report)
         left -= report.steps
         if report.stopped == "budget" or (left <= 0 and terms):
@@ -225,6 +227,7 @@ def finish_rounds(
     made: list[LevelReport] = []
     if terms and last.remaining_move > UNSETTLED:
         x, made = _solve_apart(make_system((), x), integrator, x, terms=terms, level=level, budget=budget)
+        x = view.closed(x)
     x, more = untangle_last(make_system, integrator, x, view=view, level=level.index, budget=budget)
     return x, made + more
 

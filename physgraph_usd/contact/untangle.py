@@ -29,7 +29,8 @@ from torch import Tensor
 
 from ..forces.self_contact import Gaps
 from ..level import Level
-from .cloth_mesh import ClothMesh, Crossings, joined_by
+from ..mesh.topology import joined_by
+from .cloth_mesh import ClothMesh, Crossings
 
 GRAZING = 0.2
 """Least |N.E|: an edge that lies almost in the face would be sent far along the normal."""
@@ -93,9 +94,10 @@ def _stays_joined(mesh: ClothMesh, crossings: Crossings) -> bool:
     ends, crossing = mesh.level.edges.cpu().numpy(), crossings.edge.cpu().numpy()
     around = torch.zeros_like(mesh.level.free[:, 0])
     around[torch.as_tensor(ends[crossing].reshape(-1), device=around.device).long()] = True
-    near = np.all(mesh.grown(around, NEAR).cpu().numpy()[ends], axis=1)
-    near = np.flatnonzero(near & ~np.isin(np.arange(len(ends)), crossing))
-    places, number = np.unique(np.concatenate([ends[crossing], ends[near]]), return_inverse=True)
+    close = mesh.grown(around, NEAR).cpu().numpy()
+    near = np.flatnonzero(close[ends].all(axis=1) & ~np.isin(np.arange(len(ends)), crossing))
+    joints = np.concatenate([ends[near], mesh.sewn[close[mesh.sewn].all(axis=1)]])
+    places, number = np.unique(np.concatenate([ends[crossing], joints]), return_inverse=True)
     number = number.reshape(-1, 2)
     piece = joined_by(number[len(crossing) :], len(places))[number[: len(crossing)]]
     return bool((piece[:, 0] == piece[:, 1]).all())
@@ -116,7 +118,7 @@ def pieces_of(mesh: ClothMesh, crossings: Crossings) -> tuple[np.ndarray, np.nda
     ends = mesh.level.edges.cpu().numpy()
     kept = np.ones(len(ends), bool)
     kept[crossings.edge.cpu().numpy()] = False
-    whole, piece = mesh.whole, joined_by(ends[kept], count)
+    whole, piece = mesh.whole, joined_by(np.concatenate([ends[kept], mesh.sewn]), count)
     area = np.bincount(piece, mesh.level.vertex_area.double().cpu().numpy())
     first = np.unique(piece, return_index=True)[1]
     largest = np.zeros(int(whole.max()) + 1)

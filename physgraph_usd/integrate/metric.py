@@ -12,6 +12,7 @@ from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ig
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..mesh.stencil import add_at
 from .multifrontal import DissectedSolver, Elimination
 
 REGULARISATION = 1e-7
@@ -59,7 +60,8 @@ class Metric:
             free: False where a vertex may not move: its row becomes the identity's.
             dtype: Scalar type of the right-hand sides.
         """
-        self._kept, self._free = free.to(dtype), free.squeeze(1)
+        self._kept, self._free, self._matrix = free.to(dtype), free.squeeze(1), matrix
+        self._merged: MergedMetric | None = None
         keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
         couplings = sp.csr_matrix(keep @ (matrix - sp.diags(matrix.diagonal())) @ keep)
         couplings.eliminate_zeros()
@@ -72,6 +74,16 @@ class Metric:
         other = copy.copy(self)
         other._hold(self._stiffness + springs.double())
         return other
+
+    def merged(self, label: np.ndarray) -> MergedMetric:
+        """The metric of the same cloth with all vertices of a label as one; the same one while the labels stay.
+
+        Args:
+            label: A number for each vertex, shape (V,).
+        """
+        if self._merged is None or not np.array_equal(self._merged.label, label):
+            self._merged = MergedMetric(self._matrix, label, free=self._free.unsqueeze(1), dtype=self._kept.dtype)
+        return self._merged
 
     def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
         """Factorise with a diagonal [N/m]."""
@@ -87,6 +99,60 @@ class Metric:
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero where a vertex may not move."""
         return self._solver(force * self._scaled).mul_(self._kept)
+
+
+class MergedMetric(Metric):
+    """The metric of cloth some of whose vertices are one: the first of each label stands for all.
+
+    Attributes:
+        label: A number for each vertex, shape (V,).
+    """
+
+    def __init__(
+        self, matrix: sp.csr_matrix, label: np.ndarray, *, free: Bool[Tensor, "vertices 1"], dtype: torch.dtype
+    ) -> None:
+        """Add up the rows and columns of each label, and factorise.
+
+        Args:
+            matrix: As `Metric` takes it.
+            label: A number for each vertex, shape (V,).
+            free: False where a vertex may not move; then none of its label may.
+            dtype: Scalar type of the right-hand sides.
+        """
+        _, first, group = np.unique(label, return_index=True, return_inverse=True)
+        own, count = first[group], len(label)
+        members = np.bincount(group)
+        joined = sp.csr_matrix((np.ones(count), (own, np.arange(count))), shape=(count, count))
+        held = np.bincount(group, ~free[:, 0].cpu().numpy())[group] > 0
+        device, moves = free.device, (own == np.arange(count)) & ~held
+        self.label = label
+        self._own = torch.as_tensor(own, device=device)
+        self._several = torch.as_tensor(np.flatnonzero(members[group] > 1), device=device)
+        self._members = torch.as_tensor(members[group], device=device).double()
+        super().__init__(
+            sp.csr_matrix(joined @ matrix @ joined.T),
+            free=torch.as_tensor(moves, device=device).unsqueeze(1),
+            dtype=dtype,
+        )
+
+    def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
+        """As of `Metric`; what holds one of a label holds all."""
+        return super().plus(self._gathered(springs))
+
+    def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 of each label's force together [m], the same move for all of it."""
+        return super().solve(self._gathered(force))[self._own]
+
+    def _gathered(self, values: Tensor) -> Tensor:
+        """The sum of each label's values at its first vertex."""
+        out, each = values.clone(), self._several
+        out[each] = 0.0
+        return add_at(out, self._own[each], values[each])
+
+    def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
+        """As of `Metric`; each vertex shows its share of the diagonal."""
+        super()._hold(stiffness)
+        self.diagonal = self.diagonal[self._own] / self._members
 
 
 class HostFactors:

@@ -29,7 +29,13 @@ def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int3
 
 @wp.func
 def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces."""
+    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces.
+
+    An end at a corner does not: cloth that is sewn together there meets, and rounding says on which side.
+    """
+    for i in range(3):
+        if x[e[0]] == x[t[i]] or x[e[1]] == x[t[i]]:
+            return False
     p, q, r = wide(x[t[0]]), wide(x[t[1]]), wide(x[t[2]])
     if volume(p, q, r, wide(x[e[0]])) * volume(p, q, r, wide(x[e[1]])) >= wp.float64(0.0):
         return False

@@ -330,3 +330,9 @@ def incidence(elements: np.ndarray, vertex_count: int) -> Incidence:
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     size = elements.shape[1]
     return Incidence(starts, order // np.int32(size), order % np.int32(size))
+
+
+def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
+    """The piece of each of some vertices, by the edges that hold them together, shape (V,)."""
+    graph = sparse.coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return csgraph.connected_components(graph, directed=False)[1]

@@ -1,0 +1,276 @@
+"""Seams: cloth cut along a line whose sides are at one place stays one cloth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from bodies import ball
+from cloth import FABRIC, base_of
+from folds import EDGE, Cloth, curved, fine, frame_with, levels_of, named, refiner_with, square, strip, view_of
+from shots import refine
+from test_cloth_mesh import everything, moved, reach
+
+from physgraph_usd.contact.settings import ContactSettings
+from physgraph_usd.forces import elastic_terms
+from physgraph_usd.forces.base import ForceModule
+from physgraph_usd.forces.seam import Seam, SewnForces
+from physgraph_usd.level import Level
+from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.scene import Garment
+
+SOFT = replace(FABRIC, shear=10.0)
+"""A fabric that also resists shear."""
+
+
+def cut(cloth: Cloth, sides: np.ndarray) -> tuple[Cloth, np.ndarray]:
+    """A mesh cut into panels, each face on the side of that number; also which vertex each vertex was."""
+    mesh, points = cloth
+    faces = mesh.indices.reshape(-1, 3)
+    key = sides[:, None] * len(points) + faces
+    number, again = np.unique(key, return_inverse=True)
+    source = number % len(points)
+    panels = PolygonMesh(np.full(len(faces), 3), again.reshape(-1), len(source))
+    return (panels, points[source]), source
+
+
+def panels(cloth: Cloth, count: int = 2) -> tuple[Cloth, np.ndarray]:
+    """A sheet cut across x into strips of faces."""
+    mesh, points = cloth
+    centre = points[mesh.indices.reshape(-1, 3)].mean(axis=1)[:, 0]
+    inner = np.quantile(np.unique(points[:, 0].round(9)), np.arange(1, count) / count, method="nearest")
+    return cut(cloth, np.searchsorted(inner, centre))
+
+
+def seam_of(level: Level, base: torch.Tensor) -> Seam:
+    """Every two vertices at one place."""
+    found = np.argwhere(np.triu((torch.cdist(base.double(), base.double()) < 1e-6).numpy(), 1))
+    return Seam(level, found)
+
+
+def two_halves(pin: bool = False) -> tuple[Level, Seam, torch.Tensor]:
+    """A sheet cut in two at its finest level, its seam, and its positions."""
+    cloth, _ = panels(square(4))
+    held = (cloth[1][:, 2] < -0.09) * 1.0 if pin else np.zeros(len(cloth[1]))
+    levels = levels_of(named(cloth, pin=held), dtype=torch.float64)
+    base = fine(levels, cloth[1])
+    return levels[-1], seam_of(levels[-1], base), base
+
+
+def noise(like: torch.Tensor, seed: int = 0) -> torch.Tensor:
+    """Normal numbers."""
+    return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=like.dtype)
+
+
+class TestSeam:
+    def test_closed_points_meet_at_their_mean(self):
+        _, seam, base = two_halves()
+        x = base + 1e-3 * noise(base)
+        out = seam.closed(x)
+        for a, b in seam.pairs:
+            torch.testing.assert_close(out[a], 0.5 * (x[a] + x[b]))
+            assert torch.equal(out[a], out[b])
+        away = torch.ones(len(x), dtype=torch.bool)
+        away[seam.pairs.reshape(-1)] = False
+        assert torch.equal(out[away], x[away])
+
+    def test_what_is_closed_stays_to_the_last_bit(self):
+        """Also where three meet: a third of the sum of three equal numbers is not always that number."""
+        levels = levels_of(*(named(square(2), name) for name in "ABC"))
+        level = levels[-1]
+        third = level.vertex_count // 3
+        groups = np.arange(third)[:, None] + third * np.arange(3)
+        seam = Seam(level, np.concatenate([groups[:, :2], groups[:, 1:]]))
+        out = seam.closed(level.rest + noise(level.rest))
+        assert torch.equal(out[:third], out[third : 2 * third])
+        assert torch.equal(out[:third], out[2 * third :])
+        assert torch.equal(seam.closed(out), out)
+
+    def test_what_may_not_move_draws_the_rest_to_it(self):
+        level, seam, base = two_halves()
+        held = level.free.clone()
+        first = torch.as_tensor(seam.pairs[:, 0])
+        held[first] = False
+        level = replace(level, pin=(~held[:, 0]).to(level.pin))
+        seam = Seam(level, seam.pairs)
+        x = base + 1e-3 * noise(base)
+        out = seam.closed(x)
+        assert torch.equal(out[first], x[first])
+        torch.testing.assert_close(out[seam.pairs[:, 1]], x[first], rtol=0, atol=1e-15)
+        assert not seam.shared(noise(x))[seam.pairs[:, 1]].any()
+
+
+class TestForces:
+    def sewn(self) -> tuple[SewnForces, ForceModule, Seam, torch.Tensor]:
+        level, seam, base = two_halves()
+        apart = ForceModule(elastic_terms(level, [SOFT], potential="continuum"))
+        return SewnForces(apart, seam), apart, seam, base + 2e-3 * noise(base)
+
+    def test_the_force_is_minus_the_gradient(self):
+        forces, _, seam, x = self.sewn()
+        force, way = forces.energy_and_force(x)[1], noise(x, 1)
+        step = 1e-6
+        rise = forces.energy_and_force(x + step * way)[0] - forces.energy_and_force(x - step * way)[0]
+        assert float(rise) / (2 * step) == pytest.approx(-float((force * way).sum()), rel=1e-6)
+        for a, b in seam.pairs:
+            assert torch.equal(force[a], force[b])
+
+    def test_opening_the_seam_changes_nothing(self):
+        forces, apart, seam, x = self.sewn()
+        x = seam.closed(x)
+        opened = x.clone()
+        way = 1e-3 * noise(x)[seam.pairs[:, 0]]
+        opened[seam.pairs[:, 0]] += way
+        opened[seam.pairs[:, 1]] -= way
+        (before, force), (after, same) = forces.energy_and_force(x), forces.energy_and_force(opened)
+        assert float(after) == pytest.approx(float(before), rel=1e-12)
+        torch.testing.assert_close(same, force, rtol=1e-9, atol=1e-12)
+        assert float(apart.energy_and_force(opened)[0]) != pytest.approx(float(before), rel=1e-3)
+
+    def test_the_diagonal_is_the_mean_of_what_is_sewn(self):
+        forces, apart, seam, x = self.sewn()
+        x = seam.closed(x)
+        own, sewn = apart.diagonal(x), forces.diagonal(x)
+        a, b = seam.pairs[0]
+        assert float(sewn[a]) == pytest.approx(float(0.5 * (own[a] + own[b])))
+        assert (sewn > 0).all()
+
+
+def stretched(points: np.ndarray) -> np.ndarray:
+    """Pulled along x, and bent to and fro within the plane."""
+    return points * [1.15, 1.0, 1.0] + 0.02 * np.sin(20.0 * points[:, :1]) * [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_cut_sheet_in_tension_is_the_whole_one(count: int):
+    """Held at both ends and pulled: a seam transmits what the cloth would, so the cut shows nowhere."""
+    whole = strip(8, 4)
+    pieces, source = panels(whole, count)
+    answers = []
+    for cloth in (whole, pieces):
+        x = cloth[1][:, 0]
+        pin = ((x < 0.01) | (x > x.max() - 0.01)) * 1.0
+        solver = refiner_with(
+            [named(cloth, pin=pin)], level=1, gravity=np.zeros(3), dtype=torch.float64, steps=400, tolerance=1e-8
+        )
+        frame = frame_with([stretched(cloth[1])], fabric=SOFT, guide=0.0)
+        answers.append((solver.solve(frame).points[0], base_of(cloth[0], cloth[1], 1)))
+    (one, rest), (other, places) = answers
+    same = np.linalg.norm(places[:, None] - rest, axis=2).argmin(axis=1)
+    assert len(source) > len(whole[1])
+    assert np.abs(one - base_of(whole[0], stretched(whole[1]), 1)).max() > 0.05 * EDGE
+    assert np.abs(other - one[same]).max() < 1e-4 * EDGE
+
+
+def gap_of(points: np.ndarray, places: np.ndarray) -> float:
+    """How far what is at one place in the cage is apart [m]."""
+    near = np.argwhere(np.triu(np.linalg.norm(places[:, None] - places, axis=2) < 1e-9, 1))
+    assert len(near)
+    return float(np.linalg.norm(points[near[:, 0]] - points[near[:, 1]], axis=1).max())
+
+
+@pytest.mark.parametrize("options", [{}, {"contact": ContactSettings(cloth="off")}, {"integrator": "physgraph"}])
+def test_seams_stay_closed_on_a_body(options: dict[str, Any]):
+    """A sheet of four panels sinks onto a ball that stands in it: closed, and as far outside as a whole one."""
+    cloth, _ = panels(square(8, edge=0.5 * EDGE), 4)
+    solver = refiner_with([named(cloth)], ["mesh"], times=(0.0, 1.0), **options)
+    for time in (0.0, 1.0):
+        cage = cloth[1] + [0.0, 0.058 - 0.004 * time, 0.0]
+        answer = solver.solve(frame_with([cage], ball(0.06, level=3), time=time))
+        assert gap_of(answer.points[0], base_of(cloth[0], cage, 1)) < 1e-7
+        after = next(iter(answer.telemetry[0]["contact"]["bodies"].values()))["after"]
+        assert after["inside"] == 0
+
+
+def test_a_box_of_sewn_faces_settles():
+    """A box whose faces are held together by seams alone, pressed: no part is pushed by the one it is sewn to."""
+    corner = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    points = 0.01 * np.concatenate([corner[list(side)] for side in sides])
+    mesh = PolygonMesh(np.full(6, 4), np.arange(24), 24)
+    pressed = points * [0.95, 0.9, 1.0] + [0.1, 0.0, 0.0] * points[:, 1:2]
+    solver = refiner_with([named((mesh, points))], level=4, steps=50)
+    answer = solver.solve(frame_with([pressed]))
+    assert answer.telemetry[0]["contact"]["cloth"]["after"]["crossings"] == 0
+    assert answer.telemetry[0]["levels"][-1]["remaining_move"] < 0.02
+    assert gap_of(answer.points[0], base_of(mesh, pressed, 4)) == 0.0
+
+
+class TestCloth:
+    def sewn(self) -> tuple[Garment, tuple[Level, ...], Seam, torch.Tensor]:
+        cloth, _ = panels(strip(8, 3))
+        garment = named(cloth)
+        levels = levels_of(garment)
+        base = fine(levels, curved(cloth[1], 2.0))
+        return garment, levels, seam_of(levels[-1], base), base
+
+    def test_what_is_sewn_is_no_pair_with_what_is_beside_it(self):
+        """Folded sharply along the seam, so that nothing is in one plane."""
+        cloth, _ = panels(strip(8, 3))
+        levels = levels_of(named(cloth))
+        level = levels[-1]
+        x = level.rest.clone()
+        middle = float(np.median(x[:, 0]))
+        x[:, 1] = 0.4 * (x[:, 0] - middle).abs()
+        seam = seam_of(level, level.rest)
+        mesh = moved(level, x)
+        loose = mesh.pairs(everything(level), reach(level))
+        mesh.sew(seam.pairs)
+        sewn = mesh.pairs(everything(level), reach(level))
+        beside = mesh.beside + mesh.beside.T
+
+        def joined(corners: np.ndarray) -> int:
+            return sum(bool(beside[a, b] or a == b) for four in corners for a in four[:1] for b in four[1:])
+
+        assert joined(loose.corners[loose.face].numpy()) > 0
+        assert joined(sewn.corners[sewn.face].numpy()) == 0
+
+    def test_rings_grow_across_seams_and_no_longer_when_they_are_gone(self):
+        _, levels, seam, base = self.sewn()
+        mesh = moved(levels[-1], base)
+        one = torch.zeros(len(base), dtype=torch.bool)
+        one[seam.pairs[0, 0]] = True
+        alone = mesh.grown(one, 2)
+        mesh.sew(seam.pairs)
+        assert bool(mesh.grown(one, 1)[seam.pairs[0, 1]])
+        assert int(mesh.grown(one, 2).sum()) > int(alone.sum())
+        assert len(np.unique(mesh.whole)) == 1
+        mesh.sew(np.zeros((0, 2), np.int64))
+        assert torch.equal(mesh.grown(one, 2), alone)
+        assert len(np.unique(mesh.whole)) == 2
+
+    def test_mended_cloth_stays_closed(self):
+        """Noise that crosses the cloth on both sides of its seam is mended; the seam is closed wherever it ends."""
+        garment, levels, seam, base = self.sewn()
+        view = view_of(levels, [garment], seam.closed(base), seam=seam)
+        x = seam.closed(base + 0.3 * EDGE * noise(base))
+        assert view.look(x).crossings.count > 0
+        mended = view.mend(x)
+        assert mended.crossings.count == 0
+        assert torch.equal(seam.closed(mended.x), mended.x)
+        assert bool((mended.x != x).any(dim=1)[seam.pairs.reshape(-1)].any())
+
+    def test_what_meets_at_a_corner_does_not_cross(self):
+        """Edges that begin at corners of faces they are sewn to: rounding puts them on either side, at any place."""
+        garment, levels, seam, base = self.sewn()
+        for seed in range(8):
+            turn = torch.linalg.qr(noise(torch.zeros((3, 3)), seed))[0]
+            x = seam.closed(base + 0.02 * EDGE * noise(base, seed)) @ turn + noise(torch.zeros(3), seed)
+            x = seam.closed(x)
+            assert view_of(levels, [garment], x).before.crossings.count == 0
+
+
+@pytest.mark.real_data
+def test_a_skinned_box_cut_at_its_edges(real_data: Path, tmp_path: Path):
+    """The stage that showed it: new crossings and a crease in each frame, where seams were springs."""
+    shot = real_data / "stages" / "usdskel" / "dqs.usda"
+    report = refine(shot, tmp_path / "fine.usdc", level=4, garments=["/Root/Mesh"])
+    found = [garment for frame in report.frames for garment in frame["garments"]]
+    assert len(found) == 30
+    for each in found:
+        assert each["contact"]["cloth"]["after"]["crossings"] == 0
+        assert each["strain"]["p99"] < 0.06
