@@ -1,8 +1,9 @@
 """Carries the detail of one frame to the next in the moving frames of the coarse surface, and tells when not to.
 
 Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame made of its normal
-and of a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface.
-Interpolated to the fine vertices, they take the detail along.
+and of a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface. What
+interpolates to the fine vertices is how frames have turned: tangents of neighbours may point anywhere, also against one
+another, and have no mean.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Carried:
 
     Attributes:
         coarse: Cage positions [m], world space.
-        detail: Fine positions minus the smooth base, in the moving frames [m], shape (V, 3).
+        detail: Fine positions minus the smooth base [m], shape (V, 3).
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
     """
 
@@ -111,10 +112,7 @@ class MovingFrames:
 
     def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> Carried:
         """Keep a solved frame's detail."""
-        frames = self.frames(coarse)
-        detail = fine - self._level.smooth_base.apply(coarse)
-        local = torch.einsum("vij,vi->vj", self._spread(frames), detail)
-        return Carried(coarse, local, frames)
+        return Carried(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
 
     def predict(
         self, kept: Carried, coarse: Float[Tensor, "coarse 3"]
@@ -125,7 +123,7 @@ class MovingFrames:
             Predicted fine positions [m], the RMS motion of the cage in mean cage edges, and its RMS turn [rad].
         """
         frames = self.frames(coarse)
-        moved = torch.einsum("vij,vj->vi", self._spread(frames), kept.detail)
+        moved = torch.einsum("vij,vj->vi", self._turned(kept.frames, frames), kept.detail)
         motion = float((coarse - kept.coarse).square().sum(dim=1).mean().sqrt()) / self._edge
         cosine = (torch.einsum("cij,cij->c", frames, kept.frames) - 1.0) / 2.0
         turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
@@ -141,11 +139,15 @@ class MovingFrames:
         smooth = self._level.smooth_base.apply(coarse)
         return torch.where(self._level.free, smooth + more * (fine - smooth), fine)
 
-    def _spread(self, frames: Float[Tensor, "coarse 3 3"]) -> Float[Tensor, "vertices 3 3"]:
-        """Interpolate cage frames to the fine vertices."""
-        base = self._level.base
-        tangent = base.apply(frames[:, :, 0].contiguous())
-        return _orthonormal(base.apply(frames[:, :, 2].contiguous()), tangent)
+    def _turned(
+        self, before: Float[Tensor, "coarse 3 3"], after: Float[Tensor, "coarse 3 3"]
+    ) -> Float[Tensor, "vertices 3 3"]:
+        """How cage frames have turned, interpolated to the fine vertices; not at all where either is no frame."""
+        turned = torch.einsum("cij,ckj->cik", after, before)
+        whole = (torch.linalg.det(turned) > 0.5).unsqueeze(1).unsqueeze(2)
+        turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
+        first, last = (self._level.base.apply(turned[:, :, column].contiguous()) for column in (0, 2))
+        return _orthonormal(last, first)
 
 
 def _orthonormal(normal: Tensor, tangent: Tensor) -> Tensor:

@@ -95,6 +95,22 @@ def test_bending_turns_detail_with_the_place_it_is_at():
     assert torch.allclose(bump[far], tensor(np.array([-0.01, 0.0, 0.0])), rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_small_turn_moves_no_detail_far(seed: int):
+    """Each vertex's first edge, and so its tangent, points anywhere: between two that oppose there is still a turn."""
+    rng = np.random.default_rng(seed)
+    rest = REST + 0.01 * rng.uniform(-1, 1, REST.shape) * [1, 1, 0]
+    faces = MESH.indices.reshape(-1, 3)[rng.permutation(len(MESH.indices) // 3)]
+    turned = [np.roll(face, turn).tolist() for face, turn in zip(faces, rng.integers(3, size=len(faces)), strict=True)]
+    group = group_of(mesh_of(turned), rest, level=2)
+    frames, finest = group._frames, group.levels[-1]
+    before, after = tensor(wave(rest, height=0.02)), tensor(wave(rest, height=0.022))
+    detail = 0.01 * tensor(rng.normal(size=(finest.vertex_count, 3)))
+    kept = frames.store(before, finest.smooth_base.apply(before) + detail)
+    moved = frames.predict(kept, after)[0] - finest.smooth_base.apply(after) - detail
+    assert 0.01 < float((moved.norm(dim=1) / detail.norm(dim=1)).max()) < 0.06
+
+
 def test_stretching_does_not_stretch_detail():
     coarse = tensor(REST)
     x, kept = stored(coarse)

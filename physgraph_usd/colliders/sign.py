@@ -18,8 +18,19 @@ from .base import Nearest, Surface
 
 LEAST_REACH = 1e-3
 """Distance within which closest points are always asked for [m]."""
-MARGIN = 1.001
-"""Distances are float32: a segment counts as clear of the surface with this to spare."""
+MARGIN, ROUNDING = 1.001, 1e-6
+"""Distances are float32: a segment counts as clear of the surface with so many times its length, and so many metres, to
+spare."""
+
+
+def is_clear(distance: Float[Tensor, " segments"], length: Float[Tensor, " segments"]) -> Bool[Tensor, " segments"]:
+    """Whether segments are too short to pass through a surface.
+
+    Args:
+        distance: Distances of both ends to it together [m].
+        length: Their lengths [m].
+    """
+    return distance > MARGIN * length + ROUNDING
 
 
 def signed_distances(
@@ -74,7 +85,7 @@ def _sides(
     """
     ends = edges.long()
     length = (x[ends[:, 0]] - x[ends[:, 1]]).norm(dim=1)
-    clear = ends[distance[ends].sum(dim=1) > MARGIN * length]
+    clear = ends[is_clear(distance[ends].sum(dim=1), length)]
     side = torch.ones(len(x), dtype=x.dtype, device=x.device)
     side[near] = told
     settled = torch.zeros(len(x), dtype=torch.bool, device=x.device)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
-from ..colliders.sign import MARGIN, behind
+from ..colliders.sign import MARGIN, behind, is_clear
 from ..level import Level
 from .measure import Pierced, pierced, pinched
 
@@ -99,7 +99,7 @@ class Track:
         if self.surface.certain:
             return found.side
         known = torch.where(self.known[which] < 0, -torch.ones_like(moved), torch.ones_like(moved))
-        may_have_crossed = self.known[which].abs() + found.distance <= MARGIN * moved
+        may_have_crossed = ~is_clear(self.known[which].abs() + found.distance, moved)
         sign = torch.where(may_have_crossed & (found.side != 0), found.side, known)
         ask = may_have_crossed & (found.side == 0)
         if bool(ask.any()):
