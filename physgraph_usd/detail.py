@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -82,8 +83,15 @@ class Solved:
 
     points: list[np.ndarray]
     carried: Carried
-    telemetry: dict[str, object]
+    telemetry: dict[str, Any]
     crossing: list[np.ndarray]
+
+    @property
+    def crossings(self) -> tuple[int, int]:
+        """How many edges pass through cloth, in the upsampled input and in the result."""
+        cloth = self.telemetry.get("contact", {}).get("cloth", {})
+        before, after = (cloth.get(which, {}).get("crossings", 0) for which in ("before", "after"))
+        return before, after
 
 
 class MovingFrames:

@@ -111,10 +111,14 @@ class Group:
             SolveError: A term of the potential is not finite.
         """
         solved, strain = self._attempt(frames, kept, at, touching)
-        if solved.telemetry["start"] == "warm" and strain > TORN:
-            solved, _ = self._attempt(frames, None, at, touching)
-            solved.telemetry["start"] = f"cold: the last frame's detail tore the cloth, straining it by {strain:.3g}"
-        return solved
+        before, after = solved.crossings if self._settings.contact.cloth != "off" else (0, 0)
+        if solved.telemetry["start"] != "warm" or (strain <= TORN and after <= before):
+            return solved
+        torn = f"tore the cloth, straining it by {strain:.3g}"
+        why = torn if strain > TORN else f"made {after} edges cross, {before} in the input"
+        cold, _ = self._attempt(frames, None, at, touching)
+        cold.telemetry["start"] = f"cold: the last frame's detail {why}"
+        return cold if strain > TORN or cold.crossings[1] < after else solved
 
     def _attempt(
         self, frames: Sequence[GarmentFrame], kept: Carried | None, at: float | None, touching: Sequence[Touching]
@@ -301,30 +305,30 @@ class Group:
         *,
         contact: FrameContact | None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
-        """Walk the levels; a warm start goes straight to the finest. Also says why, where there was a choice."""
-        choice = self._choose(forces[0], coarse, contact, warm=predicted is not None)
-        first = 0 if choice.nested else len(self.levels) - 1
-        x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
+        """Walk the levels; a warm start goes straight to the finest, but where it crosses itself.
+
+        Also says why, where there was a choice.
+        """
+        choice, last = self._choose(forces[0], coarse, contact, warm=predicted is not None), len(self.levels) - 1
+        tangled = predicted is not None and contact is not None and contact.tangles(predicted)
+        first = 0 if choice.nested or tangled else last
+        x = predicted if predicted is not None and not tangled else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
         module = ForceModule(())
-        for index in range(first, len(self.levels)):
+        for index in range(first, last + 1):
             level, lasting = self.levels[index], forces[index]
             if index > first and level.from_below is not None:
                 x = level.from_below.apply(x)
+            if index == last and tangled and predicted is not None and contact is not None:
+                predicted = x = contact.mixed(predicted, x)
             module = lasting.module(coarse)
-            tie = None
-            if predicted is not None and self._settings.temporal == "tether":
-                tie = (self._settings.tether, predicted)
-            budget = self._settings.budget(len(self.levels) - 1 - index, clock, more=choice.steps)
+            warm = predicted if index == last else None
+            tie = None if warm is None or self._settings.temporal != "tether" else (self._settings.tether, warm)
+            budget = self._settings.budget(last - index, clock, more=choice.steps)
             view = None if contact is None else contact.at(level)
-            cold = predicted is None
-            if self._systems_last:
-                alone = lasting.lasting_system(coarse, tie)
-            else:
-                terms = module if tie is None else ForceModule((*module.forces, lasting.tether(*tie)))
-                alone = System(terms, lasting.metric, free=level.free, spacing=level.spacing, level=level)
-            x, made, touched = self._solve_level(alone, level, x=x, cold=cold, view=view, budget=budget)
-            if index < len(self.levels) - 1:
+            alone = (lasting.lasting_system if self._systems_last else lasting.system)(coarse, tie)
+            x, made, touched = self._solve_level(alone, level, x=x, cold=warm is None, view=view, budget=budget)
+            if index < last:
                 made[-1].energies = module.energies(x)
             reports += made
             module = ForceModule((*module.forces, *touched))

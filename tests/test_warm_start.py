@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from cloth import frame_of, group_of, sheet, wave
+from folds import EDGE, levels_of, named, square
 
+from physgraph_usd.contact.cloth import ClothContact
+from physgraph_usd.contact.frame import FrameContact
+from physgraph_usd.contact.settings import ContactSettings
+from physgraph_usd.detail import Carried, Solved
 from physgraph_usd.group import Group
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.pipeline import Refiner
 from physgraph_usd.resolution import edge_strain
+from physgraph_usd.samples import write_sample
+from physgraph_usd.usd.reader import open_shot
 
 MESH, REST = sheet(8, 6)
 
@@ -46,3 +57,77 @@ def test_detail_that_tears_the_cloth_is_not_carried(strain: float, squeeze: floa
     assert here == pytest.approx(strain, rel=0.02)
     assert found.startswith(start), found
     assert ("carried detail strains the cloth" in found) == (start == "cold")
+
+
+@pytest.mark.parametrize(
+    ("warm", "cold", "cloth", "taken"),
+    [(12, 8, "pairs", "cold"), (12, 15, "pairs", "warm"), (10, 0, "pairs", "warm"), (12, 8, "off", "warm")],
+)
+def test_a_frame_that_crosses_more_than_its_input_is_solved_again_from_cold(
+    monkeypatch: pytest.MonkeyPatch, warm: int, cold: int, cloth: str, taken: str
+):
+    """Whichever crosses less is taken; what is only measured is no reason."""
+    group, frames = group_of(MESH, REST, level=1), list(frame_of(wave(REST)).garments)
+    group.use(replace(group._settings, contact=ContactSettings(cloth=cloth)))
+    carried, asked = group.solve(frames, None, at=None).carried, list[str]()
+
+    def attempt(frames: object, kept: Carried | None, at: object, touching: object) -> tuple[Solved, float]:
+        asked.append("cold" if kept is None else "warm")
+        counts = {"before": {"crossings": 10}, "after": {"crossings": cold if kept is None else warm}}
+        return Solved([], carried, {"start": asked[-1], "contact": {"cloth": counts}}, []), 0.1
+
+    monkeypatch.setattr(group, "_attempt", attempt)
+    solved = group.solve(frames, carried, at=None)
+    assert solved.crossings == (10, warm if taken == "warm" else cold)
+    assert asked == (["warm"] if warm <= 10 or cloth == "off" else ["warm", "cold"])
+    if taken == "cold":
+        assert solved.telemetry["start"] == "cold: the last frame's detail made 12 edges cross, 10 in the input"
+
+
+class TestTangledStart:
+    """A warm start that crosses itself."""
+
+    def test_starts_anew_round_what_crosses_and_nowhere_else(self):
+        """Two sheets: a corner of the upper one's carried detail hangs through the lower one."""
+        garments = [named(square(8), "A"), named(square(8), "B")]
+        levels = levels_of(*garments)
+        level, cage = levels[-1], levels[0].rest.clone()
+        cage[len(cage) // 2 :, 1] += 0.004
+        contact = FrameContact(
+            levels,
+            cage,
+            bodies=None,
+            cloth=ClothContact(levels, garments),
+            thickness=[0.001, 0.001],
+            settings=ContactSettings(cloth_stiffness=1e5),
+        )
+        cold = level.base.apply(cage) + torch.tensor([0.0, 0.0, 0.001])
+        plain = level.base.apply(cage)
+        assert not contact.tangles(plain)
+        hung = plain.clone()
+        corner = (plain[:, 0] > 0.17) & (plain[:, 2] > 0.17) & (level.vertex_garment == 1)
+        hung[corner, 1] -= 0.008
+        assert contact.tangles(hung)
+        mixed = contact.mixed(hung, cold)
+        assert not contact.tangles(mixed)
+        far = (hung[:, [0, 2]] - 0.2).norm(dim=1) > 2.0 * 8 * 0.5 * EDGE
+        assert torch.equal(mixed[far], hung[far])
+        assert torch.equal(mixed[corner], cold[corner])
+        assert 0 < int(far.sum()) < len(far)
+
+    def test_of_a_shot_goes_through_the_levels(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        """Two frames of the T-shirt whose cages cross themselves; from the last detail alone they stay crossed."""
+        shot = open_shot(str(write_sample("tshirt", tmp_path)))
+
+        def left() -> tuple[list[str], list[int]]:
+            refiner = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[2])
+            told: list[Any] = [refiner.solve(shot.frame(float(time))).telemetry[0] for time in range(7, 10)]
+            starts = [str(each["start"]) + str(sorted({level["level"] for level in each["levels"]})) for each in told]
+            return starts[2:], [each["contact"]["cloth"]["after"]["crossings"] for each in told[1:]]
+
+        starts, crossing = left()
+        assert starts == ["warm[0, 1, 2]"] * 2
+        monkeypatch.setattr(FrameContact, "tangles", lambda *_: False)
+        starts, more = left()
+        assert starts == ["warm[2]"] * 2
+        assert sum(crossing) < 0.2 * sum(more)

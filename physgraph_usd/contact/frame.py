@@ -31,6 +31,8 @@ SQUEEZED = 2.0
 """Distance to which cloth is moved apart then, in thicknesses: what bodies push moves faces, whose middles sag."""
 HOLDS = 6
 """How often more of what is between overlapping parts of a body is left there, while pushing it out makes it cross."""
+MIXED = 4
+"""Rings round what crosses in a warm start that start from the coarse levels instead; it fades over as many more."""
 Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
 
@@ -175,6 +177,20 @@ class FrameContact:
         if term is None or view.cloth is None:
             return 0.0
         return 1.0 if view.cloth.tangled else float(term.near(finest).to(base).mean())
+
+    def tangles(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """Whether the finest level's cloth crosses itself at x [m]."""
+        cloth = self.at(self._levels[-1]).cloth
+        return cloth is not None and cloth.look(x).crossings.count > 0
+
+    def mixed(self, x: Float[Tensor, "vertices 3"], other: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions of the finest level [m], and other ones round what crosses there."""
+        cloth = self.at(self._levels[-1]).cloth
+        if cloth is None:
+            return x
+        return cloth.closed(
+            returned(self._cloth_mesh, x, other, where=cloth.round_crossings(x, rings=MIXED), rings=MIXED)
+        )
 
     def forget(self) -> None:
         """Look at the finest level as if it had never been looked at: its cloth keeps the sides that it sees first."""
