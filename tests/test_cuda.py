@@ -23,6 +23,7 @@ from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
 from physgraph_usd.integrate.paper_network import PaperConfig, PaperNetwork, has_triton
 from physgraph_usd.integrate.weights import random_network, shipped_network
 from physgraph_usd.level import refine_garments
+from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.samples import write_sample
 from physgraph_usd.scene import GarmentFrame
 
@@ -108,6 +109,26 @@ def test_the_papers_step_is_the_same_by_its_kernel(latent: int, monkeypatch: pyt
     plain = paper.propose(system, carry)
     assert torch.equal(fused, again)
     assert 0.0 < float((fused - plain).norm()) < 3e-3 * float(plain.norm())
+
+
+def test_sewn_cloth_agrees_and_repeats() -> None:
+    """A box of faces that only its seams hold together, pressed."""
+    corner = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    points, mesh = (
+        0.05 * np.concatenate([corner[list(side)] for side in sides]),
+        PolygonMesh([4] * 6, np.arange(24), 24),
+    )
+    garments, frames = [garment_of(mesh, points)], frame_of(points * [0.95, 0.9, 1.0]).garments
+    chains, down, answers = refine_garments(garments, [4]), np.array([0.0, -9.81, 0.0]), []
+    for device in ("cpu", "cuda", "cuda"):
+        one = Group(garments, chains, down, settings_of(steps=60), dtype=torch.float32, device=device)
+        answers.append(one.solve(frames, None, at=None))
+    assert answers[0].crossings == answers[1].crossings == (0, 0)
+    assert np.abs(answers[1].points[0] - answers[0].points[0]).max() < 1e-3 * 0.05
+    assert np.array_equal(answers[1].points[0], answers[2].points[0])
+    sewn = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points, axis=2) < 1e-9, 1))
+    assert np.array_equal(answers[1].points[0][sewn[:, 0]], answers[1].points[0][sewn[:, 1]])
 
 
 def test_a_metric_with_springs_agrees() -> None:

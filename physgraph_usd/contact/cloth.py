@@ -7,7 +7,6 @@ report's measure says so.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -129,7 +128,6 @@ class ClothView:
     Attributes:
         tangled: Whether anything crossed where the term was asked for last.
         allowed: What may cross in the end: the input, where another cage is followed; else None.
-        spared: Whether mending strains the cloth no more than a little.
     """
 
     def __init__(
@@ -162,7 +160,6 @@ class ClothView:
         self._looked: ClothState | None = None
         self.tangled = False
         self.allowed: ClothState | None = None
-        self.spared = True
         self._reach = float(thickness.max()) + (AHEAD if level.index else 1.0) * float(level.spacing.mean())
 
     @cached_property
@@ -269,7 +266,7 @@ class ClothView:
             return state
         good = good or self.before
         zone = self._mesh.grown(self._mesh.crossed(good.crossings), ZONE)
-        shift, most = x - good.x, self.most_strain(x) if self.spared else math.inf
+        shift, most = x - good.x, self.most_strain(x)
         least = self._rank(best, good, most)
         for attempt in range(MENDS):
             corners = self._mesh.corners_of(state.crossings)

@@ -228,20 +228,17 @@ class FrameContact:
         return x, mended, moved
 
     def _mended(self, view: LevelContact, solved: Tensor) -> tuple[Tensor, Tensor, int]:
-        """Cloth before and after bodies pushed what was mended, and their passes; taut cloth only where it must be."""
-        mended, x, passes, cloth, bodies = solved, solved, 0, view.cloth, view.bodies
-        for spared in (True, False):
-            if cloth is not None:
-                cloth.spared = spared
-                mended = x = cloth.mend(solved).x
-            if bodies is not None:
-                self._hold(bodies, None)
-                x, passes = bodies.project(mended)
-                if cloth is not None and cloth.look(x).crossings.count:
-                    x = self._least_crossed(cloth, bodies, mended, x)
-            if cloth is None or not cloth.worse(x):
-                return mended, x, passes
-        assert cloth is not None
+        """Cloth before and after bodies pushed what was mended, and their passes."""
+        cloth, bodies = view.cloth, view.bodies
+        mended = solved if cloth is None else cloth.mend(solved).x
+        x, passes = mended, 0
+        if bodies is not None:
+            self._hold(bodies, None)
+            x, passes = bodies.project(mended)
+            if cloth is not None and cloth.look(x).crossings.count:
+                x = self._least_crossed(cloth, bodies, mended, x)
+        if cloth is None or not cloth.worse(x):
+            return mended, x, passes
         return mended, self._not_worse(cloth, bodies, mended, x), passes
 
     def _least_crossed(self, cloth: ClothView, bodies: LevelBodies, mended: Tensor, x: Tensor) -> Tensor:
