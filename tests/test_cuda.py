@@ -117,7 +117,7 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     points, mesh = (
         0.05 * np.concatenate([corner[list(side)] for side in sides]),
-        PolygonMesh([4] * 6, np.arange(24), 24),
+        PolygonMesh(np.full(6, 4), np.arange(24), 24),
     )
     garments, frames = [garment_of(mesh, points)], frame_of(points * [0.95, 0.9, 1.0]).garments
     chains, down, answers = refine_garments(garments, [4]), np.array([0.0, -9.81, 0.0]), []
