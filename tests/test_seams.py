@@ -15,6 +15,9 @@ from folds import EDGE, Cloth, curved, fine, frame_with, levels_of, named, refin
 from shots import refine
 from test_cloth_mesh import everything, moved, reach
 
+from physgraph_usd.contact.cloth import ClothContact
+from physgraph_usd.contact.frame import FrameContact
+from physgraph_usd.contact.seams import Seams
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.forces import elastic_terms
 from physgraph_usd.forces.base import ForceModule
@@ -253,6 +256,32 @@ class TestCloth:
         assert mended.crossings.count == 0
         assert torch.equal(seam.closed(mended.x), mended.x)
         assert bool((mended.x != x).any(dim=1)[seam.pairs.reshape(-1)].any())
+
+    def test_what_opens_at_a_seam_is_closed_before_it_is_looked_for_crossings(self):
+        """The last frame's detail, carried panel by panel: the end of one hangs through the other."""
+        cloth, _ = panels(strip(8, 3))
+        garment = named(cloth)
+        levels = levels_of(garment)
+        middle = float(np.median(cloth[1][:, 0]))
+        bent = torch.as_tensor(cloth[1], dtype=torch.float32)
+        bent[:, 1] = 0.4 * (bent[:, 0] - middle).abs()
+        contact = FrameContact(
+            levels,
+            bent,
+            bodies=None,
+            cloth=ClothContact(levels, [garment]),
+            thickness=[0.001],
+            settings=ContactSettings(cloth_stiffness=1e5),
+            seams=Seams.find(levels[0], bent),
+        )
+        base = levels[-1].base.apply(bent)
+        x, first = base.clone(), torch.as_tensor(seam_of(levels[-1], base).pairs[:, 0])
+        x[first] += 0.5 * EDGE * torch.tensor([0.3, 0.05, 0.0])
+        view = contact.at(levels[-1]).cloth
+        assert view is not None
+        assert view.look(x).crossings.count > 0
+        assert not contact.tangles(x)
+        assert torch.equal(contact.mixed(x, base), contact.at(levels[-1]).closed(x))
 
     def test_what_meets_at_a_corner_does_not_cross(self):
         """Edges that begin at corners of faces they are sewn to: rounding puts them on either side, at any place."""

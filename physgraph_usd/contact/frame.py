@@ -181,16 +181,16 @@ class FrameContact:
     def tangles(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether the finest level's cloth crosses itself at x [m]."""
         cloth = self.at(self._levels[-1]).cloth
-        return cloth is not None and cloth.look(x).crossings.count > 0
+        return cloth is not None and cloth.look(cloth.closed(x)).crossings.count > 0
 
     def mixed(self, x: Float[Tensor, "vertices 3"], other: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions of the finest level [m], and other ones round what crosses there."""
         cloth = self.at(self._levels[-1]).cloth
         if cloth is None:
             return x
-        return cloth.closed(
-            returned(self._cloth_mesh, x, other, where=cloth.round_crossings(x, rings=MIXED), rings=MIXED)
-        )
+        x = cloth.closed(x)
+        near = cloth.round_crossings(x, rings=MIXED)
+        return cloth.closed(returned(self._cloth_mesh, x, other, where=near, rings=MIXED))
 
     def forget(self) -> None:
         """Look at the finest level as if it had never been looked at: its cloth keeps the sides that it sees first."""
