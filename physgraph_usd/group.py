@@ -310,7 +310,7 @@ class Group:
         Also says why, where there was a choice.
         """
         choice, last = self._choose(forces[0], coarse, contact, warm=predicted is not None), len(self.levels) - 1
-        tangled = predicted is not None and contact is not None and contact.tangles(predicted)
+        tangled = predicted is not None and contact is not None and contact.crossed and contact.tangles(predicted)
         first = 0 if choice.nested or tangled else last
         x = predicted if predicted is not None and not tangled else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
