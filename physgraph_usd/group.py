@@ -112,7 +112,7 @@ class Group:
         """
         solved, strain = self._attempt(frames, kept, at, touching)
         before, after = solved.crossings if self._settings.contact.cloth != "off" else (0, 0)
-        if solved.telemetry["start"] != "warm" or (strain <= TORN and after <= before):
+        if not solved.telemetry["start"].startswith("warm") or (strain <= TORN and after <= before):
             return solved
         torn = f"tore the cloth, straining it by {strain:.3g}"
         why = torn if strain > TORN else f"made {after} edges cross, {before} in the input"
@@ -132,7 +132,7 @@ class Group:
         aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            x, reports, module, chosen = self._descend(forces, aim, predicted, clock, contact=contact)
+            x, reports, module, told = self._descend(forces, aim, predicted, clock, contact=contact)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
@@ -145,7 +145,7 @@ class Group:
         solved = time.perf_counter()
         carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world))
         strain = edge_strain(self.levels[-1], result)
-        telemetry = self._telemetry(module, result, coarse, reports) | chosen | {"strain": strain, "start": start}
+        telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start} | told
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
         measured, crossing = ({}, None) if judge is None else judge.measure(result)
         if measured:
@@ -305,10 +305,7 @@ class Group:
         *,
         contact: FrameContact | None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
-        """Walk the levels; a warm start goes straight to the finest, but where it crosses itself.
-
-        Also says why, where there was a choice.
-        """
+        """Walk the levels; a warm start goes to the finest, but where it is tangled. Also says why, for the report."""
         choice, last = self._choose(forces[0], coarse, contact, warm=predicted is not None), len(self.levels) - 1
         tangled = predicted is not None and contact is not None and contact.crossed and contact.tangles(predicted)
         first = 0 if choice.nested or tangled else last
@@ -326,13 +323,14 @@ class Group:
             tie = None if warm is None or self._settings.temporal != "tether" else (self._settings.tether, warm)
             budget = self._settings.budget(last - index, clock, more=choice.steps)
             view = None if contact is None else contact.at(level)
-            alone = (lasting.lasting_system if self._systems_last else lasting.system)(coarse, tie)
+            alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
             x, made, touched = self._solve_level(alone, level, x=x, cold=warm is None, view=view, budget=budget)
             if index < last:
                 made[-1].energies = module.energies(x)
             reports += made
             module = ForceModule((*module.forces, *touched))
-        return x, reports, module, {"chosen": choice.reason} if choice.reason else {}
+        told: dict[str, object] = {"start": "warm: from the coarse levels round what crossed"} if tangled else {}
+        return x, reports, module, told | ({"chosen": choice.reason} if choice.reason else {})
 
     def _choose(self, cage: LevelForces, coarse: Tensor, contact: FrameContact | None, *, warm: bool) -> Choice:
         """Which levels a frame is solved at, and the integrator, which is made ready."""

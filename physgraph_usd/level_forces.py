@@ -46,11 +46,8 @@ class LevelForces:
         """All terms of one frame, given its recentred coarse positions [m]."""
         return ForceModule((*self.elastic, *self.body, self.guide.retarget(coarse)))
 
-    def system(
-        self, coarse: Float[Tensor, "coarse 3"], tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None
-    ) -> System:
-        """The system of a frame in which nothing touches; arguments as for `lasting_system`."""
-        module = self.module(coarse)
+    def system(self, module: ForceModule, tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None) -> System:
+        """The system of a frame in which nothing touches, given its terms; the tie as for `lasting_system`."""
         field = module if tie is None else ForceModule((*module.forces, self.tether(*tie)))
         return System(field, self.metric, free=self.level.free, spacing=self.level.spacing, level=self.level)
 

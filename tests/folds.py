@@ -14,6 +14,8 @@ from sheets import garment_of
 
 from physgraph_usd.colliders.pose import Collider, MeshPose, Pose
 from physgraph_usd.contact.cloth import ClothContact, ClothView
+from physgraph_usd.contact.frame import FrameContact
+from physgraph_usd.contact.seams import Seams
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.forces.seam import Seam
@@ -125,6 +127,22 @@ def view_of(
     each = torch.full((len(garments),), thickness, dtype=base.dtype)
     settings = ContactSettings(cloth=form, cloth_stiffness=stiffness)
     return ClothView(lasting, levels[-1], base, thickness=each, settings=settings, seam=seam)
+
+
+def contact_of(
+    levels: Sequence[Level], garments: Sequence[Garment], cage: torch.Tensor, *, stiffness: float | None = None
+) -> FrameContact:
+    """Cloth that may touch cloth in a frame without bodies, and its seams."""
+    settings = ContactSettings() if stiffness is None else ContactSettings(cloth_stiffness=stiffness)
+    return FrameContact(
+        levels,
+        cage,
+        bodies=None,
+        cloth=ClothContact(levels, garments),
+        thickness=[0.001] * len(garments),
+        settings=settings,
+        seams=Seams.find(levels[0], cage),
+    )
 
 
 def refiner_with(

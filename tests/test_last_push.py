@@ -9,14 +9,11 @@ import pytest
 import torch
 from bodies import ball, box, surfaces, together
 from brute import Soup, crossings
-from folds import EDGE, frame_with, levels_of, named, refiner_with, square
+from folds import EDGE, contact_of, frame_with, levels_of, named, refiner_with, square
 from test_untangle import BOTH, UPPER
 
-from physgraph_usd.contact.cloth import ClothContact
 from physgraph_usd.contact.cloth_mesh import ClothMesh
-from physgraph_usd.contact.frame import FrameContact
 from physgraph_usd.contact.measure import depths, pinched
-from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.contact.squeeze import squeezed
 
 GAP = 0.002
@@ -110,14 +107,7 @@ class TestLastResort:
         garments = [named(square(4), each) for each in "AB"]
         levels, cage = levels_of(*garments, dtype=torch.float64), _cage(name)
         base = levels[-1].base.apply(cage)
-        contact = FrameContact(
-            levels,
-            cage,
-            bodies=None,
-            cloth=ClothContact(levels, garments),
-            thickness=[0.001, 0.001],
-            settings=ContactSettings(),
-        )
+        contact = contact_of(levels, garments, cage)
         noise = torch.as_tensor(np.random.default_rng(4).normal(size=(len(base), 3))) * size * EDGE
         out, _, _ = contact.finish(base + noise)
         told: Any = contact.measure(out)[0]["cloth"]

@@ -11,13 +11,23 @@ import pytest
 import torch
 from bodies import ball
 from cloth import FABRIC, base_of
-from folds import EDGE, Cloth, curved, fine, frame_with, levels_of, named, refiner_with, square, strip, view_of
+from folds import (
+    EDGE,
+    Cloth,
+    contact_of,
+    curved,
+    fine,
+    frame_with,
+    levels_of,
+    named,
+    refiner_with,
+    square,
+    strip,
+    view_of,
+)
 from shots import refine
 from test_cloth_mesh import everything, moved, reach
 
-from physgraph_usd.contact.cloth import ClothContact
-from physgraph_usd.contact.frame import FrameContact
-from physgraph_usd.contact.seams import Seams
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.forces import elastic_terms
 from physgraph_usd.forces.base import ForceModule
@@ -265,15 +275,7 @@ class TestCloth:
         middle = float(np.median(cloth[1][:, 0]))
         bent = torch.as_tensor(cloth[1], dtype=torch.float32)
         bent[:, 1] = 0.4 * (bent[:, 0] - middle).abs()
-        contact = FrameContact(
-            levels,
-            bent,
-            bodies=None,
-            cloth=ClothContact(levels, [garment]),
-            thickness=[0.001],
-            settings=ContactSettings(cloth_stiffness=1e5),
-            seams=Seams.find(levels[0], bent),
-        )
+        contact = contact_of(levels, [garment], bent, stiffness=1e5)
         base = levels[-1].base.apply(bent)
         x, first = base.clone(), torch.as_tensor(seam_of(levels[-1], base).pairs[:, 0])
         x[first] += 0.5 * EDGE * torch.tensor([0.3, 0.05, 0.0])

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 from cloth import frame_of, group_of, sheet, wave
-from folds import EDGE, levels_of, named, square
+from folds import EDGE, contact_of, levels_of, named, square
 
-from physgraph_usd.contact.cloth import ClothContact
 from physgraph_usd.contact.frame import FrameContact
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.detail import Carried, Solved
@@ -93,14 +92,7 @@ class TestTangledStart:
         levels = levels_of(*garments)
         level, cage = levels[-1], levels[0].rest.clone()
         cage[len(cage) // 2 :, 1] += 0.004
-        contact = FrameContact(
-            levels,
-            cage,
-            bodies=None,
-            cloth=ClothContact(levels, garments),
-            thickness=[0.001, 0.001],
-            settings=ContactSettings(cloth_stiffness=1e5),
-        )
+        contact = contact_of(levels, garments, cage, stiffness=1e5)
         cold = level.base.apply(cage) + torch.tensor([0.0, 0.0, 0.001])
         plain = level.base.apply(cage)
         assert not contact.tangles(plain)
@@ -126,7 +118,7 @@ class TestTangledStart:
             return starts[1:], [each["contact"]["cloth"]["after"]["crossings"] for each in told[1:]]
 
         starts, crossing = left()
-        assert starts == ["warm[0, 1, 2]"] * 2
+        assert starts == ["warm: from the coarse levels round what crossed[0, 1, 2]"] * 2
         monkeypatch.setattr(FrameContact, "tangles", lambda *_: False)
         starts, more = left()
         assert starts == ["warm[2]"] * 2
