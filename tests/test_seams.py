@@ -199,6 +199,18 @@ def test_seams_stay_closed_on_a_body(options: dict[str, Any]):
         assert after["inside"] == 0
 
 
+def test_what_bodies_push_out_is_closed():
+    """A face beside a seam that a body's corner comes through is lifted on its own side: that opens the seam."""
+    level, seam, base = two_halves()
+    bodies = LevelBodies(level, (), ContactSettings())
+    opened = base + 1e-3 * noise(base)
+    assert not torch.equal(seam.closed(opened), opened)
+    assert bodies.project(opened)[0] is opened
+    bodies.seam = seam
+    for out in (bodies.project(opened)[0], bodies.push_out(opened)):
+        assert torch.equal(out, seam.closed(opened))
+
+
 def test_a_box_of_sewn_faces_settles():
     """A box whose faces are held together by seams alone, pressed: no part is pushed by the one it is sewn to."""
     corner = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
