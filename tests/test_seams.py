@@ -28,6 +28,7 @@ from folds import (
 from shots import refine
 from test_cloth_mesh import everything, moved, reach
 
+from physgraph_usd.contact.bodies import LevelBodies
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.forces import elastic_terms
 from physgraph_usd.forces.base import ForceModule
