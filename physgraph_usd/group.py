@@ -373,7 +373,7 @@ class Group:
                 return alone
             assert isinstance(alone.field, ForceModule)
             assert isinstance(alone.metric, Metric)
-            field = ForceModule((*alone.field.forces, *touched))
+            field = alone.field.joined_by(touched)
             field = field if view.seam is None else SewnForces(field, view.seam)
             held = view.metric(alone.metric, touched, at)
             return System(field, held, free=level.free, spacing=level.spacing, level=level)

@@ -48,7 +48,8 @@ class LevelForces:
 
     def system(self, module: ForceModule, tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None) -> System:
         """The system of a frame in which nothing touches, given its terms; the tie as for `lasting_system`."""
-        field = module if tie is None else ForceModule((*module.forces, self.tether(*tie)))
+        forces = module.forces if tie is None else (*module.forces, self.tether(*tie))
+        field = ForceModule(forces, remembers=True)
         return System(field, self.metric, free=self.level.free, spacing=self.level.spacing, level=self.level)
 
     def lasting_system(

@@ -42,6 +42,26 @@ class Force(Protocol):
         ...
 
 
+class _Last:
+    """What a module's own terms answered last, on the CPU: on CUDA recorded steps write into tensors unseen."""
+
+    def __init__(self) -> None:
+        """Nothing was asked yet."""
+        self._asked: tuple[Tensor, int] | None = None
+        self._answer: tuple[Tensor, Tensor] | None = None
+
+    def recall(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Energy and force, to be written to, if they are those at x."""
+        if self._answer is None or self._asked is None or self._asked[0] is not x or self._asked[1] != x._version:
+            return None
+        return self._answer[0], self._answer[1].clone()
+
+    def keep(self, x: Tensor, energy: Tensor, force: Tensor) -> None:
+        """Remember an answer."""
+        if not x.is_cuda:
+            self._asked, self._answer = (x, x._version), (energy, force.clone())
+
+
 class ForceModule:
     """The sum of the terms that one frame needs.
 
@@ -49,15 +69,37 @@ class ForceModule:
         forces: The terms, in order.
     """
 
-    def __init__(self, forces: Sequence[Force]) -> None:
-        """Keep the terms in order; the order fixes the rounding of their sum."""
+    def __init__(self, forces: Sequence[Force], *, remembers: bool = False) -> None:
+        """Keep the terms in order; the order fixes the rounding of their sum.
+
+        Args:
+            forces: The terms.
+            remembers: Whether what they answered last serves again at the same positions: for terms that do not change.
+        """
         self.forces = tuple(forces)
+        self._own, self._last = self.forces, _Last() if remembers else None
+
+    def joined_by(self, more: Sequence[Force]) -> ForceModule:
+        """This module's terms and more; if it remembers, its own are not evaluated anew at the same positions."""
+        joined = ForceModule((*self.forces, *more))
+        joined._own, joined._last = self._own, self._last
+        return joined
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
-        force = torch.zeros_like(x)
-        energy = torch.zeros((), dtype=torch.float64, device=x.device)
-        for term in self.forces:
+        known = None if self._last is None else self._last.recall(x)
+        if known is None:
+            nothing = torch.zeros((), dtype=torch.float64, device=x.device)
+            known = self._sum(self._own, x, (nothing, torch.zeros_like(x)))
+            if self._last is not None:
+                self._last.keep(x, *known)
+        return self._sum(self.forces[len(self._own) :], x, known)
+
+    @staticmethod
+    def _sum(terms: Sequence[Force], x: Tensor, so_far: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Energy and force with some terms added; the force is written to."""
+        energy, force = so_far
+        for term in terms:
             energy = energy + term.add_force(x, force)
         return energy, force
 
