@@ -115,6 +115,7 @@ class MeshSurface:
         self._asked: Tensor | None = None
         self._buried: Tensor | None = None
         self._overlaps: Tensor | None = None
+        self._mute: Tensor | None = None
         self._up: Tensor | None = None
         self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
@@ -124,7 +125,7 @@ class MeshSurface:
         """Move the surface to another pose of the same topology."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
         self.mesh.refit()
-        self._buried, self._overlaps, self._up = None, None, None
+        self._buried, self._overlaps, self._mute, self._up = None, None, None, None
         self._skins.clear()
 
     def _place(self, pose: MeshPose) -> np.ndarray:
@@ -149,7 +150,7 @@ class MeshSurface:
             return replace(found, side=1.0 - 2.0 * self.inside(x).to(x))
         if self.closed and len(x):
             tied = ((x - found.point) * found.normal).sum(dim=1) * found.side < 0
-            found.side[self._is_buried(found.face) | self._is_unsure(found.face) | tied] = 0.0
+            found.side[self._is_mute(found.face) | tied] = 0.0
         return found
 
     def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
@@ -207,6 +208,17 @@ class MeshSurface:
         mesh, faces = skin
         bare = self._closest(mesh, x, torch.full_like(known.distance, float("inf")))
         return replace(bare, face=faces[bare.face.long()])
+
+    def _is_mute(self, face: Tensor) -> Bool[Tensor, " points"]:
+        """Whether the normals of faces do not tell the side; each face is asked for once a pose."""
+        if self._mute is None:
+            self._mute = torch.full((len(self._corners),), -1, dtype=torch.int8, device=face.device)
+        told = self._mute[face.long()]
+        new = torch.unique(face[told < 0])
+        if len(new):
+            self._mute[new.long()] = (self._is_buried(new) | self._is_unsure(new)).to(torch.int8)
+            told = self._mute[face.long()]
+        return told > 0
 
     def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Whether faces have a corner inside the surface; each corner is asked for once a pose."""

@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.sparse import csgraph
 from torch import Tensor
 
+from ..mesh.topology import joined_by
 from .base import Nearest, Surface
 
 LEAST_REACH = 1e-3
@@ -83,34 +82,43 @@ def _sides(
     Taken from the closest points where they tell. Where that contradicts a neighbour that no surface divides it from,
     as it does where a face is buried in part only, and where they do not tell, the winding number does.
     """
-    ends = edges.long()
-    length = (x[ends[:, 0]] - x[ends[:, 1]]).norm(dim=1)
-    clear = ends[is_clear(distance[ends].sum(dim=1), length)]
+    ends = edges.long().T.contiguous()
     side = torch.ones(len(x), dtype=x.dtype, device=x.device)
     side[near] = told
-    settled = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    settled, seen = torch.zeros(len(x), dtype=torch.bool, device=x.device), side <= 0
+    clear = _clear_edges(x, distance, ends, seen)
     unsure = (side == 0) | _contradicted(side, clear)
     while bool(unsure.any()):
+        if bool((unsure & ~seen).any()):  # What may change its side is compared with all its neighbours.
+            seen = seen | unsure
+            clear = _clear_edges(x, distance, ends, seen)
         which = torch.nonzero(unsure).squeeze(1)
-        group, first = _joined(which, clear[unsure[clear].all(dim=1)], len(x))
-        inside = surface.inside(x[which[first]])
+        group, one = _joined(which, clear[unsure[clear[:, 0]] & unsure[clear[:, 1]]], len(x))
+        inside = surface.inside(x[which[one]])
         side[which] = 1.0 - 2.0 * inside.to(x.dtype)[group]
         settled |= unsure
         unsure = _contradicted(side, clear) & ~settled
     return side[near]
 
 
+def _clear_edges(x: Tensor, distance: Tensor, ends: Tensor, seen: Tensor) -> Int[Tensor, "edges 2"]:
+    """Edges that no surface divides, of those with an end among some vertices: of all others both ends are outside."""
+    first, second = ends[:, seen[ends[0]] | seen[ends[1]]]
+    clear = is_clear(distance[first] + distance[second], (x[first] - x[second]).norm(dim=1))
+    return torch.stack([first[clear], second[clear]], dim=1)
+
+
 def _contradicted(side: Tensor, clear: Tensor) -> Bool[Tensor, " vertices"]:
     """Vertices told to be on the other side of a neighbour that no surface divides them from."""
     out = torch.zeros(len(side), dtype=torch.bool, device=side.device)
-    out[clear[side[clear].prod(dim=1) < 0].ravel()] = True
+    out[clear[side[clear[:, 0]] * side[clear[:, 1]] < 0].ravel()] = True
     return out
 
 
 def _joined(which: Tensor, pairs: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Group of each of some vertices that pairs join, and the place of the first of each group."""
-    ends = pairs.cpu().numpy()
-    graph = sparse.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    _, label = csgraph.connected_components(graph, directed=False)
-    _, first, group = np.unique(label[which.cpu().numpy()], return_index=True, return_inverse=True)
+    place = torch.zeros(count, dtype=torch.long, device=which.device)
+    place[which] = torch.arange(len(which), device=which.device)
+    label = joined_by(place[pairs].cpu().numpy(), len(which))
+    _, first, group = np.unique(label, return_index=True, return_inverse=True)
     return torch.as_tensor(group.reshape(-1), device=which.device), torch.as_tensor(first, device=which.device)
