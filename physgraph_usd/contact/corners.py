@@ -13,6 +13,8 @@ from .track import ON_SURFACE
 
 ORDER = 6
 """Parts into which the sides of a face are cut where it is looked how deep it is."""
+SIDEWAYS = 0.5
+"""Cosine to a face's normal under which the way out of what comes through between its points is sideways."""
 LEAST_LIFT = 0.5
 """Least move of that point, in clearances."""
 OVER = 1.25
@@ -56,14 +58,25 @@ def lift_over(
     kept = (grid[deepest] * clearance[corners]).sum(dim=1)
     # What comes through between the points is at least near one.
     lack = OVER * torch.maximum(kept - signed[each, deepest], LEAST_LIFT * kept)
+    way = torch.where(
+        (signed[each, deepest] > 0).unsqueeze(1), _up(x[corners], away[each, deepest]), away[each, deepest]
+    )
     share = weight / weight.square().sum(dim=1, keepdim=True).clamp_min(1e-9)
-    move = share.unsqueeze(2) * (lack.unsqueeze(1) * away[each, deepest]).unsqueeze(1)
+    move = share.unsqueeze(2) * (lack.unsqueeze(1) * way).unsqueeze(1)
     best, length = torch.zeros_like(x), torch.zeros_like(x[:, 0])
     which, move = corners.reshape(-1), move.reshape(-1, 3)
     length.scatter_reduce_(0, which, move.norm(dim=1), "amax")
     largest = torch.nonzero((move.norm(dim=1) >= length[which]) & (length[which] > 0)).squeeze(1)
     best[which[largest]] = move[largest]
     return best
+
+
+def _up(corners: Float[Tensor, "triangles 3 3"], away: Float[Tensor, "triangles 3"]) -> Float[Tensor, "triangles 3"]:
+    """Unit ways out of what comes through a face between its points: of a needle not sideways, but past its tip."""
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+    cosine = (normal * away).sum(dim=1, keepdim=True)
+    return torch.where(cosine.abs() < SIDEWAYS, torch.where(cosine < 0, -normal, normal), away)
 
 
 def _away(surface: Surface, points: Float[Tensor, "points 3"], start: Tensor) -> tuple[Tensor, Tensor]:

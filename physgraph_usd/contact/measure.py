@@ -4,7 +4,10 @@
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
+from weakref import WeakKeyDictionary
 
 import torch
 import warp as wp
@@ -13,7 +16,6 @@ from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
 from ..colliders.mesh import MeshSurface
-from ..colliders.sign import MARGIN
 from ..level import Level
 from ..mesh.lanes import LEAST_QUERIES, Launch
 
@@ -182,64 +184,77 @@ def pierced(
 ) -> Pierced:
     """Edges that pass through a face: the cloth's through the body's and the body's through the cloth's.
 
-    Of a primitive, the cloth's edges with one end inside. Edges and faces that are farther from the surface than they
-    are long are not looked at.
+    Of a primitive, the cloth's edges with one end inside. Edges that are farther from the surface than they are long
+    are not looked at.
 
     Args:
         surface: The surface.
         level: The level.
         x: Positions in the surface's coordinates [m].
-        distance: Unsigned distances at x, or lower bounds [m].
+        distance: Unsigned distances at x, or lower bounds; infinite for cloth that does not feel the surface [m].
     """
-    ends = level.edges.long()
-    start, end = x[ends[:, 0]], x[ends[:, 1]]
-    length = (end - start).norm(dim=1)
-    near = torch.nonzero(distance[ends].sum(dim=1) <= length).squeeze(1)
-    none = near[:0]
-    if not len(near):
-        return Pierced(none, none)
+    first, second = level.edges.long().T.contiguous()
+    length = (x[second] - x[first]).norm(dim=1)
+    near = torch.nonzero(distance[first] + distance[second] <= length).squeeze(1)
+    none, start, end = near[:0], x[first[near]], x[second[near]]
     if not isinstance(surface, MeshSurface):
-        inside = surface.inside(x)[ends[near]]
-        return Pierced(near[inside[:, 0] != inside[:, 1]], none)
-    faces = _faces_met(surface.mesh, start[near], end[near], lanes=level.lanes)
-    return Pierced(near[faces >= 0], _through_cloth(surface, level, x, distance, longest=float(length.max())))
+        inside = surface.inside(x) if len(near) else none
+        return Pierced(near[inside[first[near]] != inside[second[near]]] if len(near) else none, none)
+    if not len(length) or float(distance.min()) > COVER * float(length.max()):
+        return Pierced(none, none)
+    faces = _faces_met(surface.mesh, start, end, lanes=level.lanes)
+    return Pierced(near[faces >= 0], _through_cloth(surface, level, x, distance.isfinite()))
 
 
 def _through_cloth(
-    surface: MeshSurface, level: Level, x: Tensor, distance: Tensor, *, longest: float
+    surface: MeshSurface, level: Level, x: Tensor, feels: Bool[Tensor, " vertices"]
 ) -> Int[Tensor, " triangles"]:
-    """The cloth's triangles that the body's edges pass through; no side is longer than the longest [m]."""
-    least = distance[level.triangles.long()].amin(dim=1)
-    near = torch.nonzero(least <= COVER * longest).squeeze(1)
-    near = near[least[near] <= _farthest_inside(x[level.triangles[near].long()])]
-    if not len(near):
-        return near
-    used = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-    used[level.triangles[near].long().reshape(-1)] = True
-    index = (torch.cumsum(used, 0, dtype=torch.int32) - 1)[level.triangles[near].long()].reshape(-1)
-    points = x[used].to(torch.float32).contiguous()
-    device = str(x.device)
-    cloth = wp.Mesh(
-        points=wp.from_torch(points, dtype=wp.vec3f),
-        indices=wp.from_torch(index.contiguous()),
-        bvh_constructor="median" if device == "cpu" else None,  # Built once and asked once: building must be cheap.
-    )
+    """The cloth's triangles that the body's edges pass through, of the cloth that feels the body."""
+    cloth = _Cloth.of(level, feels)
+    points = x.to(torch.float32).contiguous()
+    cloth.move(points)
     body = wp.to_torch(surface.mesh.points)
     edges = torch.as_tensor(surface.edges, device=x.device)
     start, end = body[edges[:, 0]], body[edges[:, 1]]
     low, high = points.amin(dim=0), points.amax(dim=0)
     meets = ((torch.maximum(start, end) >= low) & (torch.minimum(start, end) <= high)).all(dim=1)
-    faces = _faces_met(cloth, start[meets], end[meets], lanes=level.lanes)
-    return near[faces[faces >= 0].long()]
+    faces = _faces_met(cloth.mesh, start[meets], end[meets], lanes=level.lanes)
+    return cloth.triangles[faces[faces >= 0].long()]
 
 
-def _farthest_inside(corners: Float[Tensor, "triangles 3 3"]) -> Float[Tensor, " triangles"]:
-    """No point of a triangle is farther than this from its nearest corner [m]: its circumradius is one bound."""
-    across = corners - corners.roll(1, dims=1)
-    sides = across.norm(dim=2)
-    twice_area = torch.linalg.cross(across[:, 0], across[:, 1]).norm(dim=1)
-    circumradius = sides.prod(dim=1) / (2.0 * twice_area).clamp_min(1e-30)
-    return torch.minimum(COVER * sides.amax(dim=1), MARGIN * circumradius)
+class _Cloth:
+    """The faces of some of a level's garments in a hierarchy, built once and refitted.
+
+    Attributes:
+        triangles: Their numbers in the level.
+        mesh: Warp's mesh of them.
+    """
+
+    _known: ClassVar[WeakKeyDictionary[Level, dict[tuple[int, ...], _Cloth]]] = WeakKeyDictionary()
+
+    def __init__(self, level: Level, garments: Sequence[int]) -> None:
+        """Build the hierarchy at rest."""
+        corners = level.triangles.long()
+        owner = level.vertex_garment[corners[:, 0]]
+        kept = torch.isin(owner, torch.tensor(garments, dtype=owner.dtype, device=owner.device))
+        self.triangles = torch.nonzero(kept).squeeze(1)
+        self._points = level.rest.to(torch.float32).clone()
+        self._index = level.triangles[self.triangles].reshape(-1).contiguous()
+        self.mesh = wp.Mesh(wp.from_torch(self._points, dtype=wp.vec3f), wp.from_torch(self._index))
+
+    @classmethod
+    def of(cls, level: Level, feels: Bool[Tensor, " vertices"]) -> _Cloth:
+        """The faces of the garments that have a vertex that feels."""
+        garments = tuple(torch.unique(level.vertex_garment[feels]).tolist())
+        known = cls._known.setdefault(level, {})
+        if garments not in known:
+            known[garments] = cls(level, garments)
+        return known[garments]
+
+    def move(self, points: Float[Tensor, "vertices 3"]) -> None:
+        """Refit to positions [m]."""
+        self._points.copy_(points)
+        self.mesh.refit()
 
 
 def _faces_met(mesh: wp.Mesh, start: Tensor, end: Tensor, *, lanes: int) -> Int[Tensor, " segments"]:
