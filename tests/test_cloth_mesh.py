@@ -13,6 +13,7 @@ from folds import SHAPES, Cloth, crumpled, flat, folded, levels_of, named, place
 from physgraph_usd.contact.cloth_mesh import ClothMesh
 from physgraph_usd.contact.nearest import Pairs
 from physgraph_usd.level import Level
+from physgraph_usd.mesh.topology import PolygonMesh
 
 REACH = 0.06
 """More than twice the longest edge of the sheets: every pair that counts is within what is asked."""
@@ -30,17 +31,35 @@ def two_sheets() -> tuple[Level, torch.Tensor]:
     return level, torch.as_tensor(x, dtype=level.dtype)
 
 
+def fan(corners: int = 90) -> Cloth:
+    """A disc whose triangles all meet in its middle: more than bits tell of."""
+    angle = 2 * np.pi * np.arange(corners) / corners
+    rim = 0.05 * np.stack([np.cos(angle), 0.0 * angle, -np.sin(angle)], axis=1)
+    ids = np.arange(corners)
+    faces = np.stack([0 * ids, 1 + ids, 1 + (ids + 1) % corners], axis=1)
+    return PolygonMesh(np.full(corners, 3), faces.ravel(), corners + 1), np.concatenate([np.zeros((1, 3)), rim])
+
+
+def two_fans() -> tuple[Level, torch.Tensor]:
+    """Two such discs, bent and a little apart."""
+    level = levels_of(named(fan(), "A"), named(fan(), "B"), level=0)[-1]
+    x = level.rest.double().numpy() + 1e-3 * np.random.default_rng(0).normal(size=level.rest.shape)
+    half = level.vertex_count // 2
+    x[half:] = x[half:] * [0.8, 1.0, 0.9] + [0.0031, 0.02, 0.0017]
+    return level, torch.as_tensor(x, dtype=level.dtype)
+
+
 @cache
 def scene(name: str) -> tuple[Level, torch.Tensor]:
     """A level and positions."""
-    if name == "two sheets":
-        return two_sheets()
+    if name in (more := {"two sheets": two_sheets, "two fans": two_fans}):
+        return more[name]()
     cloth = strip(8, 3) if "crumpled" not in name else square(4)
     level = levels_of(named(cloth))[-1]
     return level, placed(level, SHAPES[name])
 
 
-SCENES = (*SHAPES, "two sheets")
+SCENES = (*SHAPES, "two sheets", "two fans")
 ALL = np.ones((2, 2), bool)
 
 

@@ -89,7 +89,7 @@ class TestCrossingsSince:
             everywhere = fresh.crossings(everything(level))
             assert everywhere.count == len(crossings(Soup.of(level, x)))
             if known is not None and known.all_listed:
-                since = mesh.crossings_since(known, moved, everything(level))
+                since = mesh.crossings_since(known, moved)
                 assert listed(since) == listed(everywhere)
                 assert since.count == everywhere.count
                 compared, changed = compared + 1, changed + (listed(known) != listed(since))
@@ -108,7 +108,7 @@ class TestCrossingsSince:
         )
         moved = torch.zeros(level.vertex_count, dtype=torch.bool)
         moved[0] = True
-        mesh.crossings_since(Crossings.none(moved.device), moved, everything(level))
+        mesh.crossings_since(Crossings.none(moved.device), moved)
         assert 0 < asked[0] < level.vertex_count // 4
 
 

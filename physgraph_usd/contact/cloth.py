@@ -47,7 +47,7 @@ SPHERE = 0.8
 """R of the paper's form, in mean edges (PAPER A13)."""
 AHEAD = 0.5
 """How much farther than the thickness it is looked for pairs above the cage, in mean edges: the move of a round."""
-STALE, FEW, MOST = 0.1, 1e-3, 0.5
+STALE, FEW, MOST = 0.1, 1e-3, 0.35
 """Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
 has, and everywhere where more than the last part has."""
 LOCAL = 0.2
@@ -179,14 +179,15 @@ class ClothView:
 
     def _look(self, x: Tensor, known: ClothState | None) -> ClothState:
         """Find what crosses; where few vertices have moved since what is known, only beside them."""
+        if known is not None and known.near and known.version == known.x._version and known.crossings.all_listed:
+            moved = (x != known.x).any(dim=1)
+            if float(moved.to(x.dtype).mean()) < LOCAL:
+                self._mesh.move(x)
+                return ClothState(x, self._mesh.crossings_since(known.crossings, moved), version=x._version)
         busy = self._regions.busy(x, 0.0)
         if not bool(busy.any()):
             return ClothState(x, Crossings.none(x.device), near=False, version=x._version)
         self._mesh.move(x)
-        if known is not None and known.version == known.x._version and known.crossings.all_listed:
-            moved = (x != known.x).any(dim=1)
-            if float(moved.to(x.dtype).mean()) < LOCAL:
-                return ClothState(x, self._mesh.crossings_since(known.crossings, moved, busy), version=x._version)
         return ClothState(x, self._mesh.crossings(busy), version=x._version)
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | Spheres | None:
@@ -227,7 +228,7 @@ class ClothView:
         return Spheres(level, ends, radius=limit, stiffness=self._settings.sphere_stiffness, area=area)
 
     def _near(self, x: Tensor) -> tuple[Pairs | None, Crossings]:
-        """What is near what, and what crosses; where nothing did at a level's start, only its end is looked at again.
+        """What is near what, and what crosses: where nothing did at the start or in the input, the end alone tells.
 
         Pairs found before serve again away from what has moved since.
         """
@@ -242,7 +243,8 @@ class ClothView:
         if not bool(busy.any()):
             self._found = None
             return None, none
-        crossings = self.look(x).crossings if self._sides is None or self.tangled else none
+        again = self._sides is None or self.tangled or self.before.crossings.count > 0
+        crossings = self.look(x).crossings if again else none
         self._mesh.move(x)
         before = None if known is None or part > MOST else known.nearest
         reach = torch.full_like(self._level.spacing, self._reach)
@@ -267,7 +269,7 @@ class ClothView:
         good = good or self.before
         zone = self._mesh.grown(self._mesh.crossed(good.crossings), ZONE)
         shift, most = x - good.x, self.most_strain(x)
-        least = self._rank(best, good, most)
+        least = (self._excess(best, good), False, best.crossings.count)
         for attempt in range(MENDS):
             corners = self._mesh.corners_of(state.crossings)
             too_many = self._excess(state, good) > 0
@@ -294,11 +296,11 @@ class ClothView:
 
     def is_taut(self, x: Float[Tensor, "vertices 3"], most: float) -> bool:
         """Whether a hundredth of the edges is strained by more than that."""
-        return self._mesh.strain(x) > most
+        return self._mesh.is_strained(x, most)
 
     def most_strain(self, x: Float[Tensor, "vertices 3"]) -> float:
         """How far mending may strain cloth that is at x [m]."""
-        return max(TAUT * self._mesh.strain(x), SLACK)
+        return TAUT * self._mesh.strain(x) if self._mesh.is_strained(x, SLACK / TAUT) else SLACK
 
     def worse(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether more crosses than may, in all or between garments."""

@@ -18,6 +18,7 @@ from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges, joined_by
 from .again import edges_again, faces_again
+from .beside import beside_table
 from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
 from .nearest import Nearest, Pairs
@@ -79,7 +80,7 @@ class ClothMesh:
         self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
         self._rest = level.rest.to(torch.float32).contiguous()
         self._apart, self.sewn = self.beside, np.zeros((0, 2), np.int64)
-        self._rings = self._arrays(self.beside)
+        self._rings, self._beside_parts = self._arrays(self.beside), self._tables(self.beside)
         corner = np.argsort(triangles.ravel(), kind="stable")
         starts = np.concatenate([[0], np.cumsum(np.bincount(triangles.ravel(), minlength=level.vertex_count))])
         about = [wp.array(each.astype(np.int32), dtype=wp.int32, device=level.device) for each in (starts, corner // 3)]
@@ -119,7 +120,7 @@ class ClothMesh:
         beside.setdiag(0.0)
         beside.eliminate_zeros()
         beside.data[:] = 1.0
-        self.beside, self._rings = beside, self._arrays(beside)
+        self.beside, self._rings, self._beside_parts = beside, self._arrays(beside), self._tables(beside)
 
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions [m]; what is asked afterwards is asked of them.
@@ -174,7 +175,8 @@ class ClothMesh:
         self._ask_faces(busy & again, limit, found)
         # An edge near another has a vertex near a face, or next to one that is.
         close = self.grown(found.close(level), 1) & beside
-        found.edge[(close | again)[level.edges.long()].any(dim=1)] = -1
+        unknown, (first, second) = close | again, self._ends
+        found.edge[unknown[first] | unknown[second]] = -1
         self._ask_edges(close, limit, found)
         return found
 
@@ -189,18 +191,15 @@ class ClothMesh:
         listed = torch.nonzero(torch.arange(4, device=edge.device) < count[edge].unsqueeze(1))
         return Crossings(edge[listed[:, 0]], faces[edge].long()[listed[:, 0], listed[:, 1]], int(count.sum()))
 
-    def crossings_since(
-        self, known: Crossings, moved: Bool[Tensor, " vertices"], busy: Bool[Tensor, " vertices"]
-    ) -> Crossings:
+    def crossings_since(self, known: Crossings, moved: Bool[Tensor, " vertices"]) -> Crossings:
         """What crosses now, by what crossed before some vertices moved: only what lies beside those is asked.
 
         Args:
             known: What crossed, all of it listed.
             moved: Vertices that have moved since.
-            busy: As `crossings` takes it.
         """
         near = self._beside(moved, 0.0)
-        found = self.crossings(near & busy)
+        found = self.crossings(near)
         ends = self.level.edges.long()[known.edge]
         kept = ~near[ends].any(dim=1) & ~moved[self.triangles[known.face]].any(dim=1)
         edge, face = torch.cat([known.edge[kept], found.edge]), torch.cat([known.face[kept], found.face])
@@ -226,9 +225,27 @@ class ClothMesh:
 
     def strain(self, x: Float[Tensor, "vertices 3"]) -> float:
         """What all but the hundredth part of the edges are strained by at most, at x [m]."""
-        ends, rest = self.level.edges.long(), self.level.rest_length
-        strain = ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) / rest - 1.0).abs()
-        return float(strain.kthvalue(1 + int(0.99 * (len(rest) - 1))).values)
+        return float(self._strains(x).kthvalue(self._most_edges).values)
+
+    def is_strained(self, x: Float[Tensor, "vertices 3"], most: float) -> bool:
+        """Whether that is more than so much at x [m]."""
+        return int((self._strains(x) <= most).sum()) < self._most_edges
+
+    def _strains(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:
+        """What each edge is strained by."""
+        first, second = self._ends
+        return ((x[second] - x[first]).norm(dim=1) / self.level.rest_length - 1.0).abs()
+
+    @cached_property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        """The edges' first and second vertices."""
+        first, second = self.level.edges.long().T.contiguous()
+        return first, second
+
+    @property
+    def _most_edges(self) -> int:
+        """Number of edges but the hundredth part."""
+        return 1 + int(0.99 * (len(self.level.rest_length) - 1))
 
     def between(self, crossings: Crossings) -> np.ndarray:
         """Number of listed crossings between garments, the lower number first, shape (G, G)."""
@@ -261,7 +278,13 @@ class ClothMesh:
         """Write the closest faces of the vertices that are asked."""
         best = torch.empty((len(asked), 2), dtype=torch.float32, device=asked.device)
         clusters = self._clusters
-        inputs = [*self._asked(asked, reach), *clusters.vertices, *clusters.faces, *clusters.face_boxes]
+        inputs = [
+            *self._asked(asked, reach),
+            *self._beside_parts[0],
+            *clusters.vertices,
+            *clusters.faces,
+            *clusters.face_boxes,
+        ]
         outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.face, dtype=wp.vec2i)]
         clusters.run(faces_near, [*inputs, *outputs, *[_vectors(each) for each in found.weight]])
 
@@ -269,7 +292,7 @@ class ClothMesh:
         """Write the closest edges of those that have an end that is asked."""
         best = torch.empty((len(found.edge), 2), dtype=torch.float32, device=asked.device)
         clusters = self._clusters
-        inputs = [*self._asked(asked, reach), *clusters.edges, *clusters.edge_boxes]
+        inputs = [*self._asked(asked, reach), *self._beside_parts[1], *clusters.edges, *clusters.edge_boxes]
         outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.edge, dtype=wp.vec2i)]
         clusters.run(edges_near, [*inputs, *outputs, *[wp.from_torch(each, dtype=wp.vec2f) for each in found.place]])
 
@@ -277,6 +300,12 @@ class ClothMesh:
         """What both proximity kernels are told first."""
         moving = [_vectors(self._position), _flags(asked), wp.from_torch(reach), _vectors(self._normal)]
         return [*self._rings, *moving, _vectors(self._rest)]
+
+    def _tables(self, beside: sp.csr_matrix) -> list[tuple[wp.array, ...]]:
+        """The faces and the edges beside each vertex, as kernels read them."""
+        parts = [self._clusters.faces[:2], self._clusters.edges[:2]]
+        given = {"device": self.level.device}
+        return [beside_table(beside, corners.numpy(), first.numpy(), **given) for first, corners in parts]
 
     def _arrays(self, beside: sp.csr_matrix) -> list[wp.array]:
         """An adjacency as kernels read it: where each row starts, and the neighbours."""

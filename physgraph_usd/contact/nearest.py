@@ -64,18 +64,19 @@ class Nearest:
 
     def beside_moved(self, level: Level, moved: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:
         """Vertices, and ends of edges, whose closest part has a vertex that moved."""
-        ends = level.edges.long()
-        with_face, with_edge = moved[level.triangles.long()].any(dim=1), moved[ends].any(dim=1)
-        near = (with_face[self.face.clamp_min(0).long()] & (self.face >= 0)).any(dim=1)
-        edges = (with_edge[self.edge.clamp_min(0).long()] & (self.edge >= 0)).any(dim=1)
-        near[ends[edges].reshape(-1)] = True
+        near = torch.zeros_like(moved)
+        vertex, side = torch.nonzero(self.face >= 0, as_tuple=True)
+        near[vertex[moved[level.triangles[self.face[vertex, side].long()].long()].any(dim=1)]] = True
+        edge, side = torch.nonzero(self.edge >= 0, as_tuple=True)
+        beside = edge[moved[level.edges[self.edge[edge, side].long()].long()].any(dim=1)]
+        near[level.edges[beside].long().reshape(-1)] = True
         return near
 
     def close(self, level: Level) -> Bool[Tensor, " vertices"]:
         """Vertices near a face, and the corners of those faces."""
         known = self.face >= 0
         close = known.any(dim=1)
-        close[level.triangles.long()[self.face[known].long()].reshape(-1)] = True
+        close[level.triangles[self.face[known].long()].long().reshape(-1)] = True
         return close
 
     def pairs(self, level: Level) -> Pairs:
@@ -91,7 +92,7 @@ class Nearest:
         corners, weights = [], []
         for side, weight in enumerate(self.weight):
             found = torch.nonzero(self.face[:, side] >= 0).squeeze(1)
-            three = level.triangles.long()[self.face[found, side].long()]
+            three = level.triangles[self.face[found, side].long()].long()
             corners.append(torch.cat([found.unsqueeze(1), three], dim=1))
             weights.append(torch.cat([torch.ones_like(weight[found, :1]), -weight[found]], dim=1))
         return torch.cat(corners), torch.cat(weights)
@@ -109,5 +110,4 @@ class Nearest:
         key = torch.minimum(a, b) * len(level.edges) + torch.maximum(a, b)
         kept = torch.as_tensor(np.unique(key.cpu().numpy(), return_index=True)[1], device=a.device)
         a, b, s, t = a[kept], b[kept], st[kept, 0], st[kept, 1]
-        ends = level.edges.long()
-        return torch.cat([ends[a], ends[b]], dim=1), torch.stack([1 - s, s, t - 1, -t], dim=1)
+        return torch.cat([level.edges[a], level.edges[b]], dim=1).long(), torch.stack([1 - s, s, t - 1, -t], dim=1)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from .cluster_kernels import FAR, are_apart, has
+from .beside import bits_beside, bits_of_edge, is_own_edge, is_own_face
+from .cluster_kernels import FAR, are_apart
 
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
@@ -54,23 +55,6 @@ def closest_on_triangle(p: wp.vec3f, a: wp.vec3f, b: wp.vec3f, c: wp.vec3f):  # 
 
 
 @wp.func
-def is_beside(v: wp.int32, u: wp.int32, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
-    """Whether u is v or a neighbour of v."""
-    found = v == u
-    for k in range(starts[v], starts[v + 1]):
-        if ring[k] == u:
-            found = True
-    return found
-
-
-@wp.func
-def are_beside(e: wp.vec2i, g: wp.vec2i, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
-    """Whether two edges share a vertex or are joined by an edge."""
-    of_first = is_beside(e[0], g[0], starts, ring) or is_beside(e[0], g[1], starts, ring)
-    return of_first or is_beside(e[1], g[0], starts, ring) or is_beside(e[1], g[1], starts, ring)
-
-
-@wp.func
 def places_inside(a: wp.vec3f, b: wp.vec3f, c: wp.vec3f, d: wp.vec3f):
     """Where along two edges they are closest, if inside both; else a negative place (Ericson 2005, 5.1.9)."""
     along, other, way = b - a, d - c, a - c
@@ -101,16 +85,26 @@ def belongs(distance: float, rest_distance: float, cosine: float):
 
 
 @wp.func
+def edge_belongs(
+    same: bool,
+    e: wp.vec2i,
+    g: wp.vec2i,
+    places: wp.vec2f,
+    distance: float,
+    cosine: float,
+    rest: wp.array(dtype=wp.vec3f),
+):
+    """The same of two edges, at their closest points."""
+    if same:
+        return belongs(distance, wp.length(between(rest, e, g, places[0], places[1])), cosine)
+    return False
+
+
+@wp.func
 def within(least: wp.vec3f, most: wp.vec3f, low: wp.vec3f, high: wp.vec3f, reach: float):
     """Whether two boxes are at most so far apart: of what boxes grown by it meet, half is farther away."""
     apart = wp.max(wp.max(low - most, least - high), wp.vec3f(0.0))
     return wp.dot(apart, apart) <= reach * reach
-
-
-@wp.func
-def share_an_end(e: wp.vec2i, g: wp.vec2i):
-    """Whether two edges meet at a vertex."""
-    return e[0] == g[0] or e[0] == g[1] or e[1] == g[0] or e[1] == g[1]
 
 
 @wp.func
@@ -139,15 +133,6 @@ def box_of_vertices(
             least = wp.min(least, x[v] - wp.vec3f(reach[v]))
             most = wp.max(most, x[v] + wp.vec3f(reach[v]))
     return least, most
-
-
-@wp.func
-def is_face_beside(v: wp.int32, t: wp.vec3i, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
-    """Whether a neighbour of v is a corner of a triangle."""
-    for k in range(starts[v], starts[v + 1]):
-        if has(t, ring[k]):
-            return True
-    return False
 
 
 @wp.func
@@ -198,6 +183,9 @@ def faces_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
     reach: wp.array(dtype=wp.float32),
     normal: wp.array(dtype=wp.vec3f),
     rest: wp.array(dtype=wp.vec3f),
+    entries: wp.array(dtype=wp.int32),
+    entry_cluster: wp.array(dtype=wp.int32),
+    entry_bits: wp.array(dtype=wp.uint64),
     first_vertex: wp.array(dtype=wp.int32),
     vertices: wp.array(dtype=wp.int32),
     first_face: wp.array(dtype=wp.int32),
@@ -227,12 +215,13 @@ def faces_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             p, farthest = x[v], wp.max(best[v][0], best[v][1])
             if not asked[v] or not within(p, p, low[j], high[j], farthest):
                 continue
+            known = bits_beside(v, j, entries, entry_cluster, entry_bits)
             for m in range(first_face[j], first_face[j + 1]):
+                if is_own_face(known, m, first_face[j], v, triangles, starts, beside):
+                    continue
+                if not within(p, p, face_low[m], face_high[m], farthest):
+                    continue
                 t = triangles[m]
-                if not within(p, p, face_low[m], face_high[m], farthest) or has(t, v):
-                    continue
-                if is_face_beside(v, t, starts, beside):
-                    continue
                 weight = closest_on_triangle(p, x[t[0]], x[t[1]], x[t[2]])
                 way = p - (weight[0] * x[t[0]] + weight[1] * x[t[1]] + weight[2] * x[t[2]])
                 distance = wp.length(way)
@@ -276,25 +265,6 @@ def box_of_edges(
     return least, most
 
 
-@wp.func
-def is_own_edge(
-    same: bool,
-    e: wp.vec2i,
-    g: wp.vec2i,
-    places: wp.vec2f,
-    distance: float,
-    cosine: float,
-    rest: wp.array(dtype=wp.vec3f),
-    starts: wp.array(dtype=wp.int32),
-    beside: wp.array(dtype=wp.int32),
-):
-    """Whether an edge is next to another or, of the same garment, in its plane, where it belongs."""
-    if same:
-        if belongs(distance, wp.length(between(rest, e, g, places[0], places[1])), cosine):
-            return True
-    return are_beside(e, g, starts, beside)
-
-
 @wp.kernel
 def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
     first: wp.int32,
@@ -315,6 +285,9 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
     reach: wp.array(dtype=wp.float32),
     normal: wp.array(dtype=wp.vec3f),
     rest: wp.array(dtype=wp.vec3f),
+    entries: wp.array(dtype=wp.int32),
+    entry_cluster: wp.array(dtype=wp.int32),
+    entry_bits: wp.array(dtype=wp.uint64),
     first_edge: wp.array(dtype=wp.int32),
     edges: wp.array(dtype=wp.vec2i),
     number: wp.array(dtype=wp.int32),
@@ -344,20 +317,21 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             lower, upper, farthest = edge_low[k], edge_high[k], wp.max(best[e][0], best[e][1])
             if not within(lower, upper, low[j], high[j], farthest):
                 continue
+            known = bits_of_edge(edges[k], j, entries, entry_cluster, entry_bits)
             for m in range(first_edge[j], first_edge[j + 1]):
-                if not within(lower, upper, edge_low[m], edge_high[m], farthest) or share_an_end(edges[k], edges[m]):
+                if is_own_edge(known, m, first_edge[j], edges[k], edges, starts, beside):
+                    continue
+                if not within(lower, upper, edge_low[m], edge_high[m], farthest):
                     continue
                 places = places_inside(x[a], x[b], x[edges[m][0]], x[edges[m][1]])
                 if places[0] < 0.0:
                     continue
                 way = between(x, edges[k], edges[m], places[0], places[1])
                 distance = wp.length(way)
-                if distance > wp.max(best[e][0], best[e][1]) or distance < LEAST:
-                    continue
                 cosine = wp.dot(way, wp.normalize(normal[a] + normal[b])) / distance
-                if distance > wp.where(cosine > 0.0, best[e][0], best[e][1]):
+                if distance < LEAST or distance > wp.where(cosine > 0.0, best[e][0], best[e][1]):
                     continue
-                if is_own_edge(same, edges[k], edges[m], places, distance, cosine, rest, starts, beside):
+                if edge_belongs(same, edges[k], edges[m], places, distance, cosine, rest):
                     continue
                 side = keep_nearest(e, number[m], distance, cosine, best, other)
                 if side > 0:

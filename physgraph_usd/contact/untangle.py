@@ -95,7 +95,9 @@ def _stays_joined(mesh: ClothMesh, crossings: Crossings) -> bool:
     around = torch.zeros_like(mesh.level.free[:, 0])
     around[torch.as_tensor(ends[crossing].reshape(-1), device=around.device).long()] = True
     close = mesh.grown(around, NEAR).cpu().numpy()
-    near = np.flatnonzero(close[ends].all(axis=1) & ~np.isin(np.arange(len(ends)), crossing))
+    whole = close[ends[:, 0]] & close[ends[:, 1]]
+    whole[crossing] = False
+    near = np.flatnonzero(whole)
     joints = np.concatenate([ends[near], mesh.sewn[close[mesh.sewn].all(axis=1)]])
     places, number = np.unique(np.concatenate([ends[crossing], joints]), return_inverse=True)
     number = number.reshape(-1, 2)

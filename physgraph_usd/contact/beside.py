@@ -1,0 +1,142 @@
+"""What lies beside each vertex: of every cluster with such parts, a bit for each of its faces and each of its edges.
+
+Nearly all parts within reach of a vertex are its neighbours, which are no pairs with it. A bit tells so at once, where
+comparing corners with the vertex's ring takes most of a query's time.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from .cluster_kernels import has
+
+BITS = 64
+"""Parts of a cluster that bits tell of; those after them are compared by their corners."""
+
+
+def beside_table(
+    beside: sp.csr_matrix, corners: np.ndarray, first: np.ndarray, *, device: str
+) -> tuple[wp.array, wp.array, wp.array]:
+    """The parts of clusters that have a vertex itself, or a neighbour of it, as a corner.
+
+    Args:
+        beside: Adjacency of the vertices, shape (V, V).
+        corners: Corners of the parts in the clusters' order, shape (N, 2) or (N, 3).
+        first: The first part of each cluster, and N, shape (clusters + 1,).
+        device: "cpu" or a CUDA device.
+
+    Returns:
+        Where each vertex's entries begin, shape (V + 1,); and of each entry the cluster, and the bits of its parts.
+    """
+    count, parts = beside.shape[0], len(corners)
+    places = (corners.ravel(), np.repeat(np.arange(parts, dtype=np.int32), corners.shape[1]))
+    of_vertex = sp.csr_matrix((np.ones(corners.size, np.int32), places), shape=(count, parts))
+    rows = sp.csr_matrix((beside + sp.identity(count, dtype=beside.dtype, format="csr")).astype(np.int32) @ of_vertex)
+    rows.sort_indices()
+    vertex, part = np.repeat(np.arange(count), np.diff(rows.indptr)), rows.indices
+    cluster = np.repeat(np.arange(len(first) - 1, dtype=np.int32), np.diff(first))[part]
+    place = part - first[cluster]
+    bits = np.where(place < BITS, np.uint64(1) << np.minimum(place, BITS - 1).astype(np.uint64), np.uint64(0))
+    begins = np.flatnonzero(np.diff(vertex, prepend=-1) | np.diff(cluster, prepend=-1))
+    masks = np.bitwise_or.reduceat(bits, begins) if len(begins) else bits
+    starts = np.searchsorted(vertex[begins], np.arange(count + 1)).astype(np.int32)
+    return (
+        wp.array(starts, dtype=wp.int32, device=device),
+        wp.array(cluster[begins].astype(np.int32), dtype=wp.int32, device=device),
+        wp.array(masks, dtype=wp.uint64, device=device),
+    )
+
+
+@wp.func
+def bits_beside(
+    v: wp.int32,
+    j: wp.int32,
+    entries: wp.array(dtype=wp.int32),
+    cluster: wp.array(dtype=wp.int32),
+    bits: wp.array(dtype=wp.uint64),
+):
+    """Which of the first parts of a cluster lie beside a vertex."""
+    for k in range(entries[v], entries[v + 1]):
+        if cluster[k] == j:
+            return bits[k]
+    return wp.uint64(0)
+
+
+@wp.func
+def is_set(bits: wp.uint64, place: wp.int32):
+    """Whether a bit is."""
+    return ((bits >> wp.uint64(place)) & wp.uint64(1)) == wp.uint64(1)
+
+
+@wp.func
+def bits_of_edge(
+    e: wp.vec2i,
+    j: wp.int32,
+    entries: wp.array(dtype=wp.int32),
+    cluster: wp.array(dtype=wp.int32),
+    bits: wp.array(dtype=wp.uint64),
+):
+    """Which of the first parts of a cluster lie beside an end of an edge."""
+    return bits_beside(e[0], j, entries, cluster, bits) | bits_beside(e[1], j, entries, cluster, bits)
+
+
+@wp.func
+def is_beside(v: wp.int32, u: wp.int32, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
+    """Whether u is v or a neighbour of v."""
+    found = v == u
+    for k in range(starts[v], starts[v + 1]):
+        if ring[k] == u:
+            found = True
+    return found
+
+
+@wp.func
+def are_beside(e: wp.vec2i, g: wp.vec2i, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
+    """Whether two edges share a vertex or are joined by an edge."""
+    of_first = is_beside(e[0], g[0], starts, ring) or is_beside(e[0], g[1], starts, ring)
+    return of_first or is_beside(e[1], g[0], starts, ring) or is_beside(e[1], g[1], starts, ring)
+
+
+@wp.func
+def is_face_beside(v: wp.int32, t: wp.vec3i, starts: wp.array(dtype=wp.int32), ring: wp.array(dtype=wp.int32)):
+    """Whether a neighbour of v is a corner of a triangle."""
+    for k in range(starts[v], starts[v + 1]):
+        if has(t, ring[k]):
+            return True
+    return False
+
+
+@wp.func
+def is_own_face(
+    known: wp.uint64,
+    m: wp.int32,
+    first: wp.int32,
+    v: wp.int32,
+    triangles: wp.array(dtype=wp.vec3i),
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+):
+    """Whether a face of a cluster has v or a neighbour of it as a corner."""
+    if m - first < BITS:
+        return is_set(known, m - first)
+    return has(triangles[m], v) or is_face_beside(v, triangles[m], starts, beside)
+
+
+@wp.func
+def is_own_edge(
+    known: wp.uint64,
+    m: wp.int32,
+    first: wp.int32,
+    e: wp.vec2i,
+    edges: wp.array(dtype=wp.vec2i),
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+):
+    """Whether an edge of a cluster shares a vertex with another or is joined to it by an edge."""
+    if m - first < BITS:
+        return is_set(known, m - first)
+    return are_beside(e, edges[m], starts, beside)
