@@ -32,6 +32,8 @@ PINCHED = 0.5
 
 LIFT = 2.0
 """Farthest that cloth is lifted over what comes through its faces, in edge lengths: a spike would show more."""
+STALE = 0.1
+"""How far a vertex moves before the plane that it sees is found anew, in edge lengths."""
 STALLED = 6
 """How often faces that a body comes through are moved in vain, once none more comes clear."""
 
@@ -61,6 +63,26 @@ class Touching:
     offset: tuple[float, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The planes that vertices see in one body: where each vertex was then [m], unit normals, heights [m]."""
+
+    there: Bool[Tensor, " vertices"]
+    at: Float[Tensor, "vertices 3"]
+    normal: Float[Tensor, "vertices 3"]
+    height: Float[Tensor, " vertices"]
+
+    @staticmethod
+    def none(x: Float[Tensor, "vertices 3"]) -> _Seen:
+        """No planes."""
+        return _Seen(torch.zeros_like(x[:, 0], dtype=torch.bool), x, torch.zeros_like(x), torch.zeros_like(x[:, 0]))
+
+    def planes(self) -> Planes:
+        """Those that there are."""
+        which = torch.nonzero(self.there).squeeze(1)
+        return Planes(which.to(torch.int32), self.normal[which], self.height[which])
+
+
 class LevelBodies:
     """One level's view of the bodies.
 
@@ -73,20 +95,29 @@ class LevelBodies:
         self.seam: Seam | None = None
         self._level, self._tracks, self._settings = level, tuple(tracks), settings
         self._reach = float(level.spacing.mean())
+        self._seen: list[_Seen] = []
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> Contact | None:
         """The contact force near positions x [m], or None where nothing can touch."""
-        planes = []
-        for track in self._tracks:
-            vertex, normal, signed = track.refresh(x, track.offset + self._reach)
-            near = signed < track.offset[vertex] + self._reach
-            vertex, normal, signed = vertex[near], normal[near], signed[near]
-            offset = self._kept(track, x[vertex], normal, signed, track.offset[vertex])
-            height = (normal * x[vertex]).sum(dim=1) - signed + offset
-            planes.append(Planes(vertex.to(torch.int32), normal.contiguous(), height))
+        before = self._seen or [_Seen.none(x)] * len(self._tracks)
+        self._seen = [self._look(*each, x) for each in zip(self._tracks, before, strict=True)]
+        planes = [seen.planes() for seen in self._seen]
         if not any(len(each.vertex) for each in planes):
             return None
         return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form)
+
+    def _look(self, track: Track, seen: _Seen, x: Tensor) -> _Seen:
+        """What is seen of one body; planes of vertices that have hardly moved stay."""
+        still = seen.there & ((x - seen.at).norm(dim=1) <= STALE * self._level.spacing)
+        reach = track.offset + self._reach
+        vertex, normal, signed = track.refresh(x, torch.where(still, torch.full_like(reach, -torch.inf), reach))
+        near = signed < reach[vertex]
+        vertex, normal, signed = vertex[near], normal[near], signed[near]
+        offset = self._kept(track, x[vertex], normal, signed, track.offset[vertex])
+        out = _Seen(still, torch.where(still.unsqueeze(1), seen.at, x), seen.normal.clone(), seen.height.clone())
+        out.there[vertex], out.normal[vertex] = True, normal
+        out.height[vertex] = (normal * x[vertex]).sum(dim=1) - signed + offset
+        return out
 
     def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], int]:
         """Move free vertices that are under the least clearance to it, and farther where a body comes through a face.

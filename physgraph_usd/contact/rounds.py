@@ -53,7 +53,7 @@ def solve_touching(
     outward: Float[Tensor, " garments"] | None,
     budget: Budget,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
-    """Solve one level: draw out what crosses, leave the saddle, then rounds, and what follows them.
+    """Solve one level: mend and draw out what crosses, leave the saddle, then rounds, and what follows them.
 
     Results are those of `solve_rounds`.
 
@@ -69,6 +69,9 @@ def solve_touching(
     """
     most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS * (outward is None)
     x = view.closed(x)
+    if view.cloth is not None and level.index and (outward is not None or not view.cloth.before.crossings.count):
+        # What a coarser level or the last frame made cross; where a warm frame's input crosses too, it is drawn out.
+        x = view.cloth.mend(x).x
     x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
     if outward is not None:
         x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
@@ -128,7 +131,7 @@ def untangle_last(
     if view.cloth is None or not view.cloth.look(x).crossings.count:
         return x, reports
     best = view.cloth.mend(x)
-    most = view.cloth.most_strain(best.x)
+    most = view.cloth.most_strain(best.x) if best.crossings.count else 0.0
     for _ in range(LAST_TRIES):
         if not best.crossings.count:
             break
