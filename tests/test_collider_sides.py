@@ -16,7 +16,7 @@ from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.colliders.sign import signed_distances
+from physgraph_usd.colliders.sign import _sides, signed_distances
 from physgraph_usd.contact.track import Track
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.shot import inspect_shot
@@ -281,3 +281,14 @@ def test_sides_are_right_again_after_creeping_through_a_surface(seed: int):
             assert bool(((found > 0) == (height > 0)).all()), height
         if abs(height) > 2e-6:
             assert float((normal - torch.tensor([0.0, 1.0, 0.0])).norm(dim=1).max()) < 0.05
+
+
+def test_a_side_that_changes_is_compared_with_its_neighbours():
+    """Points in a row, deep in a ball, of which the first alone is told so: the others follow one after another."""
+    (surface,) = surfaces(ball(0.5), "auto")
+    x = torch.tensor([[0.01 * place, 0.0, 0.0] for place in range(5)], dtype=torch.float64)
+    told = torch.tensor([-1.0, 1.0, 1.0, 1.0, 1.0], dtype=torch.float64)
+    edges = torch.tensor([[place, place + 1] for place in range(4)], dtype=torch.int32)
+    distance = torch.full((5,), 0.4, dtype=torch.float64)
+    sides = _sides(surface, x, distance, near=torch.arange(5), told=told, edges=edges)
+    assert sides.tolist() == [-1.0] * 5
