@@ -45,9 +45,8 @@ def test_what_crosses_at_a_levels_start_is_mended(warm):
     contact = contact_of(levels, [garment], cage)
     view, fine = contact.at(levels[1]), levels[1]
     x = fine.base.apply(cage)
-    over = torch.nonzero((x[:, 1] > 0.3 * EDGE) & (x[:, 2].abs() < EDGE) & ((x[:, 0] - 3 * EDGE).abs() < EDGE)).squeeze(
-        1
-    )
+    above = (x[:, 1] > 0.3 * EDGE) & (x[:, 2].abs() < EDGE)
+    over = torch.nonzero(above & ((x[:, 0] - 3 * EDGE).abs() < EDGE)).squeeze(1)
     x[over[len(over) // 2], 1] -= 0.8 * EDGE
     assert view.cloth is not None
     assert view.cloth.look(x).crossings.count > 0
