@@ -28,13 +28,32 @@ class TestHeldMetric:
         stiff = torch.linspace(0.0, 5.0, 12, dtype=torch.float64)
         force = torch.randn((12, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(3))
         held = matrix + np.diag(stiff.numpy())
-        smooth = np.linalg.solve(held, force.numpy())
+        let = np.diag(np.sqrt(np.diag(matrix) / np.diag(held)))
+        smooth = let @ np.linalg.solve(matrix, let @ force.numpy())
         rough = force.numpy() / np.diag(held)[:, None]
         answer = contact_metric.SMOOTH * smooth + contact_metric.ROUGH * rough
         metric = HeldMetric(plain, stiff)
-        np.testing.assert_allclose(metric.smooth(force).numpy(), smooth, rtol=1e-6)
-        np.testing.assert_allclose(metric.solve(force).numpy(), answer, rtol=1e-6)
+        np.testing.assert_allclose(metric.solve(force).numpy(), answer, rtol=1e-6, atol=1e-6)
+        known = metric.held(force)
+        assert known is not None
+        np.testing.assert_allclose(known.numpy(), smooth, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(metric.smooth(force).numpy(), np.linalg.solve(held, force.numpy()), rtol=1e-6)
         np.testing.assert_allclose(metric.diagonal.numpy(), np.diag(held), rtol=1e-6)
+
+    def test_what_it_answered_is_known_of_that_force_alone(self):
+        metric = HeldMetric(chain()[0], torch.ones(12, dtype=torch.float64))
+        force = torch.ones((12, 3), dtype=torch.float64)
+        assert metric.held(force) is None
+        metric.solve(force)
+        assert metric.held(force.clone()) is None
+        assert metric.held(force) is not None
+        force[0] = 2.0
+        assert metric.held(force) is None
+
+    def test_quasi_newton_needs_no_factor(self, monkeypatch):
+        monkeypatch.setattr(Metric, "plus", lambda *_: (_ for _ in ()).throw(AssertionError("factorised")))
+        metric = HeldMetric(chain()[0], torch.ones(12, dtype=torch.float64))
+        assert bool(metric.solve(torch.ones((12, 3), dtype=torch.float64)).isfinite().all())
 
     def test_a_large_level_is_not_factorised_again(self, monkeypatch):
         plain, matrix = chain()
@@ -65,5 +84,6 @@ def test_cloth_that_crosses_cloth_is_not_worth_a_factor(tangled, monkeypatch):
     cloth.tangled = tangled
     metric = LevelContact(None, cloth, rounds=3).metric(plain, [touch], torch.zeros((12, 3), dtype=torch.float64))
     assert isinstance(metric, HeldMetric)
+    metric.smooth(torch.zeros((12, 3), dtype=torch.float64))
     assert len(made) == (not tangled)
     assert torch.equal(metric.stiff, 3.0 * pushed)  # The rough part takes it up all the same.

@@ -1,21 +1,25 @@
 """The preconditioner of cloth that something touches.
 
-    P = s (H0 + K)^-1 + w (D + K)^-1
+    P = s R H0^-1 R + w (D + K)^-1,   R = (D / (D + K))^1/2
 
 | symbol | meaning |
 |---|---|
 | H0 | the level's metric |
 | K | stiffness of what touches, a diagonal: three times its mean over directions, since a plane holds in one of them |
 | D | the diagonal of H0 |
+| R H0^-1 R | answers smooth moves; R takes from what is held the moves that it cannot make |
 | s, w | `SMOOTH`, `ROUGH`: about so much that a first step needs no shortening |
 
 H0 answers smooth moves well and rough ones as cloth at rest would. What touches leaves rough errors: planes that turn
-from vertex to vertex, cloth that was pushed out. The diagonal answers those, so few steps get far. Above `REFACTORED`
-vertices K is left out of the first term: a factor would cost more than the steps that it saves. So it is while cloth
-crosses cloth: what pushes changes sides after every few steps.
+from vertex to vertex, cloth that was pushed out. The diagonal answers those, so few steps get far.
+
+The network asks for smooth moves alone, and learned them from (H0 + K)^-1: it gets those, up to `REFACTORED` vertices,
+above which a factor would cost more than the steps that it saves. R costs nothing and takes quasi-Newton as far.
 """
 
 from __future__ import annotations
+
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -42,11 +46,14 @@ class HeldMetric:
         Args:
             plain: The level's metric.
             stiff: K [N/m].
-            factored: Whether the first term takes it up, where that pays.
+            factored: Whether smooth moves alone are those of a factor that takes it up, where that pays.
         """
         self.stiff = stiff
-        self._smooth = plain.plus(stiff) if factored and len(stiff) <= REFACTORED else plain
-        self._rough = (ROUGH / (plain.diagonal.to(stiff) + stiff)).unsqueeze(1)
+        self._plain, self._factored = plain, factored and len(stiff) <= REFACTORED
+        own = plain.diagonal.to(stiff)
+        self._let = (own / (own + stiff)).sqrt().unsqueeze(1)
+        self._rough = (ROUGH / (own + stiff)).unsqueeze(1)
+        self._last: tuple[Tensor, int, Tensor] | None = None
 
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
         """Whether it holds enough of another stiffness [N/m]."""
@@ -59,8 +66,21 @@ class HeldMetric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """P F [m]; zero where a vertex may not move, provided that the force is."""
-        return torch.addcmul(SMOOTH * self._smooth.solve(force), self._rough, force)
+        held = self._plain.solve(force * self._let).mul_(self._let)
+        self._last = force, force._version, held
+        return torch.addcmul(SMOOTH * held, self._rough, force)
+
+    def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"] | None:
+        """R H0^-1 R F [m], by which the remaining move is judged, of the force solved for last; None of any other."""
+        if self._last is None or self._last[0] is not force or self._last[1] != force._version:
+            return None
+        return self._last[2]
 
     def smooth(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """(H0 + K)^-1 F [m], by which the remaining move is judged."""
+        """(H0 + K)^-1 F [m]; H0^-1 F where K is not taken up."""
         return self._smooth.solve(force)
+
+    @cached_property
+    def _smooth(self) -> Metric:
+        """The factor by which smooth moves are answered."""
+        return self._plain.plus(self.stiff) if self._factored else self._plain

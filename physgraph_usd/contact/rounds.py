@@ -190,8 +190,8 @@ def solve_rounds(
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
             resume=kept[-1] if last is not None and system.shares_metric(last) else None,
         )
-        if isinstance(system.metric, HeldMetric):
-            report.remaining_move = system.remaining_move(system.metric.smooth(kept[-1].force))
+        held = system.metric.held(kept[-1].force) if isinstance(system.metric, HeldMetric) else None
+        report.remaining_move = report.remaining_move if held is None else system.remaining_move(held)
         last, x = system, view.closed(x)
         reports.append(report)
         left -= report.steps
