@@ -7,7 +7,7 @@ import pytest
 import torch
 from bodies import around, ball, box, distances, endless, flipped, split, surfaces, together, tube
 
-from physgraph_usd.colliders.mesh import MeshBody
+from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.orient import pieces_of
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.colliders.primitives import ShapeSurface
@@ -136,6 +136,18 @@ class TestMeshes:
         (surface,) = body.pose(MeshPose(2.0 * points + 5.0, triangles))
         x = np.array([[5.0, 5.0, 5.5]])
         assert signed_by(surface, x)[0] == pytest.approx(0.1, abs=2e-3)
+
+    def test_what_stands_still_is_not_posed_again(self, monkeypatch):
+        points, triangles = ball()
+        body = MeshBody(device="cpu", lanes=1)
+        body.pose(MeshPose(points, triangles))
+        posed: list[MeshPose] = []
+        monkeypatch.setattr(MeshSurface, "repose", lambda _, pose: posed.append(pose))
+        body.pose(MeshPose(points.copy(), triangles))
+        assert not posed
+        points += 1.0  # A pose may be written over in place.
+        body.pose(MeshPose(points, triangles))
+        assert len(posed) == 1
 
     def test_the_topology_may_change(self):
         body = MeshBody(device="cpu", lanes=1)

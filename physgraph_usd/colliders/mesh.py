@@ -18,6 +18,8 @@ from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
 from .pose import MeshPose
 
+wp.set_module_options({"enable_backward": False})
+
 Rim = tuple[np.ndarray, np.ndarray]
 """Rim edges and rim corners of open triangles, as `Pieces` has them."""
 LIFT = 1e-4
@@ -297,7 +299,7 @@ class MeshBody:
         """Remember where and how to build; ``side`` is one of `sides.SIDES`."""
         self._side, self._device, self._lanes = side, device, lanes
         self._triangles: np.ndarray | None = None
-        self._count = 0
+        self._points = np.zeros((0, 3))
         self._surfaces: tuple[MeshSurface, ...] = ()
 
     def pose(self, pose: MeshPose) -> tuple[MeshSurface, ...]:
@@ -306,13 +308,15 @@ class MeshBody:
             pose.triangles is self._triangles or np.array_equal(pose.triangles, self._triangles)
         )
         finite = bool(np.isfinite(pose.points).all())
-        if same and len(pose.points) == self._count and finite:
-            for surface in self._surfaces:
-                surface.repose(pose)
+        if same and pose.points.shape == self._points.shape and finite:
+            if not np.array_equal(pose.points, self._points):  # What stands still keeps what was found out about it.
+                for surface in self._surfaces:
+                    surface.repose(pose)
+            self._points = pose.points.copy()
             return self._surfaces
         pieces = pieces_of(pose.points, pose.triangles, side=self._side)
         self._surfaces = tuple(self._build(pose, pieces))
-        self._triangles, self._count = (pose.triangles if finite else None), len(pose.points)
+        self._triangles, self._points = (pose.triangles if finite else None), pose.points.copy()
         return self._surfaces
 
     def _build(self, pose: MeshPose, pieces: Pieces) -> list[MeshSurface]:

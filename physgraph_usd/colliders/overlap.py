@@ -16,6 +16,8 @@ from torch import Tensor
 from ..mesh.lanes import LEAST_QUERIES, Launch
 from ..mesh.piercing import passes_through
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def _pierces(x: wp.array(dtype=wp.vec3f), t: wp.vec3i, u: wp.vec3i):

@@ -18,6 +18,8 @@ from ..mesh.lanes import Launch
 from .pose import ShapePose
 from .primitives import ShapeSurface
 
+wp.set_module_options({"enable_backward": False})
+
 KNOTS = wp.constant(8)
 BISECTIONS = wp.constant(20)
 NUDGE = 1e-5 * np.array([0.612, 0.354, 0.707])

@@ -8,6 +8,8 @@ import warp as wp
 
 from .proximity import closest_on_triangle, places_inside
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.kernel
 def faces_again(

@@ -8,6 +8,8 @@ import warp as wp
 
 from ..mesh.piercing import passes_through
 
+wp.set_module_options({"enable_backward": False})
+
 FAR = 1e30
 """Corner of a box that holds nothing."""
 SLOTS = 4

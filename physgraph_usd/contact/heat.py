@@ -16,6 +16,8 @@ from ..colliders.sign import signed_distances
 from ..mesh.lanes import Launch
 from .measure import depths
 
+wp.set_module_options({"enable_backward": False})
+
 LAYERS = wp.constant(8)
 """Most faces along an edge that are looked at."""
 

@@ -19,6 +19,8 @@ from ..colliders.mesh import MeshSurface
 from ..level import Level
 from ..mesh.lanes import LEAST_QUERIES, Launch
 
+wp.set_module_options({"enable_backward": False})
+
 DETOUR = 1.05
 """The nearest face is buried where the way out is longer than this, over the distance to it."""
 COVER = 0.6

@@ -13,6 +13,8 @@ import warp as wp
 from .beside import bits_beside, bits_of_edge, is_own_edge, is_own_face
 from .cluster_kernels import FAR, are_apart
 
+wp.set_module_options({"enable_backward": False})
+
 LEAST = 1e-9
 """Distance under which two parts have no direction from one to the other [m]."""
 POINT = 1e-12

@@ -13,6 +13,8 @@ from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
 from ..mesh.lanes import LEAST_QUERIES, Launch
 
+wp.set_module_options({"enable_backward": False})
+
 OFF = 1e-5
 """How far off the surface a ray starts, so that it does not meet where it starts [m]."""
 

@@ -19,6 +19,8 @@ from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 from ..mesh.topology import incidence
 
+wp.set_module_options({"enable_backward": False})
+
 
 @runtime_checkable
 class Force(Protocol):

@@ -35,6 +35,8 @@ from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
 from .stretch import garment_area
 
+wp.set_module_options({"enable_backward": False})
+
 PAPER_HINGE = 3.46
 """The paper's k_b over D: both in N m."""
 

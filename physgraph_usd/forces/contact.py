@@ -31,6 +31,8 @@ from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 
+wp.set_module_options({"enable_backward": False})
+
 FORMS = ("quadratic", "linear")
 
 

@@ -41,6 +41,8 @@ from ..mesh.stencil import add_at
 from .base import Elements, Force, element_overloads
 from .stretch import Stretch, garment_area
 
+wp.set_module_options({"enable_backward": False})
+
 POISSON = 1.0 / 3.0
 """Poisson's ratio between warp and weft; edge springs have the same."""
 

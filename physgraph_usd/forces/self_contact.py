@@ -29,6 +29,8 @@ from torch import Tensor
 from ..level import Level
 from .base import Elements, element_overloads
 
+wp.set_module_options({"enable_backward": False})
+
 
 @dataclass(frozen=True, eq=False)
 class Gaps:

@@ -32,6 +32,8 @@ from ..level import Level
 from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
 
+wp.set_module_options({"enable_backward": False})
+
 PAPER_SPRING = 2.598
 """The paper's k_s over Y: both in N/m."""
 

@@ -29,6 +29,8 @@ from ..mesh.stencil import SCALAR, VECTOR, Stencil, vectors
 from ..mesh.topology import incidence
 from .base import Surface
 
+wp.set_module_options({"enable_backward": False})
+
 PARTS = ("normal", "strain", "smooth")
 SHOWN = 30.0
 """What strains are multiplied by before a network sees them `squashed`."""

@@ -17,6 +17,8 @@ import warp as wp
 from .around import normal_of
 from .network import FLOOR, LOG_OFFSET, LOG_SCALE
 
+wp.set_module_options({"enable_backward": False})
+
 NORMAL, STRAIN = 1, 2
 """Parts of a vector that the kernels take themselves; 0 is a row as it is: a whole vector or its mean."""
 Parts = tuple[tuple[int, int], ...]

@@ -24,6 +24,8 @@ from .around import Around
 from .features import NORMAL, STRAIN, Parts, seeing
 from .network import FLOOR, LOG_OFFSET, LOG_SCALE, Physgraph, PhysgraphConfig, clock_of, counted, families_of, pairs_of
 
+wp.set_module_options({"enable_backward": False})
+
 
 def can_fuse(config: PhysgraphConfig, dtype: torch.dtype) -> bool:
     """Whether the kernels cover a network: no messages, float32."""

@@ -41,6 +41,8 @@ from ..mesh.stencil import SCALAR, VECTOR, vectors
 from .dissection import dissect
 from .fronts import Tree, joined
 
+wp.set_module_options({"enable_backward": False})
+
 BLOCK = 64
 """Threads that share a row's sum on CUDA."""
 

@@ -30,6 +30,8 @@ from torch import Tensor
 from ..mesh.lanes import Launch
 from .base import Carry, System
 
+wp.set_module_options({"enable_backward": False})
+
 SECANTS = 5
 """Secant pairs kept."""
 FORCE, IMAGE, ROWS = 3 * SECANTS, 3 * SECANTS + 1, 3 * SECANTS + 2

@@ -18,6 +18,8 @@ from torch import Tensor
 
 from .lanes import Launch
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.kernel
 def _gather_rows(

@@ -22,6 +22,8 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 ITERATIONS = 3
 """Iterations of the solver in each step, between two looks at the external force: ten gained less per millisecond."""
 MASS = {"vbd": 0.15, "xpbd": 0.5}
