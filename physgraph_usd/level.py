@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .mesh.defects import FLAT
 from .mesh.diagonals import quad_edges
+from .mesh.lengths import EdgeLengths
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, smooth, subdivide_times
 from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, hinges_of
@@ -117,6 +118,11 @@ class Level:
     def free(self) -> Bool[Tensor, "vertices 1"]:
         """False where a vertex follows the coarse cloth exactly or belongs to no triangle."""
         return ((self.pin < 1.0 - PIN_MARGIN) & (self.vertex_area > 0)).unsqueeze(1)
+
+    @cached_property
+    def lengths(self) -> EdgeLengths:
+        """Gives the edges' lengths at positions [m]."""
+        return EdgeLengths(self.edges, self.rest, lanes=self.lanes)
 
     @cached_property
     def base(self) -> Stencil:

@@ -52,6 +52,8 @@ STALE, FEW, MOST = 0.1, 1e-3, 0.35
 has, and everywhere where more than the last part has."""
 LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
+EVERYWHERE = 0.5
+"""Part of the vertices in patches that may touch something beyond which all are asked from then on, and no patches."""
 OUT = 0.5
 """How far crossing parts are moved past one another in a round, in mean edges."""
 FRONTAL = 0.3
@@ -158,7 +160,7 @@ class ClothView:
         self._sides: Tensor | None = None
         self._found: _Found | None = None
         self._looked: ClothState | None = None
-        self.tangled = False
+        self.tangled, self._everywhere = False, False
         self.allowed: ClothState | None = None
         self._reach = float(thickness.max()) + (AHEAD if level.index else 1.0) * float(level.spacing.mean())
 
@@ -184,11 +186,19 @@ class ClothView:
             if float(moved.to(x.dtype).mean()) < LOCAL:
                 self._mesh.move(x)
                 return ClothState(x, self._mesh.crossings_since(known.crossings, moved), version=x._version)
-        busy = self._regions.busy(x, 0.0)
+        busy = self._busy(x, 0.0)
         if not bool(busy.any()):
             return ClothState(x, Crossings.none(x.device), near=False, version=x._version)
         self._mesh.move(x)
         return ClothState(x, self._mesh.crossings(busy), version=x._version)
+
+    def _busy(self, x: Tensor, reach: float) -> Bool[Tensor, " vertices"]:
+        """Vertices in patches that may come nearer to another than a reach [m], or all of them."""
+        if not self._everywhere:
+            busy = self._regions.busy(x, reach)
+            self._everywhere = float(busy.to(x.dtype).mean()) > EVERYWHERE
+            return busy
+        return torch.ones_like(self._level.free[:, 0])
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | Spheres | None:
         """The force between parts that are near one another, or None where no parts are.
@@ -239,7 +249,7 @@ class ClothView:
             part = float(moved.to(x.dtype).mean())
             if part < FEW and not self.tangled:
                 return known.pairs, none
-        busy = self._regions.busy(x, self._reach)
+        busy = self._busy(x, self._reach)
         if not bool(busy.any()):
             self._found = None
             return None, none

@@ -175,8 +175,9 @@ class ClothMesh:
         self._ask_faces(busy & again, limit, found)
         # An edge near another has a vertex near a face, or next to one that is.
         close = self.grown(found.close(level), 1) & beside
-        unknown, (first, second) = close | again, self._ends
-        found.edge[unknown[first] | unknown[second]] = -1
+        if known is not None:
+            unknown, (first, second) = close | again, self._ends
+            found.edge[unknown[first] | unknown[second]] = -1
         self._ask_edges(close, limit, found)
         return found
 
@@ -233,8 +234,7 @@ class ClothMesh:
 
     def _strains(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:
         """What each edge is strained by."""
-        first, second = self._ends
-        return ((x[second] - x[first]).norm(dim=1) / self.level.rest_length - 1.0).abs()
+        return (self.level.lengths(x) / self.level.rest_length - 1.0).abs()
 
     @cached_property
     def _ends(self) -> tuple[Tensor, Tensor]:

@@ -196,7 +196,7 @@ def pierced(
         distance: Unsigned distances at x, or lower bounds; infinite for cloth that does not feel the surface [m].
     """
     first, second = level.edges.long().T.contiguous()
-    length = (x[second] - x[first]).norm(dim=1)
+    length = level.lengths(x)
     near = torch.nonzero(distance[first] + distance[second] <= length).squeeze(1)
     none, start, end = near[:0], x[first[near]], x[second[near]]
     if not isinstance(surface, MeshSurface):
