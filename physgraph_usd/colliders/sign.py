@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..mesh.lengths import EdgeLengths
 from ..mesh.topology import joined_by
 from .base import Nearest, Surface
 
@@ -45,12 +46,22 @@ def signed_distances(
         edges: Pairs of points that are near each other.
         reach: Distance over which only the side is told [m].
     """
+    return signed_and_closest(surface, x, edges, reach=reach)[0]
+
+
+def signed_and_closest(
+    surface: Surface, x: Float[Tensor, "vertices 3"], edges: Int[Tensor, "edges 2"], *, reach: float
+) -> tuple[Float[Tensor, " vertices"], Nearest | None]:
+    """The same, and the closest points of those with negative distances; None where one of them was out of reach.
+
+    Arguments are those of `signed_distances`.
+    """
     low, high = (torch.as_tensor(corner, dtype=x.dtype, device=x.device) for corner in surface.bounds)
     away = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
     out = away.clone()
     near = torch.nonzero(away <= reach).squeeze(1)
     if not len(near):
-        return out
+        return out, None
     # Behind an open surface cloth may be at any distance.
     limit = float("inf") if surface.fixed_side is not None else max(reach, LEAST_REACH)
     found = surface.closest(x[near], torch.full_like(near, limit, dtype=x.dtype))
@@ -61,7 +72,8 @@ def signed_distances(
         out[near] *= found.side
     elif surface.closed:
         out[near] *= _sides(surface, x, out, near=near, told=found.side, edges=edges)
-    return out
+    inside = found.some(torch.nonzero(out[near] < 0).squeeze(1))
+    return out, inside if bool(inside.distance.isfinite().all()) else None
 
 
 def behind(found: Nearest, side: Float[Tensor, " points"] | float) -> Bool[Tensor, " points"]:
@@ -82,30 +94,20 @@ def _sides(
     Taken from the closest points where they tell. Where that contradicts a neighbour that no surface divides it from,
     as it does where a face is buried in part only, and where they do not tell, the winding number does.
     """
-    ends = edges.long().T.contiguous()
+    ends, length = edges.long(), EdgeLengths(edges.to(torch.int32), x)(x)
+    clear = ends[is_clear(distance[ends[:, 0]] + distance[ends[:, 1]], length)]
     side = torch.ones(len(x), dtype=x.dtype, device=x.device)
     side[near] = told
-    settled, seen = torch.zeros(len(x), dtype=torch.bool, device=x.device), side <= 0
-    clear = _clear_edges(x, distance, ends, seen)
+    settled = torch.zeros(len(x), dtype=torch.bool, device=x.device)
     unsure = (side == 0) | _contradicted(side, clear)
     while bool(unsure.any()):
-        if bool((unsure & ~seen).any()):  # What may change its side is compared with all its neighbours.
-            seen = seen | unsure
-            clear = _clear_edges(x, distance, ends, seen)
         which = torch.nonzero(unsure).squeeze(1)
-        group, one = _joined(which, clear[unsure[clear[:, 0]] & unsure[clear[:, 1]]], len(x))
+        group, one = _joined(which, clear[unsure[clear].all(dim=1)], len(x))
         inside = surface.inside(x[which[one]])
         side[which] = 1.0 - 2.0 * inside.to(x.dtype)[group]
         settled |= unsure
         unsure = _contradicted(side, clear) & ~settled
     return side[near]
-
-
-def _clear_edges(x: Tensor, distance: Tensor, ends: Tensor, seen: Tensor) -> Int[Tensor, "edges 2"]:
-    """Edges that no surface divides, of those with an end among some vertices: of all others both ends are outside."""
-    first, second = ends[:, seen[ends[0]] | seen[ends[1]]]
-    clear = is_clear(distance[first] + distance[second], (x[first] - x[second]).norm(dim=1))
-    return torch.stack([first[clear], second[clear]], dim=1)
 
 
 def _contradicted(side: Tensor, clear: Tensor) -> Bool[Tensor, " vertices"]:

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..colliders.base import Surface
-from ..colliders.sign import signed_distances
+from ..colliders.base import Nearest, Surface
+from ..colliders.sign import signed_and_closest, signed_distances
 from ..forces.contact import Contact, Planes
 from ..forces.seam import Seam
 from ..level import Level
@@ -267,6 +267,7 @@ class FrameBodies:
 
     touching: tuple[Touching, ...]
     distances: list[Float[Tensor, " vertices"]]
+    _inside: list[Nearest | None]
     _tracks: list[Track] = field(default_factory=list)
     _settings: ContactSettings = field(default_factory=ContactSettings)
     _views: dict[int, LevelBodies] = field(default_factory=dict)
@@ -291,17 +292,19 @@ class FrameBodies:
         """
         finest = levels[-1]
         base = finest.base.apply(coarse)
-        tracks = []
+        tracks, inside = [], []
         for each in touching:
             shift = torch.as_tensor(origin - each.surface.origin).to(base)
             offset = torch.as_tensor(each.offset).to(base)[finest.vertex_garment.long()]
             reach = float(offset.max()) + float(levels[0].spacing.mean())
-            known = signed_distances(each.surface, base + shift, finest.edges, reach=reach)
-            known = torch.where(offset.isfinite(), known, torch.full_like(known, float("inf")))
+            known, closest = signed_and_closest(each.surface, base + shift, finest.edges, reach=reach)
+            feels = offset.isfinite()
+            known = torch.where(feels, known, torch.full_like(known, float("inf")))
+            inside.append(closest if bool(feels.all()) else None)
             side = _start_sides(each.surface, coarse + shift, finest)
             longest = PINCHED * float(levels[0].spacing.mean())
             tracks.append(Track(each.surface, shift, offset, side, base, known, longest))
-        return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], tracks, settings)
+        return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], inside, tracks, settings)
 
     def measure(
         self,
@@ -322,17 +325,18 @@ class FrameBodies:
             lost: Vertices of cloth that lies between overlapping parts, or None.
         """
         bodies: dict[str, object] = {}
-        for each, track, before in zip(self.touching, self._tracks, self.distances, strict=True):
+        known = zip(self.touching, self._tracks, self.distances, self._inside, strict=True)
+        for each, track, before, inside in known:
             surface, shift = each.surface, track.shift
             after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
-            through = len(track.pierced(finest, x, after.abs()))
-            left = {"held": held, "lost": lost, "crossings": through}
+            through, longest = len(track.pierced(finest, x, after.abs())), track.longest
+            first = penetration(surface, finest, base + shift, before, longest=longest, inside=inside)
+            last = penetration(
+                surface, finest, x + shift, after, longest=longest, held=held, lost=lost, crossings=through
+            )
             name = each.path if surface.closed else f"{each.path} (open part)"
-            bodies[name] = {
-                "before": asdict(penetration(surface, finest, base + shift, before, longest=track.longest)),
-                "after": asdict(penetration(surface, finest, x + shift, after, longest=track.longest, **left)),
-            }
+            bodies[name] = {"before": asdict(first), "after": asdict(last)}
         return {"bodies": bodies}
 
     def at(self, level: Level, finest: Level) -> LevelBodies:

@@ -60,6 +60,7 @@ def penetration(
     longest: float,
     held: Bool[Tensor, " vertices"] | None = None,
     lost: Bool[Tensor, " vertices"] | None = None,
+    inside: Nearest | None = None,
     crossings: int | None = None,
 ) -> Penetration:
     """Measure one garment group against one surface.
@@ -72,16 +73,17 @@ def penetration(
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
         held: Vertices that count as pinched there however short the way out, or None.
         lost: Vertices of cloth that lies between overlapping parts, or None.
+        inside: The closest points of vertices with negative distances, where they are known.
         crossings: How many edges pass through faces, where that is known.
     """
     free = level.free[:, 0]
-    depth, stays = depths(surface, x, signed, longest, held=held, lost=lost)
+    depth, stays = depths(surface, x, signed, longest, held=held, lost=lost, inside=inside)
     deep = (depth > DEEP) & ~stays
-    inside = int((deep & free).sum())
+    count = int((deep & free).sum())
     deepest = float((depth * (free & ~stays)).max()) if len(depth) else 0.0
     return Penetration(
-        inside=inside,
-        percent=round(100.0 * inside / max(int(free.sum()), 1), 4),
+        inside=count,
+        percent=round(100.0 * count / max(int(free.sum()), 1), 4),
         deepest_mm=round(1e3 * deepest, 4),
         pinned=int((deep & ~free).sum()),
         pinched=int((stays & free).sum()),
@@ -97,6 +99,7 @@ def depths(
     *,
     held: Bool[Tensor, " vertices"] | None = None,
     lost: Bool[Tensor, " vertices"] | None = None,
+    inside: Nearest | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
     """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched.
 
@@ -107,11 +110,12 @@ def depths(
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
         held: Vertices that count as pinched there however short the way out, or None.
         lost: Vertices of cloth that lies between overlapping parts, or None.
+        inside: The closest points of vertices with negative distances, where they are known.
     """
     depth, stays = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
     within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
     if len(within):
-        found = surface.closest(x[within], torch.full_like(signed[within], float("inf")))
+        found = inside or surface.closest(x[within], torch.full_like(signed[within], float("inf")))
         way = surface.exit(x[within], found)
         known = {name: each[within] for name, each in (("held", held), ("lost", lost)) if each is not None}
         depth[within], stays[within] = way.distance, pinched(surface, x[within], found, way, longest=longest, **known)
@@ -247,7 +251,7 @@ class _Cloth:
     @classmethod
     def of(cls, level: Level, feels: Bool[Tensor, " vertices"]) -> _Cloth:
         """The faces of the garments that have a vertex that feels."""
-        garments = tuple(torch.unique(level.vertex_garment[feels]).tolist())
+        garments = tuple(index for index, span in enumerate(level.spans) if bool(feels[span].any()))
         known = cls._known.setdefault(level, {})
         if garments not in known:
             known[garments] = cls(level, garments)

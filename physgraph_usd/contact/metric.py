@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from functools import cached_property
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -51,7 +50,7 @@ class HeldMetric:
         self.stiff = stiff
         self._plain, self._factored = plain, factored and len(stiff) <= REFACTORED
         own = plain.diagonal.to(stiff)
-        self._let = (own / (own + stiff)).sqrt().unsqueeze(1)
+        self._held = plain.between((own / (own + stiff)).sqrt().unsqueeze(1))
         self._rough = (ROUGH / (own + stiff)).unsqueeze(1)
         self._last: tuple[Tensor, int, Tensor] | None = None
 
@@ -66,9 +65,9 @@ class HeldMetric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """P F [m]; zero where a vertex may not move, provided that the force is."""
-        held = self._plain.solve(force * self._let).mul_(self._let)
+        held = self._held(force)
         self._last = force, force._version, held
-        return torch.addcmul(SMOOTH * held, self._rough, force)
+        return (force * self._rough).add_(held, alpha=SMOOTH)
 
     def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"] | None:
         """R H0^-1 R F [m], by which the remaining move is judged, of the force solved for last; None of any other."""

@@ -100,6 +100,11 @@ class Metric:
         """H0^-1 F [m]; zero where a vertex may not move."""
         return self._solver(force * self._scaled).mul_(self._kept)
 
+    def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
+        """The solve of R H0^-1 R F [m], R a diagonal, in no more passes than that of H0^-1 F."""
+        before, after = self._scaled * factor, self._kept * factor
+        return lambda force: self._solver(force * before).mul_(after)
+
 
 class MergedMetric(Metric):
     """The metric of cloth some of whose vertices are one: the first of each label stands for all.
@@ -142,6 +147,10 @@ class MergedMetric(Metric):
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 of each label's force together [m], the same move for all of it."""
         return super().solve(self._gathered(force))[self._own]
+
+    def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
+        """As of `Metric`."""
+        return lambda force: self.solve(force * factor).mul_(factor)
 
     def _gathered(self, values: Tensor) -> Tensor:
         """The sum of each label's values at its first vertex."""
