@@ -244,6 +244,41 @@ class TestBacktrack:
         assert backtrack(system, carry, carry.force, float("nan")) is None
 
 
+class OnAPlateau(Quadratic):
+    """The same on top of so much energy that what it falls by near the minimum is lost in rounding errors."""
+
+    def energy_and_force(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        energy, force = super().energy_and_force(x)
+        return energy + 1e10 + 2e-6 * torch.sin(1e9 * x.sum()), force
+
+
+class TestRounding:
+    def test_steps_go_on_by_the_force_where_the_energy_tells_nothing(self):
+        plain = system_of(spd(12, 50.0), metric=np.eye(12))
+        assert isinstance(plain.field, Quadratic)
+        field = OnAPlateau(plain.field.matrix.numpy(), plain.field.minimum)
+        system = System(field, plain.metric, free=plain.free, spacing=plain.spacing)
+        _, report = solve_level(system, QuasiNewton(), start(12), level=0, budget=Budget(100, tolerance=1e-9))
+        assert report.stopped == "tolerance"
+        assert report.evaluations < 2 * report.steps
+
+    def test_a_step_that_was_shortened_much_drops_the_secants(self, monkeypatch):
+        system = system_of(spd(12, 50.0), metric=np.eye(12))
+        integrator, kept = QuasiNewton(), []
+        for share in (0.5, 0.001):
+            carry = integrator.step(system, integrator.start(system, start(12)))
+            assert len(carry.memory.pairs) == 1
+
+            def short(system, carry, direction, slope, share=share):
+                x = carry.x + share * direction
+                return x, *system.energy_and_force(x)
+
+            with monkeypatch.context() as patch:
+                patch.setattr("physgraph_usd.integrate.quasi_newton.backtrack", short)
+                kept.append(len(integrator.step(system, carry).memory.pairs))
+        assert kept == [2, 0]
+
+
 class TestNewton:
     def test_direction_on_a_quadratic_is_exact_with_the_exact_metric(self):
         matrix = spd(10, 20.0)

@@ -187,7 +187,7 @@ class ClothMesh:
         faces = torch.empty((len(count), 4), dtype=torch.int32, device=busy.device)
         clusters, inputs = self._clusters, [_vectors(self._position), _flags(busy)]
         inputs += [*clusters.edges, *clusters.edge_boxes, *clusters.faces, *clusters.face_boxes]
-        clusters.run(pierced, [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
+        clusters.run_shared(pierced, [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
         edge = torch.nonzero(count).squeeze(1)
         listed = torch.nonzero(torch.arange(4, device=edge.device) < count[edge].unsqueeze(1))
         return Crossings(edge[listed[:, 0]], faces[edge].long()[listed[:, 0], listed[:, 1]], int(count.sum()))
@@ -294,7 +294,9 @@ class ClothMesh:
         clusters = self._clusters
         inputs = [*self._asked(asked, reach), *self._beside_parts[1], *clusters.edges, *clusters.edge_boxes]
         outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.edge, dtype=wp.vec2i)]
-        clusters.run(edges_near, [*inputs, *outputs, *[wp.from_torch(each, dtype=wp.vec2f) for each in found.place]])
+        clusters.run_shared(
+            edges_near, [*inputs, *outputs, *[wp.from_torch(each, dtype=wp.vec2f) for each in found.place]]
+        )
 
     def _asked(self, asked: Tensor, reach: Tensor) -> list[object]:
         """What both proximity kernels are told first."""

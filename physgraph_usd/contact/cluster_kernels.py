@@ -237,6 +237,7 @@ def pierced(  # noqa: C901, PLR0912 - one query, each candidate refused as early
     around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
+    threads: wp.int32,
     x: wp.array(dtype=wp.vec3f),
     asked: wp.array(dtype=wp.bool),
     first_edge: wp.array(dtype=wp.int32),
@@ -253,10 +254,11 @@ def pierced(  # noqa: C901, PLR0912 - one query, each candidate refused as early
     faces: wp.array(dtype=wp.vec4i),
 ):
     """For each edge of a cluster with an end asked, how many faces it passes through, and the first of them."""
-    i = first + wp.tid()
+    i = (first + wp.tid()) / threads
+    begin, end = first_edge[i] + (first + wp.tid()) % threads, first_edge[i + 1]
     least = wp.vec3f(FAR)
     most = wp.vec3f(-FAR)
-    for k in range(first_edge[i], first_edge[i + 1]):
+    for k in range(begin, end, threads):
         a, b = edges[k][0], edges[k][1]
         if asked[a] or asked[b]:
             least = wp.min(least, edge_low[k])
@@ -268,7 +270,7 @@ def pierced(  # noqa: C901, PLR0912 - one query, each candidate refused as early
     while wp.bvh_query_next(query, j):
         if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 0.0):
             continue
-        for k in range(first_edge[i], first_edge[i + 1]):
+        for k in range(begin, end, threads):
             a, b = edges[k][0], edges[k][1]
             if not (asked[a] or asked[b]):
                 continue

@@ -26,6 +26,9 @@ from .cluster_kernels import any_of_ring, cluster_boxes, edge_boxes, rings_turn
 TURNED = math.radians(85.0)
 """Angle from a piece's mean normal beyond which it may touch itself."""
 
+THREADS = 8
+"""Threads that share a cluster's edges on CUDA."""
+
 
 class Clusters:
     """The faces of a level by cluster: each belongs where its first corner does.
@@ -98,9 +101,14 @@ class Clusters:
         """Launch over the clusters; the kernel is told first what they all share."""
         self._launch(kernel, [*self._shared, *inputs])({})
 
-    def _launch(self, kernel: wp.Kernel, inputs: Sequence[object]) -> Launch:
+    def run_shared(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
+        """The same for kernels of much work in few clusters, which on CUDA several threads share; they are told so."""
+        threads = 1 if self._level.device == "cpu" else THREADS
+        self._launch(kernel, [*self._shared, wp.int32(threads), *inputs], threads=threads)({})
+
+    def _launch(self, kernel: wp.Kernel, inputs: Sequence[object], *, threads: int = 1) -> Launch:
         given = {"device": self._level.device, "lanes": self._level.lanes, "least": LEAST_QUERIES}
-        return Launch(kernel, self.count, inputs, **given)
+        return Launch(kernel, self.count * threads, inputs, **given)
 
     def _array(self, values: np.ndarray, dtype: type = wp.int32) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=dtype, device=self._level.device)

@@ -246,6 +246,7 @@ def faces_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
 def box_of_edges(
     begin: wp.int32,
     end: wp.int32,
+    step: wp.int32,
     edges: wp.array(dtype=wp.vec2i),
     number: wp.array(dtype=wp.int32),
     asked: wp.array(dtype=wp.bool),
@@ -257,7 +258,7 @@ def box_of_edges(
     """The box within reach of the edges with an end asked, for which nothing is known from now on."""
     least = wp.vec3f(FAR)
     most = wp.vec3f(-FAR)
-    for k in range(begin, end):
+    for k in range(begin, end, step):
         a, b = edges[k][0], edges[k][1]
         if asked[a] or asked[b]:
             far = 0.5 * (reach[a] + reach[b])
@@ -280,6 +281,7 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
     around: wp.array(dtype=wp.int32),
     meets: wp.array(dtype=wp.int32),
     garments: wp.int32,
+    threads: wp.int32,
     starts: wp.array(dtype=wp.int32),
     beside: wp.array(dtype=wp.int32),
     x: wp.array(dtype=wp.vec3f),
@@ -301,9 +303,9 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
     below: wp.array(dtype=wp.vec2f),
 ):
     """For each edge with an end asked, the closest edge on either side within reach, inside both; -1 for none."""
-    i = first + wp.tid()
-    begin, end = first_edge[i], first_edge[i + 1]
-    least, most = box_of_edges(begin, end, edges, number, asked, reach, edge_low, edge_high, best)
+    i = (first + wp.tid()) / threads
+    begin, end = first_edge[i] + (first + wp.tid()) % threads, first_edge[i + 1]
+    least, most = box_of_edges(begin, end, threads, edges, number, asked, reach, edge_low, edge_high, best)
     if least[0] > most[0]:
         return
     query = wp.bvh_query_aabb(tree, least, most)
@@ -312,7 +314,7 @@ def edges_near(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
         same = cluster_garment[i] == cluster_garment[j]
         if are_apart(i, j, cluster_garment, ring_starts, ring, turns, around, meets, garments, 1.0):
             continue
-        for k in range(begin, end):
+        for k in range(begin, end, threads):
             a, b, e = edges[k][0], edges[k][1], number[k]
             if not (asked[a] or asked[b]):
                 continue

@@ -23,6 +23,8 @@ from .base import Carry, System
 
 ARMIJO = 1e-4
 MAX_BACKTRACKS = 12
+SHORTENED = 0.01
+"""Part of its length to which a step is shortened from which on the secants are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,10 @@ class QuasiNewton:
         return self._carry(carry.x, energy, force, kept)
 
     def step(self, system: System, carry: Carry) -> Carry:
-        """One secant step with a backtracking line search; the energy never rises."""
+        """One secant step with a backtracking line search; the energy never rises by more than rounding.
+
+        A step that had to be shortened much drops the secants: they misled it, and its own is mostly rounding.
+        """
         memory: _Memory = carry.memory
         direction = two_loop(carry.force, memory.image, memory.pairs)
         slope = _dot(carry.force, direction)
@@ -77,8 +82,11 @@ class QuasiNewton:
             return self._forget(system, carry)
         x, energy, force = found
         image = self._image(system, memory.scale, force)
-        pair = pair_of(x - carry.x, carry.force - force, memory.image - image)
+        move = x - carry.x
+        pair = pair_of(move, carry.force - force, memory.image - image)
         pairs = memory.pairs if pair is None else (*memory.pairs, pair)[-self._history :]
+        if _dot(move, move) < SHORTENED**2 * _dot(direction, direction):
+            pairs = ()
         return self._carry(x, energy, force, _Memory(pairs, memory.scale, image))
 
     def _carry(self, x: Tensor, energy: float, force: Tensor, memory: _Memory) -> Carry:
@@ -117,6 +125,9 @@ def backtrack(
 ) -> tuple[Tensor, float, Tensor] | None:
     """Shorten a step until the energy falls enough (Armijo), by quadratic interpolation.
 
+    Near rest what it falls by is lost in its rounding, but not in the force's: there a step also serves that does not
+    go past the least energy by farther than it started before it (Hager and Zhang 2005, the approximate Wolfe rule).
+
     Args:
         system: The system.
         carry: Where the step starts.
@@ -128,11 +139,13 @@ def backtrack(
     """
     if not slope > 0:
         return None
-    length = 1.0
+    length, rounding = 1.0, torch.finfo(carry.x.dtype).eps * abs(carry.energy)
     for _ in range(MAX_BACKTRACKS):
         x = carry.x + length * direction
         energy, force = system.energy_and_force(x)
         if energy <= carry.energy - ARMIJO * length * slope:
+            return x, energy, force
+        if energy <= carry.energy + rounding and _dot(force, direction) >= (2.0 * ARMIJO - 1.0) * slope:
             return x, energy, force
         rise = energy - carry.energy + length * slope
         guess = 0.5 * length * slope * length / rise if rise > 0 else 0.5 * length
