@@ -262,18 +262,24 @@ class TestRounding:
         assert report.stopped == "tolerance"
         assert report.evaluations < 2 * report.steps
 
+    @pytest.mark.parametrize("by_force", [False, True])
+    def test_only_who_says_so_goes_by_the_force(self, by_force: bool):
+        """The guard promises that the energy never rises, not even by its rounding."""
+        system, x = system_of(np.eye(12)), torch.zeros((12, 3), dtype=torch.float64)
+        system.field.energy_and_force = lambda at: (1e10 + 2e-6 * at.any().double(), torch.ones_like(at))  # pyright: ignore
+        carry = Carry(x, *system.energy_and_force(x))
+        assert (backtrack(system, carry, torch.ones_like(x), 36.0, by_force=by_force) is not None) == by_force
+
     @pytest.mark.parametrize(("share", "kept"), [(0.5, 2), (0.001, 0)])
     def test_a_step_that_was_shortened_much_drops_the_secants(self, share: float, kept: int, monkeypatch):
-        def short(system: System, carry: Carry, direction: torch.Tensor, slope: float):
-            assert slope > 0
+        def short(system: System, carry: Carry, direction: torch.Tensor, slope: float, **_: bool):
             x = carry.x + share * direction
             return x, *system.energy_and_force(x)
 
-        system, integrator = system_of(spd(12, 50.0), metric=np.eye(12)), QuasiNewton()
-        carry = integrator.step(system, integrator.start(system, start(12)))
-        assert len(carry.memory.pairs) == 1
+        system, method = system_of(spd(12, 50.0), metric=np.eye(12)), QuasiNewton()
+        carry = method.step(system, method.start(system, start(12)))
         monkeypatch.setattr("physgraph_usd.integrate.quasi_newton.backtrack", short)
-        assert len(integrator.step(system, carry).memory.pairs) == kept
+        assert len(method.step(system, carry).memory.pairs) == kept
 
 
 class TestNewton:

@@ -77,7 +77,7 @@ class QuasiNewton:
         slope = _dot(carry.force, direction)
         if not slope > 0:
             direction, slope = memory.image, _dot(carry.force, memory.image)
-        found = backtrack(system, carry, direction, slope)
+        found = backtrack(system, carry, direction, slope, by_force=True)
         if found is None:
             return self._forget(system, carry)
         x, energy, force = found
@@ -121,31 +121,33 @@ class _Memory:
 
 
 def backtrack(
-    system: System, carry: Carry, direction: Float[Tensor, "vertices 3"], slope: float
+    system: System, carry: Carry, direction: Float[Tensor, "vertices 3"], slope: float, *, by_force: bool = False
 ) -> tuple[Tensor, float, Tensor] | None:
     """Shorten a step until the energy falls enough (Armijo), by quadratic interpolation.
 
-    Near rest what it falls by is lost in its rounding, but not in the force's: there a step also serves that does not
-    go past the least energy by farther than it started before it (Hager and Zhang 2005, the approximate Wolfe rule).
+    Near rest what it falls by is lost in its rounding, but not in the force's: there, by the force, a step also serves
+    that does not go past the least energy by farther than it started before it (Hager and Zhang 2005, the approximate
+    Wolfe rule).
 
     Args:
         system: The system.
         carry: Where the step starts.
         direction: Displacement of the full step [m].
         slope: force . direction [J].
+        by_force: Whether that rule serves too; the energy may then rise by its rounding.
 
     Returns:
         Positions, energy and force after the step, or None when no step lowers the energy.
     """
     if not slope > 0:
         return None
-    length, rounding = 1.0, torch.finfo(carry.x.dtype).eps * abs(carry.energy)
+    length, level = 1.0, carry.energy + torch.finfo(carry.x.dtype).eps * abs(carry.energy)
     for _ in range(MAX_BACKTRACKS):
         x = carry.x + length * direction
         energy, force = system.energy_and_force(x)
         if energy <= carry.energy - ARMIJO * length * slope:
             return x, energy, force
-        if energy <= carry.energy + rounding and _dot(force, direction) >= (2.0 * ARMIJO - 1.0) * slope:
+        if by_force and energy <= level and _dot(force, direction) >= (2.0 * ARMIJO - 1.0) * slope:
             return x, energy, force
         rise = energy - carry.energy + length * slope
         guess = 0.5 * length * slope * length / rise if rise > 0 else 0.5 * length
