@@ -26,6 +26,8 @@ LIFT = 1e-4
 """How far above a vertex it is looked whether the surface is buried there, relative to the surface's size."""
 ON_EDGE = 1e-4
 """Barycentric coordinate under which a point is on an edge."""
+TOGETHER = 100_000
+"""Most faces of which CUDA is asked together what their normals tell."""
 
 
 @wp.kernel
@@ -212,15 +214,23 @@ class MeshSurface:
         return replace(bare, face=faces[bare.face.long()])
 
     def _is_mute(self, face: Tensor) -> Bool[Tensor, " points"]:
-        """Whether the normals of faces do not tell the side; each face is asked for once a pose."""
+        """Whether the normals of faces do not tell the side; each face is asked for once a pose.
+
+        On CUDA all are asked for together, where they are not too many: that takes as long as asking for a few.
+        """
         if self._mute is None:
-            self._mute = torch.full((len(self._corners),), -1, dtype=torch.int8, device=face.device)
-        told = self._mute[face.long()]
-        new = torch.unique(face[told < 0])
+            every = torch.arange(len(self._corners), dtype=torch.int32, device=face.device)
+            together = face.is_cuda and len(every) <= TOGETHER
+            self._mute = self._tells_nothing(every) if together else torch.full_like(every, -1, dtype=torch.int8)
+        new = face[self._mute[face.long()] < 0]
         if len(new):
-            self._mute[new.long()] = (self._is_buried(new) | self._is_unsure(new)).to(torch.int8)
-            told = self._mute[face.long()]
-        return told > 0
+            new = torch.unique(new)
+            self._mute[new.long()] = self._tells_nothing(new)
+        return self._mute[face.long()] > 0
+
+    def _tells_nothing(self, face: Tensor) -> Tensor:
+        """1 where a face's normal does not tell the side, else 0."""
+        return (self._is_buried(face) | self._is_unsure(face)).to(torch.int8)
 
     def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Whether faces have a corner inside the surface; each corner is asked for once a pose."""

@@ -14,6 +14,8 @@ import warp as wp
 
 from .cluster_kernels import has
 
+wp.set_module_options({"enable_backward": False})
+
 BITS = 64
 """Parts of a cluster that bits tell of; those after them are compared by their corners."""
 
@@ -49,6 +51,21 @@ def beside_table(
         wp.array(cluster[begins].astype(np.int32), dtype=wp.int32, device=device),
         wp.array(masks, dtype=wp.uint64, device=device),
     )
+
+
+@wp.kernel
+def add_neighbours(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.int32),
+    given: wp.array(dtype=wp.bool),
+    out: wp.array(dtype=wp.bool),
+):
+    """Add the neighbours of given vertices to those in ``out``."""
+    v = first + wp.tid()
+    if given[v]:
+        for k in range(starts[v], starts[v + 1]):
+            out[beside[k]] = True
 
 
 @wp.func

@@ -223,7 +223,7 @@ class LevelBodies:
     def _pierced_faces(self, track: Track, x: Tensor) -> Tensor:
         """Faces that a body comes through though none of their corners is left inside it."""
         found = track.pierced(self._level, x, (track.known.abs() - (x - track.at).norm(dim=1)).clamp_min(0.0))
-        triangles, ends = self._level.triangles.long(), self._level.edges.long()[found.edges]
+        triangles, ends = self._level.triangles.long(), self._level.edges[found.edges].long()
         hit = torch.zeros(len(triangles), dtype=torch.bool, device=x.device)
         hit[found.triangles] = True
         if len(ends):

@@ -345,7 +345,7 @@ class ClothView:
     def _gaps(self, pairs: Pairs, x: Float[Tensor, "vertices 3"], crossings: Crossings) -> Gaps:
         """Planes between parts, each on the side that it had at the start or, if ordered, that it should have."""
         corners = pairs.corners.long()
-        garment = self._level.vertex_garment.long()[corners[:, [0, 3]]]
+        garment = self._level.vertex_garment[corners[:, [0, 3]]].long()
         ordered = self._lasting.order[garment[:, 0]] != self._lasting.order[garment[:, 1]]
         ordered &= ~self._lasting.order[garment].isnan().any(dim=1)
         off = cut_off(self._mesh, crossings) if crossings.count else torch.zeros_like(self._level.free[:, 0])
@@ -378,7 +378,7 @@ class ClothView:
     def _is_split(self, off: Bool[Tensor, " vertices"]) -> Bool[Tensor, " garments"]:
         """Which garments have pieces that are cut off."""
         split = torch.zeros(len(self._level.spans), dtype=torch.bool, device=off.device)
-        split[self._level.vertex_garment.long()[off]] = True
+        split[self._level.vertex_garment[off].long()] = True
         return split
 
     def _on_wrong_side(self, pairs: Pairs, garment: Tensor, normal: Tensor) -> Bool[Tensor, " pairs"]:

@@ -18,7 +18,7 @@ from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges, joined_by
 from .again import edges_again, faces_again
-from .beside import beside_table
+from .beside import add_neighbours, beside_table
 from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
 from .nearest import Nearest, Pairs
@@ -201,7 +201,7 @@ class ClothMesh:
         """
         near = self._beside(moved, 0.0)
         found = self.crossings(near)
-        ends = self.level.edges.long()[known.edge]
+        ends = self.level.edges[known.edge].long()
         kept = ~near[ends].any(dim=1) & ~moved[self.triangles[known.face]].any(dim=1)
         edge, face = torch.cat([known.edge[kept], found.edge]), torch.cat([known.face[kept], found.face])
         order = torch.argsort(edge, stable=True)
@@ -209,14 +209,15 @@ class ClothMesh:
 
     def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
         """Vertices at most some edges away from given ones."""
-        mask = vertices.cpu().numpy()
-        for _ in range(rings if mask.any() else 0):
-            mask = mask | (self.beside @ mask.astype(np.float32) > 0)
-        return torch.as_tensor(mask, device=vertices.device)
+        for _ in range(rings):
+            given, vertices = vertices, vertices.clone()
+            inputs = [*self._rings, _flags(given), _flags(vertices)]
+            Launch(add_neighbours, len(given), inputs, device=self.level.device, lanes=self.level.lanes)({})
+        return vertices
 
     def corners_of(self, crossings: Crossings) -> Int[Tensor, "crossings 5"]:
         """Vertices of the edge and of the face of each crossing."""
-        return torch.cat([self.level.edges.long()[crossings.edge], self.triangles[crossings.face]], dim=1)
+        return torch.cat([self.level.edges[crossings.edge].long(), self.triangles[crossings.face]], dim=1)
 
     def crossed(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
         """Vertices of what crosses."""
@@ -249,8 +250,7 @@ class ClothMesh:
 
     def between(self, crossings: Crossings) -> np.ndarray:
         """Number of listed crossings between garments, the lower number first, shape (G, G)."""
-        garment = self.level.vertex_garment.cpu().numpy()
-        ends = garment[self.corners_of(crossings)[:, [0, 2]].cpu().numpy()]
+        ends = self.level.vertex_garment[self.corners_of(crossings)[:, [0, 2]]].cpu().numpy()
         table = np.zeros((self._garments, self._garments), np.int64)
         np.add.at(table, (ends.min(axis=1), ends.max(axis=1)), 1)
         return table
@@ -271,7 +271,7 @@ class ClothMesh:
         edges += [wp.from_torch(each, dtype=wp.vec2f) for each in found.place]
         Launch(edges_again, len(found.edge), [x, self._edges, *edges, wp.from_torch(slid)], **given)({})
         ends = torch.zeros_like(found.face[:, 0], dtype=torch.bool)
-        ends[self.level.edges.long()[slid].reshape(-1)] = True
+        ends[self.level.edges[slid].long().reshape(-1)] = True
         return ends
 
     def _ask_faces(self, asked: Bool[Tensor, " vertices"], reach: Tensor, found: Nearest) -> None:

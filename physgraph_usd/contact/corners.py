@@ -46,7 +46,7 @@ def lift_over(
     Returns:
         Moves [m].
     """
-    corners = level.triangles.long()[triangles]
+    corners = level.triangles[triangles].long()
     grid = _grid(x)
     points = torch.einsum("pk,tkd->tpd", grid, x[corners])
     sides = start[corners[:, :1]].expand(-1, len(grid)).reshape(-1)

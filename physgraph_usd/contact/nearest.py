@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -89,25 +88,18 @@ class Nearest:
 
     def _vertex_face(self, level: Level) -> tuple[Tensor, Tensor]:
         """Corners and weights of the pairs of a vertex and a face."""
-        corners, weights = [], []
-        for side, weight in enumerate(self.weight):
-            found = torch.nonzero(self.face[:, side] >= 0).squeeze(1)
-            three = level.triangles[self.face[found, side].long()].long()
-            corners.append(torch.cat([found.unsqueeze(1), three], dim=1))
-            weights.append(torch.cat([torch.ones_like(weight[found, :1]), -weight[found]], dim=1))
-        return torch.cat(corners), torch.cat(weights)
+        vertex, side = torch.nonzero(self.face >= 0, as_tuple=True)
+        three, weight = level.triangles[self.face[vertex, side].long()].long(), self.weight[side, vertex]
+        corners = torch.cat([vertex.unsqueeze(1), three], dim=1)
+        return corners, torch.cat([torch.ones_like(weight[:, :1]), -weight], dim=1)
 
     def _edge_edge(self, level: Level) -> tuple[Tensor, Tensor]:
         """Corners and weights of the pairs of two edges."""
-        first, second, along = [], [], []
-        for side, place in enumerate(self.place):
-            found = torch.nonzero(self.edge[:, side] >= 0).squeeze(1)
-            first.append(found)
-            second.append(self.edge[found, side].long())
-            along.append(place[found])
-        a, b, st = torch.cat(first), torch.cat(second), torch.cat(along)
+        a, side = torch.nonzero(self.edge >= 0, as_tuple=True)
+        b, st = self.edge[a, side].long(), self.place[side, a]
         # The pair that either edge found is one pair.
         key = torch.minimum(a, b) * len(level.edges) + torch.maximum(a, b)
-        kept = torch.as_tensor(np.unique(key.cpu().numpy(), return_index=True)[1], device=a.device)
+        key, order = torch.sort(key, stable=True)
+        kept = order[torch.diff(key, prepend=-torch.ones_like(key[:1])) != 0]
         a, b, s, t = a[kept], b[kept], st[kept, 0], st[kept, 1]
         return torch.cat([level.edges[a], level.edges[b]], dim=1).long(), torch.stack([1 - s, s, t - 1, -t], dim=1)

@@ -51,7 +51,7 @@ def ways_out(
     Returns:
         Directions, at most of length 1, and the place: along the edge, then barycentric on the face.
     """
-    ends, face = mesh.level.edges.long()[crossings.edge], mesh.triangles[crossings.face]
+    ends, face = mesh.level.edges[crossings.edge].long(), mesh.triangles[crossings.face]
     a, b = x[ends[:, 0]], x[ends[:, 1]]
     p, q, r = (x[face[:, i]] for i in range(3))
     along = torch.nn.functional.normalize(b - a, dim=1, eps=1e-30)
@@ -142,7 +142,7 @@ def gaps_out(
     """
     level: Level = mesh.level
     way, place = ways_out(mesh, crossings, x)
-    ends, face = level.edges.long()[crossings.edge], mesh.triangles[crossings.face]
+    ends, face = level.edges[crossings.edge].long(), mesh.triangles[crossings.face]
     corners = torch.cat([torch.cat([ends[:, i : i + 1], face], dim=1) for i in range(2)])
     share = torch.cat([1.0 - place[:, 0], place[:, 0]])
     weight = torch.cat([torch.ones_like(place[:, :1]), -place[:, 1:]], dim=1).repeat(2, 1)

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
 import scipy.sparse as sp
 import torch
 import warp as wp
@@ -17,7 +16,6 @@ from torch import Tensor
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, vectors
-from ..mesh.topology import incidence
 
 wp.set_module_options({"enable_backward": False})
 
@@ -194,9 +192,7 @@ class Elements:
         """
         self.count, width = corners.shape
         dtype, device, lanes = level.dtype, level.device, level.lanes
-        rows = incidence(corners.cpu().numpy(), level.vertex_count)
-        starts = wp.array(rows.starts, dtype=wp.int32, device=device)
-        slots = wp.array(rows.element * np.int32(width) + rows.corner, dtype=wp.int32, device=device)
+        starts, slots = gather_table(corners, level.vertex_count)
         # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
         packed = wp.from_torch(
             corners.clone(memory_format=torch.contiguous_format), dtype=wp.types.vector(length=width, dtype=wp.int32)
@@ -206,9 +202,9 @@ class Elements:
         x = vectors(torch.zeros_like(level.rest))
         own = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
         buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
-        self._kept = (corners, parameters)
+        self._kept = (corners, starts, slots, parameters)
         self._elements = Launch(kernels[dtype], self.count, [x, packed, *own, *buffers], device=device, lanes=lanes)
-        inputs = [starts, slots, buffers[1], x]
+        inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
         self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, device=device, lanes=lanes)
 
     def evaluate(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
@@ -226,6 +222,19 @@ class Elements:
         self._elements({0: vectors(x)})
         self._gather({3: vectors(force)})
         return self.energy.sum(dtype=torch.float64)
+
+
+def gather_table(
+    corners: Int[Tensor, "elements corners"], vertex_count: int
+) -> tuple[Int[Tensor, " starts"], Int[Tensor, " slots"]]:
+    """Where each vertex's corners begin, shape (V + 1,), and those corners in the order of the elements; int32.
+
+    What is found in every round of contact is sorted where it lies, on either device.
+    """
+    flat = corners.reshape(-1)
+    starts = torch.zeros(vertex_count + 1, dtype=torch.int32, device=corners.device)
+    starts[1:] = torch.bincount(flat, minlength=vertex_count).cumsum(dim=0)
+    return starts, torch.argsort(flat, stable=True).to(torch.int32)
 
 
 def element_overloads(
