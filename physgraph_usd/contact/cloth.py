@@ -18,21 +18,18 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..forces.seam import Seam
-from ..forces.self_contact import Gaps, SelfContact, Spheres
+from ..forces.self_contact import SelfContact, Spheres
 from ..level import Level
 from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh, Crossings
+from .gaps import OUT, GapFinder
 from .mend import falling_off, smoothed
 from .nearest import Nearest, Pairs
 from .regions import Regions
 from .settings import ContactSettings
-from .untangle import cut_off, gaps_out, swapped_by
+from .untangle import gaps_out
 
-LEAST_OFFSET = 0.25
-"""Part of the thickness that parts keep where the input has them closer."""
-WELDED = 0.02
-"""Part of the thickness under which the input has two points as one: a seam, which is not pushed open."""
 ZONE = 2
 """Rings round a crossing of the input within which crossings may wander."""
 SMOOTHINGS = 4
@@ -41,8 +38,6 @@ MENDS = 8
 """Most passes in all; after them the best positions found are taken."""
 TAUT, SLACK = 1.25, 0.5
 """How many times as much mending may strain the cloth beyond some strain: that shows more than a few crossings do."""
-TURNED = 0.5
-"""Cosine beyond which the way from one part to another counts as turned round since the input: one passed through."""
 SPHERE = 0.8
 """R of the paper's form, in mean edges (PAPER A13)."""
 AHEAD = 0.5
@@ -54,10 +49,6 @@ LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
 EVERYWHERE = 0.5
 """Part of the vertices in patches that may touch something beyond which all are asked from then on, and no patches."""
-OUT = 0.5
-"""How far crossing parts are moved past one another in a round, in mean edges."""
-FRONTAL = 0.3
-"""Cosine to the inner garment's normal under which a pair of ordered garments is beside it, not through it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +147,9 @@ class ClothView:
         self._lasting, self._level, self._base = lasting, level, base
         self._mesh, self._regions, self._seam = lasting.mesh(level), lasting.regions(level), seam
         self._mesh.sew(np.zeros((0, 2), np.int64) if seam is None else seam.pairs)
-        self._thickness, self._stiffness = thickness, settings.cloth_stiffness
+        self._sided = GapFinder(
+            self._mesh, base, lasting.order, lasting.outward, thickness=thickness, stiffness=settings.cloth_stiffness
+        )
         self._sides: Tensor | None = None
         self._found: _Found | None = None
         self._looked: ClothState | None = None
@@ -213,10 +206,10 @@ class ClothView:
             self._sides = x
         if pairs is None:
             return None
-        gaps = self._gaps(pairs, x, crossings)
+        gaps = self._sided.gaps(pairs, x, start=self._sides, crossings=crossings)
         if crossings.count:
-            step = OUT * float(self._level.spacing.mean())
-            gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=self._stiffness))
+            step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
+            gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=stiffness))
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
     def _spheres(self, x: Tensor) -> Spheres | None:
@@ -341,58 +334,3 @@ class ClothView:
             apart = int(np.triu(table, 1).sum())
             said[name] = {"crossings": state.crossings.count, "between_garments": apart}
         return said, self._mesh.crossed(after.crossings)
-
-    def _gaps(self, pairs: Pairs, x: Float[Tensor, "vertices 3"], crossings: Crossings) -> Gaps:
-        """Planes between parts, each on the side that it had at the start or, if ordered, that it should have."""
-        corners = pairs.corners.long()
-        garment = self._level.vertex_garment[corners[:, [0, 3]]].long()
-        ordered = self._lasting.order[garment[:, 0]] != self._lasting.order[garment[:, 1]]
-        ordered &= ~self._lasting.order[garment].isnan().any(dim=1)
-        off = cut_off(self._mesh, crossings) if crossings.count else torch.zeros_like(self._level.free[:, 0])
-        swapped, undecided = swapped_by(off[corners], pairs.face, self._is_split(off)[garment])
-        kept = (~self._mesh.crossed(crossings)[corners].any(dim=1) & ~undecided) | ordered
-        pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
-        corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
-        start = x if self._sides is None else self._sides
-        way, at_input, at_start = (
-            (pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self._base, start)
-        )
-        normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
-        distance = at_input.norm(dim=1)
-        turned = (normal * at_start).sum(dim=1) < -TURNED * at_start.norm(dim=1)
-        wrong = turned ^ swapped
-        if bool(ordered.any()):
-            wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), wrong)
-        normal = torch.where(wrong.unsqueeze(1), -normal, normal)
-        thickness = self._thickness[garment].mean(dim=1)
-        offset = torch.minimum(thickness, torch.maximum(distance, LEAST_OFFSET * thickness))
-        offset = torch.where(distance < WELDED * thickness, torch.zeros_like(offset), offset)
-        offset = torch.where(wrong & ordered, thickness, offset)
-        # What is on the wrong side comes back a little each round: all at once would tear the cloth.
-        most = OUT * float(self._level.spacing.mean())
-        offset = torch.where(wrong, torch.minimum(offset, most - way.norm(dim=1)), offset)
-        area = self._level.vertex_area[corners]
-        share = torch.where(pairs.face, area[:, 0], area.amin(dim=1) / 3.0)
-        return Gaps(pairs.corners, pairs.weight, normal.contiguous(), offset.contiguous(), self._stiffness * share)
-
-    def _is_split(self, off: Bool[Tensor, " vertices"]) -> Bool[Tensor, " garments"]:
-        """Which garments have pieces that are cut off."""
-        split = torch.zeros(len(self._level.spans), dtype=torch.bool, device=off.device)
-        split[self._level.vertex_garment[off].long()] = True
-        return split
-
-    def _on_wrong_side(self, pairs: Pairs, garment: Tensor, normal: Tensor) -> Bool[Tensor, " pairs"]:
-        """Whether the outer of two ordered garments lies inside the inner one."""
-        order = self._lasting.order[garment]
-        first_is_outer = order[:, 0] > order[:, 1]
-        side = self._mesh.normals().to(normal)[pairs.corners.long()]
-        # A vertex-face pair has one corner first, an edge-edge pair two.
-        split = torch.where(pairs.face, 1, 2).unsqueeze(1)
-        is_first = torch.arange(4, device=normal.device).unsqueeze(0) < split
-        inner = torch.where(first_is_outer.unsqueeze(1), ~is_first, is_first)
-        out = (side * inner.unsqueeze(2)).sum(dim=1)
-        out = torch.nn.functional.normalize(out, dim=1, eps=1e-30)
-        owner = torch.where(first_is_outer, garment[:, 1], garment[:, 0])
-        cosine = (out * normal).sum(dim=1) * self._lasting.outward[owner]
-        cosine = torch.where(first_is_outer, cosine, -cosine)
-        return cosine < -FRONTAL
