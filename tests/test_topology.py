@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import any_mesh, cube, faces_of, grid, mesh_of, planar_mesh, tetrahedron
 
-from physgraph_usd.forces.base import gather_table
+from physgraph_usd.mesh.incidence import incidence
 from physgraph_usd.mesh.subdivide import subdivide
-from physgraph_usd.mesh.topology import PolygonMesh, edges_of, find_edges, hinges_of, incidence
+from physgraph_usd.mesh.topology import PolygonMesh, edges_of, find_edges, hinges_of
 
 
 def triangle_normals(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -118,21 +118,10 @@ def test_a_closed_surface_has_a_hinge_at_each_edge():
 @given(any_mesh())
 def test_incidence_matches_a_loop(mesh: PolygonMesh):
     triangles = mesh.triangulate().triangles
-    rows = incidence(triangles, mesh.vertex_count)
+    starts, slots = incidence(torch.as_tensor(triangles), mesh.vertex_count)
     for vertex in range(mesh.vertex_count):
-        row = slice(rows.starts[vertex], rows.starts[vertex + 1])
-        wanted = [(t, c) for t, triangle in enumerate(triangles.tolist()) for c in range(3) if triangle[c] == vertex]
-        assert list(zip(rows.element[row].tolist(), rows.corner[row].tolist(), strict=True)) == wanted
-    assert rows.starts.dtype == rows.element.dtype == rows.corner.dtype == np.int32
-
-
-@given(any_mesh())
-def test_gather_tables_list_the_same(mesh: PolygonMesh):
-    triangles = mesh.triangulate().triangles
-    rows = incidence(triangles, mesh.vertex_count)
-    starts, slots = gather_table(torch.as_tensor(triangles), mesh.vertex_count)
-    assert starts.tolist() == rows.starts.tolist()
-    assert slots.tolist() == (3 * rows.element + rows.corner).tolist()
+        wanted = [3 * t + c for t, triangle in enumerate(triangles.tolist()) for c in range(3) if triangle[c] == vertex]
+        assert slots[starts[vertex] : starts[vertex + 1]].tolist() == wanted
     assert starts.dtype == slots.dtype == torch.int32
 
 

@@ -147,7 +147,7 @@ class ClothView:
         self._lasting, self._level, self._base = lasting, level, base
         self._mesh, self._regions, self._seam = lasting.mesh(level), lasting.regions(level), seam
         self._mesh.sew(np.zeros((0, 2), np.int64) if seam is None else seam.pairs)
-        self._sided = GapFinder(
+        self._gap_finder = GapFinder(
             self._mesh, base, lasting.order, lasting.outward, thickness=thickness, stiffness=settings.cloth_stiffness
         )
         self._sides: Tensor | None = None
@@ -206,7 +206,7 @@ class ClothView:
             self._sides = x
         if pairs is None:
             return None
-        gaps = self._sided.gaps(pairs, x, start=self._sides, crossings=crossings)
+        gaps = self._gap_finder.gaps(pairs, x, start=self._sides, crossings=crossings)
         if crossings.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=stiffness))

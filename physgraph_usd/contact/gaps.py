@@ -67,7 +67,7 @@ class GapFinder:
         ordered &= ~self.order[garment].isnan().any(dim=1)
         swapped = torch.zeros_like(ordered)
         if crossings.count:
-            kept, swapped = self._beside(pairs, garment, crossings)
+            kept, swapped = self._decided(pairs, garment, crossings)
             kept |= ordered
             pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
             corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
@@ -83,7 +83,7 @@ class GapFinder:
         share = torch.where(pairs.face, area[:, 0], area.amin(dim=1) / 3.0)
         return Gaps(pairs.corners, pairs.weight, normal.contiguous(), offset.contiguous(), self.stiffness * share)
 
-    def _beside(
+    def _decided(
         self, pairs: Pairs, garment: Tensor, crossings: Crossings
     ) -> tuple[Bool[Tensor, " pairs"], Bool[Tensor, " pairs"]]:
         """Which pairs are not of what crosses and have a side, and which of them are to change it."""

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.incidence import incidence
 from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 
@@ -192,7 +193,7 @@ class Elements:
         """
         self.count, width = corners.shape
         dtype, device, lanes = level.dtype, level.device, level.lanes
-        starts, slots = gather_table(corners, level.vertex_count)
+        starts, slots = incidence(corners, level.vertex_count)
         # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
         packed = wp.from_torch(
             corners.clone(memory_format=torch.contiguous_format), dtype=wp.types.vector(length=width, dtype=wp.int32)
@@ -222,19 +223,6 @@ class Elements:
         self._elements({0: vectors(x)})
         self._gather({3: vectors(force)})
         return self.energy.sum(dtype=torch.float64)
-
-
-def gather_table(
-    corners: Int[Tensor, "elements corners"], vertex_count: int
-) -> tuple[Int[Tensor, " starts"], Int[Tensor, " slots"]]:
-    """Where each vertex's corners begin, shape (V + 1,), and those corners in the order of the elements; int32.
-
-    What is found in every round of contact is sorted where it lies, on either device.
-    """
-    flat = corners.reshape(-1)
-    starts = torch.zeros(vertex_count + 1, dtype=torch.int32, device=corners.device)
-    starts[1:] = torch.bincount(flat, minlength=vertex_count).cumsum(dim=0)
-    return starts, torch.argsort(flat, stable=True).to(torch.int32)
 
 
 def element_overloads(

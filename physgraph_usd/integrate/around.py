@@ -24,9 +24,9 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from ..mesh.incidence import incidence
 from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, Stencil, vectors
-from ..mesh.topology import incidence
 from .base import Surface
 
 wp.set_module_options({"enable_backward": False})
@@ -106,10 +106,11 @@ class _Tables:
     def __init__(self, level: Surface) -> None:
         count, device, dtype = len(level.rest), str(level.rest.device), level.rest.dtype
         triangles, edges = level.triangles.cpu().numpy(), level.edges.cpu().numpy()
-        corner, end = incidence(triangles, count), incidence(edges, count)
-        others = triangles[corner.element]
-        turned = np.take_along_axis(others, (corner.corner[:, None] + [1, 2]) % 3, axis=1).astype(np.int32)
-        far = edges[end.element, 1 - end.corner].astype(np.int32)
+        (corner_starts, corner), (end_starts, end) = (
+            [each.cpu().numpy() for each in incidence(elements, count)] for elements in (level.triangles, level.edges)
+        )
+        turned = np.take_along_axis(triangles[corner // 3], (corner[:, None] % 3 + [1, 2]) % 3, axis=1).astype(np.int32)
+        far = edges[end // 2, 1 - end % 2].astype(np.int32)
         x = vectors(torch.zeros_like(level.rest))
         wide = wp.zeros(count, dtype=wp.types.matrix(shape=(3, 3), dtype=SCALAR[dtype]), device=device)
 
@@ -117,14 +118,14 @@ class _Tables:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=device)
 
         given = {"device": device, "lanes": level.lanes}
-        lengths = level.rest_length.double().cpu().numpy()[end.element]
+        lengths = level.rest_length.double().cpu().numpy()[end // 2]
         rest = wp.array(lengths, dtype=SCALAR[dtype], device=device)
-        self.mesh = (ints(corner.starts), ints(turned, wp.vec2i), ints(end.starts), ints(far))
+        self.mesh = (ints(corner_starts), ints(turned, wp.vec2i), ints(end_starts), ints(far))
         self.normals = Launch(_NORMALS[dtype], count, [*self.mesh[:2], x, x], **given)
         self.strains = Launch(_STRAINS[dtype], count, [*self.mesh[2:], rest, x, wide, x], **given)
-        degree = np.diff(end.starts)
+        degree = np.diff(end_starts)
         weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
-        mean = sp.csr_matrix((weights, far, end.starts), shape=(count, count))
+        mean = sp.csr_matrix((weights, far, end_starts), shape=(count, count))
         self._mean = Stencil(mean, dtype=dtype, **given)
         self._back = Stencil(sp.csr_matrix(mean.T), dtype=dtype, **given)
 

@@ -19,21 +19,6 @@ rounding, the rotation of the cloth, its winding or the corner that a face start
 
 
 @dataclass(frozen=True, eq=False)
-class Incidence:
-    """Which elements touch each vertex, in compressed rows for per-vertex gathers.
-
-    Attributes:
-        starts: Row offsets, shape (V + 1,), int32; the row of vertex v is ``starts[v]:starts[v + 1]``.
-        element: Element of each entry, ascending within a row, shape (N,), int32.
-        corner: Which corner of that element the vertex is, shape (N,), int32.
-    """
-
-    starts: np.ndarray
-    element: np.ndarray
-    corner: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Edges:
     """Undirected edges of triangles.
 
@@ -311,25 +296,6 @@ def hinges_of(triangles: np.ndarray) -> np.ndarray:
     one, two = order[first], order[first + 1]
     hinges = np.stack([here[one], there[one], opposite[one], opposite[two]], axis=1).astype(np.int32)
     return hinges[hinges[:, 2] != hinges[:, 3]]
-
-
-def incidence(elements: np.ndarray, vertex_count: int) -> Incidence:
-    """List the elements at each vertex.
-
-    Args:
-        elements: Vertices of each element, shape (N, K).
-        vertex_count: Number of vertices V.
-
-    Returns:
-        One row per vertex, sorted by element, then by corner.
-    """
-    elements = np.asarray(elements)
-    flat = elements.reshape(-1)
-    order = np.argsort(flat, kind="stable").astype(np.int32)
-    counts = np.bincount(flat, minlength=vertex_count)
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    size = elements.shape[1]
-    return Incidence(starts, order // np.int32(size), order % np.int32(size))
 
 
 def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
