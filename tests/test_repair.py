@@ -11,9 +11,9 @@ import torch
 from bodies import ball, together
 from brute import Soup, crossings
 from folds import EDGE, frame_with, levels_of, named, refiner_with, square
-from test_untangle import BOTH, UPPER, pair
+from test_untangle import BOTH, UPPER, found_in, pair
 
-from physgraph_usd.contact.apart import drawn_apart
+from physgraph_usd.contact.apart import drawn_apart, pieces_of
 from physgraph_usd.contact.cloth_mesh import ClothMesh
 from physgraph_usd.contact.repair import repaired_cage
 from physgraph_usd.options import RefineOptions
@@ -22,6 +22,25 @@ from physgraph_usd.samples import write_sample
 from physgraph_usd.usd.reader import open_shot
 
 GAP = 0.002
+
+
+class TestPieces:
+    @pytest.mark.parametrize("name", ["dented", "cornered", "tilted"])
+    def test_the_smaller_ones_are_cut_off(self, name: str):
+        level, x = pair(name)
+        piece, off, _ = pieces_of(*found_in(level, x))
+        under, second = (x[:, 1] < 0).numpy(), (level.vertex_garment == 1).numpy()
+        side = under if under[second].mean() < 0.5 else ~under
+        np.testing.assert_array_equal(off[piece][second], side[second])
+
+    def test_by_area_not_by_the_number_of_vertices(self):
+        """Many small faces are less than few large ones."""
+        level, x = pair("tilted")
+        mesh, found = found_in(level, x)
+        mesh.level.vertex_area.copy_(torch.where(x[:, 1] < 0, 10.0, 1.0).to(x))
+        piece, off, _ = pieces_of(mesh, found)
+        second = (level.vertex_garment == 1).numpy()
+        np.testing.assert_array_equal(off[piece][second], (x[:, 1] > 0).numpy()[second])
 
 
 class TestDrawnApart:

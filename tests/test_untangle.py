@@ -1,7 +1,8 @@
-"""The way out of crossings, the pieces they cut off, and the promise that there are never more of them than before."""
+"""The way out of crossings and the promise that there are never more of them than before."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -11,11 +12,10 @@ from brute import Soup, contour_length, crossings
 from energies import evaluate
 from folds import EDGE, SHAPES, crumpled, curved, folded, levels_of, named, placed, square, strip, view_of
 
-from physgraph_usd.contact import untangle
 from physgraph_usd.contact.cloth import ClothView
 from physgraph_usd.contact.cloth_mesh import ClothMesh, Crossings
-from physgraph_usd.contact.untangle import cut_off, gaps_out, ways_out
-from physgraph_usd.forces.self_contact import SelfContact
+from physgraph_usd.contact.untangle import gaps_out, ways_out
+from physgraph_usd.forces.self_contact import Gaps, SelfContact
 from physgraph_usd.level import Level
 
 BOTH = np.ones((2, 2), bool)
@@ -120,7 +120,7 @@ class TestWaysOut:
         assert float(torch.nn.functional.cosine_similarity(-total, slope, dim=0)) > (0.7 if clipped.any() else 0.99)
 
     def test_a_straight_contour_from_rim_to_rim_has_no_way_out(self):
-        """Moved across the other sheet it stays as long: here the piece that is cut off tells."""
+        """Moved across the other sheet it stays as long: at the cage the piece that is cut off goes back."""
         level, x = pair("tilted")
         mesh, found = found_in(level, x)
         way, _ = ways_out(mesh, found, x)
@@ -129,47 +129,31 @@ class TestWaysOut:
         assert float(way[inner].norm(dim=1).max()) < 0.35
 
 
-class TestCutOff:
-    @pytest.mark.parametrize("name", UPPER)
-    def test_the_smaller_pieces(self, name: str):
-        level, x = pair(name)
-        mesh, found = found_in(level, x)
-        off = cut_off(mesh, found).numpy()
-        under = (x[:, 1] < 0).numpy()
-        second = (level.vertex_garment == 1).numpy()
-        if name in ("dented", "cornered"):
-            np.testing.assert_array_equal(off[second], under[second])
-        if name == "tilted":
-            assert off[second].mean() < 0.5
-            side = under if under[second].mean() < 0.5 else ~under
-            np.testing.assert_array_equal(off[second], side[second])
+class TestTerm:
+    """Two sheets of 4 by 4 cells that cross, as cloth without layers and as layers."""
 
-    def test_looking_near_the_crossings_first_changes_nothing(self, monkeypatch: pytest.MonkeyPatch):
-        level, x = pair("tilted")
-        mesh, found = found_in(level, x)
-        asked: list[int] = []
-        whole = untangle.pieces_of
-        monkeypatch.setattr(untangle, "pieces_of", lambda *given: (asked.append(1), whole(*given))[1])
-        for count in (1, 2, 5, len(found.edge)):
-            some = Crossings(found.edge[:count], found.face[:count], count)
-            piece, off, _ = whole(mesh, some)
-            np.testing.assert_array_equal(cut_off(mesh, some).numpy(), off[piece])
-        assert 0 < len(asked) < 4
+    def own_gaps(self, *layers: float | None) -> tuple[Gaps, torch.Tensor]:
+        """The planes but for those that draw out what crosses, and which vertices cross."""
+        garments = [named(square(4), name, layer=layer) for name, layer in zip("AB", layers, strict=True)]
+        levels = levels_of(*garments)
+        _, x = pair("cornered")
+        view = view_of(levels, garments, x.float())
+        term = view.term(x.float())
+        assert isinstance(term, SelfContact)
+        out = 2 * view.before.crossings.count
+        assert view.tangled
+        assert 0 < out < len(term.gaps.corners)
+        crossed = ClothMesh(levels[-1], BOTH).crossed(view.before.crossings)
+        kept = len(term.gaps.corners) - out
+        return Gaps(*(getattr(term.gaps, each.name)[:kept] for each in fields(Gaps))), crossed
 
-    def test_nothing_without_crossings(self):
-        level, _ = pair("tilted")
-        none = torch.zeros(0, dtype=torch.int64)
-        assert not cut_off(ClothMesh(level, BOTH), Crossings(none, none, 0)).any()
+    def test_what_crosses_has_no_side_to_keep(self):
+        own, crossed = self.own_gaps(None, None)
+        assert not crossed[own.corners.long()].any()
 
-    def test_by_area_not_by_the_number_of_vertices(self):
-        """Many small faces are less than few large ones."""
-        level, x = pair("tilted")
-        area = torch.where(x[:, 1] < 0, 10.0, 1.0).to(x)
-        mesh, found = found_in(level, x)
-        mesh.level.vertex_area.copy_(area)
-        off = cut_off(mesh, found)
-        second = level.vertex_garment == 1
-        torch.testing.assert_close(off[second], (x[:, 1] > 0)[second])
+    def test_layers_keep_theirs_even_so(self):
+        own, crossed = self.own_gaps(0, 1)
+        assert crossed[own.corners.long()].any()
 
 
 def views(name: str) -> tuple[Level, ClothView, torch.Tensor]:

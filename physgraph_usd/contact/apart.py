@@ -1,8 +1,8 @@
 """Cages that start crossed, drawn apart before anything is solved: the smaller piece that a contour cuts off goes back.
 
 Springs shorten a contour step by step and stop where the cloth between is stretched. Which piece is on the wrong side
-is known at once (`untangle`): its vertices are laid as far above the other cloth as they were under it, but at most a
-gap, so a dent, a corner or half a sheet comes back whole, however deep it was.
+is known at once, the smaller one (Baraff, Witkin and Kass 2003): its vertices are laid as far above the other cloth as
+they were under it, but at most a gap, so a dent, a corner or half a sheet comes back whole, however deep it was.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ..colliders.mesh import MeshSurface
 from ..colliders.pose import MeshPose
+from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh, Crossings
-from .untangle import pieces_of
 
 PASSES = 6
 """Most pieces' goes: a piece laid back may uncover another contour."""
@@ -84,6 +84,29 @@ def _lay_back(mesh: ClothMesh, crossings: Crossings, x: Tensor, *, gap: float) -
         beyond = near.distance.clamp_max(gap).unsqueeze(1) * torch.nn.functional.normalize(back, dim=1, eps=1e-30)
         out[which] = out[which] + back + beyond
     return out
+
+
+def pieces_of(mesh: ClothMesh, crossings: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pieces into which contours cut the cloth.
+
+    Args:
+        mesh: The cloth.
+        crossings: What crosses.
+
+    Returns:
+        The piece of each vertex, which pieces are cut off (smaller than the largest of what hangs together without
+        crossings), and their areas [m^2].
+    """
+    count = mesh.level.vertex_count
+    ends = mesh.level.edges.cpu().numpy()
+    kept = np.ones(len(ends), bool)
+    kept[crossings.edge.cpu().numpy()] = False
+    whole, piece = mesh.whole, joined_by(np.concatenate([ends[kept], mesh.sewn]), count)
+    area = np.bincount(piece, mesh.level.vertex_area.double().cpu().numpy())
+    first = np.unique(piece, return_index=True)[1]
+    largest = np.zeros(int(whole.max()) + 1)
+    np.maximum.at(largest, whole[first], area)
+    return piece, area < largest[whole[first]], area
 
 
 def _chosen(mesh: ClothMesh, crossings: Crossings) -> list[tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]]:

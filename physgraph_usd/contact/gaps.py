@@ -11,7 +11,6 @@ from torch import Tensor
 from ..forces.self_contact import Gaps
 from .cloth_mesh import ClothMesh, Crossings
 from .nearest import Pairs
-from .untangle import cut_off, swapped_by
 
 LEAST_OFFSET = 0.25
 """Part of the thickness that parts keep where the input has them closer."""
@@ -65,16 +64,14 @@ class GapFinder:
         garment = self.mesh.level.vertex_garment[corners[:, [0, 3]]].long()
         ordered = self.order[garment[:, 0]] != self.order[garment[:, 1]]
         ordered &= ~self.order[garment].isnan().any(dim=1)
-        swapped = torch.zeros_like(ordered)
         if crossings.count:
-            kept, swapped = self._decided(pairs, garment, crossings)
-            kept |= ordered
+            # What crosses has no side to keep: it is drawn out.
+            kept = ~self.mesh.crossed(crossings)[corners].any(dim=1) | ordered
             pairs = Pairs(pairs.corners[kept], pairs.weight[kept], pairs.face[kept])
-            corners, garment, ordered, swapped = corners[kept], garment[kept], ordered[kept], swapped[kept]
+            corners, garment, ordered = corners[kept], garment[kept], ordered[kept]
         way, at_input, at_start = ((pairs.weight.unsqueeze(2) * at[corners]).sum(dim=1) for at in (x, self.base, start))
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
-        turned = (normal * at_start).sum(dim=1) < -TURNED * at_start.norm(dim=1)
-        wrong = turned ^ swapped
+        wrong = (normal * at_start).sum(dim=1) < -TURNED * at_start.norm(dim=1)
         if bool(ordered.any()):
             wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), wrong)
         normal = torch.where(wrong.unsqueeze(1), -normal, normal)
@@ -82,16 +79,6 @@ class GapFinder:
         area = self.mesh.level.vertex_area[corners]
         share = torch.where(pairs.face, area[:, 0], area.amin(dim=1) / 3.0)
         return Gaps(pairs.corners, pairs.weight, normal.contiguous(), offset.contiguous(), self.stiffness * share)
-
-    def _decided(
-        self, pairs: Pairs, garment: Tensor, crossings: Crossings
-    ) -> tuple[Bool[Tensor, " pairs"], Bool[Tensor, " pairs"]]:
-        """Which pairs are not of what crosses and have a side, and which of them are to change it."""
-        corners, off = pairs.corners.long(), cut_off(self.mesh, crossings)
-        split = torch.zeros(len(self.order), dtype=torch.bool, device=off.device)
-        split[self.mesh.level.vertex_garment[off].long()] = True
-        swapped, undecided = swapped_by(off[corners], pairs.face, split[garment])
-        return ~self.mesh.crossed(crossings)[corners].any(dim=1) & ~undecided, swapped
 
     def _offsets(
         self, garment: Tensor, at_input: Tensor, now: Tensor, *, wrong: Tensor, ordered: Tensor
