@@ -73,7 +73,7 @@ class GapFinder:
         normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30)
         wrong = (normal * at_start).sum(dim=1) < -TURNED * at_start.norm(dim=1)
         if bool(ordered.any()):
-            wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal), wrong)
+            wrong = torch.where(ordered, self._on_wrong_side(pairs, garment, normal, distance=way.norm(dim=1)), wrong)
         normal = torch.where(wrong.unsqueeze(1), -normal, normal)
         offset = self._offsets(garment, at_input.norm(dim=1), way.norm(dim=1), wrong=wrong, ordered=ordered)
         area = self.mesh.level.vertex_area[corners]
@@ -92,8 +92,10 @@ class GapFinder:
         most = OUT * float(self.mesh.level.spacing.mean())
         return torch.where(wrong, torch.minimum(offset, most - now), offset)
 
-    def _on_wrong_side(self, pairs: Pairs, garment: Tensor, normal: Tensor) -> Bool[Tensor, " pairs"]:
-        """Whether the outer of two ordered garments lies inside the inner one."""
+    def _on_wrong_side(
+        self, pairs: Pairs, garment: Tensor, normal: Tensor, *, distance: Tensor
+    ) -> Bool[Tensor, " pairs"]:
+        """Whether the outer of two ordered garments lies inside the inner one, and nowhere nearer outside it."""
         order = self.order[garment]
         first_is_outer = order[:, 0] > order[:, 1]
         side = self.mesh.normals().to(normal)[pairs.corners.long()]
@@ -106,4 +108,9 @@ class GapFinder:
         owner = torch.where(first_is_outer, garment[:, 1], garment[:, 0])
         cosine = (out * normal).sum(dim=1) * self.outward[owner]
         cosine = torch.where(first_is_outer, cosine, -cosine)
-        return cosine < -FRONTAL
+        other = torch.where(is_first, garment[:, 1:], garment[:, :1])
+        met = pairs.corners.long() * len(self.order) + other
+        outside = torch.where(cosine > FRONTAL, distance, torch.full_like(distance, torch.inf))
+        nearest = torch.full((self.mesh.level.vertex_count * len(self.order),), torch.inf).to(distance)
+        nearest.scatter_reduce_(0, met.reshape(-1), outside.repeat_interleave(4), "amin")
+        return (cosine < -FRONTAL) & (distance < nearest[met].amin(dim=1))

@@ -103,13 +103,17 @@ class SelfContact:
 
     def __init__(self, level: Level, gaps: Gaps) -> None:
         """Take the pairs."""
-        self.gaps = gaps
+        self.gaps, self._level = gaps, level
         along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
         self._elements = Elements(_KEEP_APART, gaps.corners, [*along, gaps.offset, gaps.stiffness], level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         return self._elements.evaluate(x, force)
+
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each pair [J] where the force was added last, and the garment of its first corner."""
+        return self._elements.energy, self._level.vertex_garment[self.gaps.corners[:, 0].long()]
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """k w^2 / 3 of the pairs that push, summed at each vertex [N/m]."""
