@@ -3,10 +3,10 @@
     python -m benchmarks.contact_convergence [SAMPLE ...]
 
 Refines frames of samples from cold with ever more steps, with contact and without, and prints the gap
-(Phi - Phi*) / (Phi0 - Phi*) of each garment, the mean over the sample's frames. Phi holds the contact energy of planes and pairs found anew at the result,
-before anything is pushed out or mended; that of a pair counts for the garment of its first corner. Phi* is the least
-energy of the garment known: that of many steps in many rounds in float64, and of the reference solver, Newton, that
-goes on from there. The last column says how far Newton came below.
+(Phi - Phi*) / (Phi0 - Phi*) of each garment, over the frames together. Phi holds the contact energy of planes and pairs
+found anew at the result, before anything is pushed out or mended; that of a pair counts for the garment of its first
+corner. Phi* is the least energy of the garment known: that of many steps in many rounds in float64, and of the
+reference solver, Newton, that goes on from there. The last column says how far Newton came below.
 """
 
 from __future__ import annotations
@@ -57,34 +57,42 @@ def main() -> None:
                 continue
             shot = open_shot(str(write_sample(name, Path(folder))))
             for label, contact in (("off", ContactSettings("off", cloth="off")), ("on", ContactSettings())):
-                settled = SETTLED.get(name, LONG)
-                found = [gaps_of(shot, shot.frame(time), contact, settled_in=settled) for time in times]
-                gaps, below = (np.mean(each, axis=0) for each in zip(*found, strict=True))
+                settled_in = SETTLED.get(name, LONG)
+                found = [energies_of(shot, shot.frame(time), contact, settled_in=settled_in) for time in times]
+                gaps, below = gaps_of(np.array(found))
                 for garment, own, newton in zip(shot.scene.garments, gaps.T, below, strict=True):
                     needed = next((steps for steps, gap in zip(STEPS, own, strict=True) if gap <= GAP), None)
                     cells = " | ".join(f"{gap:.1%}" for gap in own)
                     say(f"| {name}: {Path(garment.path).name} | {label} | {cells} | {needed} | {newton:.2%} |")
 
 
-def gaps_of(
-    shot: Shot, frame: Frame, contact: ContactSettings, *, settled_in: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gaps after each number of steps, shape (steps, garments), and how far Newton came below the long solve."""
+def gaps_of(energies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gaps of each garment, and how far Newton came below the long solve, over all frames together.
+
+    Args:
+        energies: As `energies_of` gives them [J], shape (frames, runs, garments).
+
+    Returns:
+        Shapes (steps, garments) and (garments,).
+    """
+    start, settled, newton, *rough = energies.sum(axis=0)
+    least = energies[:, 1:].min(axis=1).sum(axis=0)
+    return (np.array(rough) - least) / (start - least), (settled - newton) / (start - least)
+
+
+def energies_of(shot: Shot, frame: Frame, contact: ContactSettings, *, settled_in: tuple[int, int]) -> list[np.ndarray]:
+    """Energies [J] of the garments in a frame: upsampled, after the long solve, Newton, and each number of steps."""
     coarse, exact = (problem_of(shot, dtype) for dtype in (torch.float32, torch.float64))
     for problem in (coarse, exact):
         problem.refiner.use(settings_of(contact, 1))
     nothing = [None] * len(coarse.refiner.parts_of(frame))
-    runs = (coarse.go_on(frame, settings_of(contact, steps), nothing)[0] for steps in STEPS)
-    rough = [energies_at(exact, frame, points, contact=contact) for points in runs]
     steps, rounds = settled_in
-    points, kept = exact.go_on(frame, settings_of(replace(contact, rounds=rounds), steps), nothing)
-    settled = energies_at(exact, frame, points, contact=contact)
+    settled, kept = exact.go_on(frame, settings_of(replace(contact, rounds=rounds), steps), nothing)
     steps, rounds = NEWTON
-    points, _ = exact.go_on(frame, settings_of(replace(contact, rounds=rounds), steps, method="newton"), kept)
-    newton = energies_at(exact, frame, points, contact=contact)
-    start = energies_at(exact, frame, exact.upsampled(frame, smooth=False), contact=contact)
-    least = np.minimum.reduce([newton, settled, *rough])
-    return (np.array(rough) - least) / (start - least), (settled - newton) / (start - least)
+    newton, _ = exact.go_on(frame, settings_of(replace(contact, rounds=rounds), steps, method="newton"), kept)
+    rough = [coarse.go_on(frame, settings_of(contact, steps), nothing)[0] for steps in STEPS]
+    results = (exact.upsampled(frame, smooth=False), settled, newton, *rough)
+    return [energies_at(exact, frame, points, contact=contact) for points in results]
 
 
 def problem_of(shot: Shot, dtype: torch.dtype) -> Problem:

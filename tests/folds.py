@@ -30,7 +30,7 @@ Cloth = tuple[PolygonMesh, np.ndarray]
 
 
 def square(cells: int = 4, *, edge: float = EDGE, kind: str = "triangles") -> Cloth:
-    """A square sheet about the origin, in the plane of x and z, its front up."""
+    """A square sheet about the origin, in the plane of x and z, its front down."""
     mesh, points = grid(cells, cells, kind)
     return mesh, edge * (points - points.mean(axis=0)) @ LEVEL_TURN.T
 

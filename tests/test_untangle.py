@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +14,7 @@ from folds import EDGE, SHAPES, crumpled, curved, folded, levels_of, named, plac
 from physgraph_usd.contact.cloth import ClothView
 from physgraph_usd.contact.cloth_mesh import ClothMesh, Crossings
 from physgraph_usd.contact.untangle import gaps_out, ways_out
-from physgraph_usd.forces.self_contact import Gaps, SelfContact
+from physgraph_usd.forces.self_contact import SelfContact
 from physgraph_usd.level import Level
 
 BOTH = np.ones((2, 2), bool)
@@ -127,33 +126,6 @@ class TestWaysOut:
         ends = level.edges.long()[found.edge]
         inner = (x[ends].abs() < 0.08).all(dim=2).all(dim=1)
         assert float(way[inner].norm(dim=1).max()) < 0.35
-
-
-class TestTerm:
-    """Two sheets of 4 by 4 cells that cross, as cloth without layers and as layers."""
-
-    def own_gaps(self, *layers: float | None) -> tuple[Gaps, torch.Tensor]:
-        """The planes but for those that draw out what crosses, and which vertices cross."""
-        garments = [named(square(4), name, layer=layer) for name, layer in zip("AB", layers, strict=True)]
-        levels = levels_of(*garments)
-        _, x = pair("cornered")
-        view = view_of(levels, garments, x.float())
-        term = view.term(x.float())
-        assert isinstance(term, SelfContact)
-        out = 2 * view.before.crossings.count
-        assert view.tangled
-        assert 0 < out < len(term.gaps.corners)
-        crossed = ClothMesh(levels[-1], BOTH).crossed(view.before.crossings)
-        kept = len(term.gaps.corners) - out
-        return Gaps(*(getattr(term.gaps, each.name)[:kept] for each in fields(Gaps))), crossed
-
-    def test_what_crosses_has_no_side_to_keep(self):
-        own, crossed = self.own_gaps(None, None)
-        assert not crossed[own.corners.long()].any()
-
-    def test_layers_keep_theirs_even_so(self):
-        own, crossed = self.own_gaps(0, 1)
-        assert crossed[own.corners.long()].any()
 
 
 def views(name: str) -> tuple[Level, ClothView, torch.Tensor]:
