@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
+from energies import evaluate
 from folds import levels_of, named, square, view_of
 from test_untangle import BOTH, pair
 
@@ -68,3 +69,20 @@ class TestLayers:
     @pytest.mark.parametrize("height", [0.0, 0.5])
     def test_all_are_sent_back_that_lie_wrong(self, height: float):
         assert (self.lacks(height, 1.0, upper_is_outer=True) > 0.001).mean() > 0.95
+
+
+def test_the_energy_of_each_pair_counts_for_the_garment_of_its_first_corner():
+    garments = [named(square(4), name) for name in "AB"]
+    levels = levels_of(*garments)
+    _, x = pair("dented")
+    term = view_of(levels, garments, x.float()).term(x.float())
+    assert isinstance(term, SelfContact)
+    whole, _ = evaluate(term, x.float())
+    energy, owner = term.split(x.float())
+    gaps = term.gaps
+    np.testing.assert_allclose(energy.numpy(), 0.5 * gaps.stiffness * gaps.lacks(x.float()) ** 2, rtol=1e-5, atol=1e-12)
+    assert float(energy.sum()) == pytest.approx(float(whole), rel=1e-5)
+    assert float(whole) > 0
+    upper = gaps.corners[:, 0] >= len(x) // 2
+    np.testing.assert_array_equal(owner.numpy(), upper.numpy())
+    assert 0 < int(upper.sum()) < len(upper)

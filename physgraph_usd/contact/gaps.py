@@ -96,21 +96,26 @@ class GapFinder:
         self, pairs: Pairs, garment: Tensor, normal: Tensor, *, distance: Tensor
     ) -> Bool[Tensor, " pairs"]:
         """Whether the outer of two ordered garments lies inside the inner one, and nowhere nearer outside it."""
-        order = self.order[garment]
-        first_is_outer = order[:, 0] > order[:, 1]
-        side = self.mesh.normals().to(normal)[pairs.corners.long()]
         # A vertex-face pair has one corner first, an edge-edge pair two.
         split = torch.where(pairs.face, 1, 2).unsqueeze(1)
         is_first = torch.arange(4, device=normal.device).unsqueeze(0) < split
+        cosine = self._cosine_outwards(pairs, garment, normal, is_first=is_first)
+        met = pairs.corners.long() * len(self.order) + torch.where(is_first, garment[:, 1:], garment[:, :1])
+        outside = torch.where(cosine > FRONTAL, distance, torch.full_like(distance, torch.inf))
+        nearest = distance.new_full((self.mesh.level.vertex_count * len(self.order),), torch.inf)
+        nearest.scatter_reduce_(0, met.reshape(-1), outside.repeat_interleave(4), "amin")
+        return (cosine < -FRONTAL) & (distance < nearest[met].amin(dim=1))
+
+    def _cosine_outwards(
+        self, pairs: Pairs, garment: Tensor, normal: Tensor, *, is_first: Tensor
+    ) -> Float[Tensor, " pairs"]:
+        """Of the way from the inner to the outer one of two ordered garments with the inner one's outward normal."""
+        order = self.order[garment]
+        first_is_outer = order[:, 0] > order[:, 1]
+        side = self.mesh.normals().to(normal)[pairs.corners.long()]
         inner = torch.where(first_is_outer.unsqueeze(1), ~is_first, is_first)
         out = (side * inner.unsqueeze(2)).sum(dim=1)
         out = torch.nn.functional.normalize(out, dim=1, eps=1e-30)
         owner = torch.where(first_is_outer, garment[:, 1], garment[:, 0])
         cosine = (out * normal).sum(dim=1) * self.outward[owner]
-        cosine = torch.where(first_is_outer, cosine, -cosine)
-        other = torch.where(is_first, garment[:, 1:], garment[:, :1])
-        met = pairs.corners.long() * len(self.order) + other
-        outside = torch.where(cosine > FRONTAL, distance, torch.full_like(distance, torch.inf))
-        nearest = torch.full((self.mesh.level.vertex_count * len(self.order),), torch.inf).to(distance)
-        nearest.scatter_reduce_(0, met.reshape(-1), outside.repeat_interleave(4), "amin")
-        return (cosine < -FRONTAL) & (distance < nearest[met].amin(dim=1))
+        return torch.where(first_is_outer, cosine, -cosine)
