@@ -130,17 +130,16 @@ def view_of(
 
 
 def contact_of(
-    levels: Sequence[Level], garments: Sequence[Garment], cage: torch.Tensor, *, stiffness: float | None = None
+    levels: Sequence[Level], garments: Sequence[Garment], cage: torch.Tensor, **settings: Any
 ) -> FrameContact:
     """Cloth that may touch cloth in a frame without bodies, and its seams."""
-    settings = ContactSettings() if stiffness is None else ContactSettings(cloth_stiffness=stiffness)
     return FrameContact(
         levels,
         cage,
         bodies=None,
         cloth=ClothContact(levels, garments),
         thickness=[0.001] * len(garments),
-        settings=settings,
+        settings=ContactSettings(**settings),
         seams=Seams.find(levels[0], cage),
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -14,55 +16,138 @@ from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact import rounds
 from physgraph_usd.contact.bodies import STALE, FrameBodies, Touching
 from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.integrate.base import System
+from physgraph_usd.integrate.base import Carry, System
 from physgraph_usd.integrate.metric import Metric
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.solve import Budget
 from physgraph_usd.level import Level
 
 
-class Nothing:
-    """No force."""
+class Springs:
+    """Each vertex on a spring to a place of its own [m]."""
+
+    def __init__(self, goal: torch.Tensor) -> None:
+        self.goal = goal
 
     def energy_and_force(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return torch.zeros((), dtype=torch.float64), torch.zeros_like(x)
+        return 0.5 * (x - self.goal).square().sum(), self.goal - x
 
     def diagonal(self, x: torch.Tensor) -> torch.Tensor:
         return torch.ones_like(x[:, 0])
 
 
-def still(level: Level) -> System:
+def system_of(level: Level, field: Springs) -> System:
+    """Springs at a level, by themselves, with the metric that fits them."""
     metric = Metric(sp.csr_matrix(sp.identity(level.vertex_count)), free=level.free, dtype=level.dtype)
-    return System(Nothing(), metric, free=level.free, spacing=level.spacing, level=level)
+    return System(field, metric, free=level.free, spacing=level.spacing, level=level)
+
+
+class Noting(QuasiNewton):
+    """Quasi-Newton that notes where it starts and where it goes on from, with as many setbacks a step as it is told."""
+
+    def __init__(self, setbacks: int) -> None:
+        super().__init__()
+        self.setbacks = setbacks
+        self.started: list[torch.Tensor] = []
+        self.resumed: list[torch.Tensor] = []
+
+    def start(self, system: System, x: torch.Tensor) -> Carry:
+        self.started.append(x)
+        return super().start(system, x)
+
+    def resume(self, system: System, carry: Carry) -> Carry:
+        self.resumed.append(carry.x)
+        return super().resume(system, carry)
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        return replace(super().step(system, carry), setbacks=self.setbacks)
+
+
+class Fold:
+    """A fold whose upper half is drawn through the lower one at a vertex, and along z elsewhere."""
+
+    def __init__(self, **settings: str) -> None:
+        cloth, points = strip()
+        garment = named((cloth, points))
+        self.levels = levels_of(garment)
+        self.level = self.levels[1]
+        cage = torch.as_tensor(folded(points, 0.4 * EDGE), dtype=torch.float32)
+        self.view = contact_of(self.levels, [garment], cage, **settings).at(self.level)
+        self.x = self.level.base.apply(cage)
+        above = (self.x[:, 1] > 0.3 * EDGE) & (self.x[:, 2].abs() < EDGE)
+        self.over = torch.nonzero(above & ((self.x[:, 0] - 3 * EDGE).abs() < EDGE)).squeeze(1)
+        self.goal = self.x.clone()
+        self.goal[self.over[len(self.over) // 2], 1] -= 0.8 * EDGE
+        self.away = self.x[:, 0] > self.x[:, 0].max() - EDGE
+        self.goal[self.away, 2] += 0.1 * EDGE
+
+    def solved(self, integrator: QuasiNewton, *, whole: bool) -> torch.Tensor:
+        system = system_of(self.level, Springs(self.goal))
+        return rounds.solve_rounds(
+            lambda *_: system,
+            integrator,
+            self.x,
+            terms=self.view.terms(self.x),
+            view=self.view,
+            level=1,
+            budget=Budget(3),
+            whole=whole,
+        )[0]
+
+    def crossings(self, x: torch.Tensor) -> int:
+        assert self.view.cloth is not None
+        return self.view.cloth.look(x).crossings.count
 
 
 @pytest.mark.parametrize("warm", [True, False])
 def test_what_crosses_at_a_levels_start_is_mended(warm):
-    cloth, points = strip()
-    garment = named((cloth, points))
-    levels = levels_of(garment)
-    cage = torch.as_tensor(folded(points, 0.4 * EDGE), dtype=torch.float32)
-    contact = contact_of(levels, [garment], cage)
-    view, fine = contact.at(levels[1]), levels[1]
-    x = fine.base.apply(cage)
-    above = (x[:, 1] > 0.3 * EDGE) & (x[:, 2].abs() < EDGE)
-    over = torch.nonzero(above & ((x[:, 0] - 3 * EDGE).abs() < EDGE)).squeeze(1)
-    x[over[len(over) // 2], 1] -= 0.8 * EDGE
-    assert view.cloth is not None
-    assert view.cloth.look(x).crossings.count > 0
-    assert view.cloth.before.crossings.count == 0
-    system = still(fine)
+    fold = Fold()
+    assert fold.crossings(fold.goal) > 0
+    assert fold.view.cloth is not None
+    assert fold.view.cloth.before.crossings.count == 0
+    system = system_of(fold.level, Springs(fold.goal))
     out, _, _ = rounds.solve_touching(
         lambda *_: system,
         QuasiNewton(),
-        x,
-        view=view,
-        level=fine,
+        fold.goal,
+        view=fold.view,
+        level=fold.level,
         finest=False,
         outward=None if warm else torch.ones(1),
         budget=Budget(0),
     )
-    assert view.cloth.look(out).crossings.count == 0
+    assert fold.crossings(out) == 0
+
+
+class TestWholeRounds:
+    def test_what_one_makes_cross_is_taken_back_and_nothing_else(self):
+        fold = Fold()
+        assert fold.crossings(fold.solved(QuasiNewton(), whole=False)) > 0
+        x = fold.solved(QuasiNewton(), whole=True)
+        assert fold.crossings(x) == 0
+        torch.testing.assert_close(x[fold.away], fold.goal[fold.away], rtol=0.0, atol=1e-6)
+
+    @pytest.mark.parametrize("setbacks", [0, 1])
+    def test_the_next_goes_on_from_there(self, setbacks):
+        fold, integrator = Fold(), Noting(setbacks)
+        fold.solved(integrator, whole=True)
+        assert len(integrator.started) == (3 if setbacks else 1)
+        assert len(integrator.resumed) == (0 if setbacks else 2)
+        for x in (*integrator.started, *integrator.resumed):
+            assert fold.crossings(x) == 0
+
+    def test_nothing_is_taken_back_to_a_start_that_crosses(self):
+        fold = Fold()
+        assert fold.view.uncrossed(fold.x, fold.goal) is fold.x
+        x = fold.goal.clone()
+        x[fold.over[0], 1] -= 0.8 * EDGE
+        assert fold.crossings(x) > fold.crossings(fold.goal)
+        assert fold.view.uncrossed(x, fold.goal) is x
+        assert fold.view.uncrossed(x, fold.x) is not x
+
+    def test_the_papers_spheres_are_left_alone(self):
+        fold = Fold(cloth="spheres")
+        assert fold.view.uncrossed(fold.goal, fold.x) is fold.goal
 
 
 class TestPlanes:

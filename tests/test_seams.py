@@ -288,7 +288,7 @@ class TestCloth:
         middle = float(np.median(cloth[1][:, 0]))
         bent = torch.as_tensor(cloth[1], dtype=torch.float32)
         bent[:, 1] = 0.4 * (bent[:, 0] - middle).abs()
-        contact = contact_of(levels, [garment], bent, stiffness=1e5)
+        contact = contact_of(levels, [garment], bent, cloth_stiffness=1e5)
         base = levels[-1].base.apply(bent)
         x, first = base.clone(), torch.as_tensor(seam_of(levels[-1], base).pairs[:, 0])
         x[first] += 0.5 * EDGE * torch.tensor([0.3, 0.05, 0.0])

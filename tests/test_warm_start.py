@@ -92,7 +92,7 @@ class TestTangledStart:
         levels = levels_of(*garments)
         level, cage = levels[-1], levels[0].rest.clone()
         cage[len(cage) // 2 :, 1] += 0.004
-        contact = contact_of(levels, garments, cage, stiffness=1e5)
+        contact = contact_of(levels, garments, cage, cloth_stiffness=1e5)
         cold = level.base.apply(cage) + torch.tensor([0.0, 0.0, 0.001])
         plain = level.base.apply(cage)
         assert not contact.tangles(plain)

@@ -119,6 +119,7 @@ class ClothView:
     """One level's cloth in one frame.
 
     Attributes:
+        keeps_sides: Whether parts keep their side of one another; in the paper's form they do not.
         tangled: Whether anything crossed where the term was asked for last.
         allowed: What may cross in the end: the input, where another cage is followed; else None.
     """
@@ -143,7 +144,7 @@ class ClothView:
             settings: How contact is solved, in SI.
             seam: What is sewn together, and stays so; or None without seams.
         """
-        self._settings = settings
+        self.keeps_sides, self._settings = settings.cloth == "pairs", settings
         self._lasting, self._level, self._base = lasting, level, base
         self._mesh, self._regions, self._seam = lasting.mesh(level), lasting.regions(level), seam
         self._mesh.sew(np.zeros((0, 2), np.int64) if seam is None else seam.pairs)

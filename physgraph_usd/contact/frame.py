@@ -84,6 +84,15 @@ class LevelContact:
         """Positions with their seams closed [m]."""
         return x if self.seam is None else self.seam.closed(x)
 
+    def uncrossed(
+        self, x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"]
+    ) -> Float[Tensor, "vertices 3"]:
+        """Positions x [m], taken back towards the start where they cross; x itself if the start crosses too."""
+        if self.cloth is None or not self.cloth.keeps_sides:
+            return x
+        good = self.cloth.look(start)
+        return x if good.crossings.count else self.cloth.mend(x, good).x
+
 
 class FrameContact:
     """What a group may touch in one frame."""

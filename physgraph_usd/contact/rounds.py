@@ -73,12 +73,14 @@ def solve_touching(
         # What a coarser level or the last frame made cross; where a warm frame's input crosses too, it is drawn out.
         x = view.cloth.mend(x).x
     x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
+    start = x
     if outward is not None:
         x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
     # A warm frame has no coarse levels that settle contact before; much cloth on cloth settles slowly.
-    share = budget.steps if finest and (outward is None or crowded(touched, x)) else None
+    whole = finest and (outward is None or crowded(touched, x))
+    x = view.uncrossed(x, start) if whole else x
     x, more, touched = solve_rounds(
-        make_system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, share=share
+        make_system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, whole=whole
     )
     made = made + more
     if finest:
@@ -155,7 +157,7 @@ def solve_rounds(
     view: LevelContact,
     level: int,
     budget: Budget,
-    share: int | None = None,
+    whole: bool = False,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
     """Solve one level in rounds; in one where nothing can touch.
 
@@ -167,7 +169,8 @@ def solve_rounds(
         view: The level's view of what it may touch.
         level: Index for the reports.
         budget: When to stop; its steps are shared by the rounds. What first touches at the end gets a round's more.
-        share: Steps of each round instead of its share.
+        whole: Whether each round gets all of the steps instead. In so many cloth gets far: what then crosses is taken
+            back towards the round's start, so that the next one finds everything on its side.
 
     Returns:
         Final positions [m], a report a round, and the last round's contact terms.
@@ -176,23 +179,26 @@ def solve_rounds(
         SolveError: The energy is not finite.
     """
     reports: list[LevelReport] = []
-    share, last = share or -(-budget.steps // view.rounds), None
+    share, last = budget.steps if whole else -(-budget.steps // view.rounds), None
     left = max(budget.steps, share * view.rounds) if terms else budget.steps
     kept: list[Carry] = []
+    going: Carry | None = None
     while True:
-        system = make_system(terms, x)
+        system, start = make_system(terms, x), x
         x, report = solve_level(
             system,
             integrator,
-            x,
+            start,
             level=level,
             budget=_round_of(budget, system, min(left, share) if terms else left),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
-            resume=kept[-1] if last is not None and system.shares_metric(last) else None,
+            resume=going if last is not None and system.shares_metric(last) else None,
         )
         held = system.metric.held(kept[-1].force) if isinstance(system.metric, HeldMetric) else None
         report.remaining_move = report.remaining_move if held is None else system.remaining_move(held)
-        last, x = system, view.closed(x)
+        last, x, going = system, view.closed(x), kept[-1]
+        if whole:
+            x, going = _uncrossed(view, x, start=start, carry=going)
         reports.append(report)
         left -= report.steps
         if report.stopped == "budget" or (left <= 0 and terms):
@@ -204,6 +210,17 @@ def solve_rounds(
             left = share
         elif report.steps == 0:
             return x, reports, terms
+
+
+def _uncrossed(view: LevelContact, x: Tensor, *, start: Tensor, carry: Carry) -> tuple[Tensor, Carry | None]:
+    """Cloth that a round made cross taken back [m], and what its integrator goes on from.
+
+    From there one that had to be corrected starts anew (None); others keep what they learned.
+    """
+    out = view.uncrossed(x, start)
+    if out is x:
+        return x, carry
+    return out, None if carry.setbacks else replace(carry, x=out)
 
 
 def _round_of(budget: Budget, system: System, steps: int) -> Budget:
