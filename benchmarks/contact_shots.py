@@ -1,11 +1,12 @@
 """What contact leaves in shots: vertices in bodies and crossings, before and after, in our form and in the paper's.
 
     python -m benchmarks.contact_shots [--frames 5] [--whole] [--level 2] [--form ours] [--shot NAME]
-        [--device cuda] [FOLDER]
+        [--way-out 3] [--device cuda] [FOLDER]
 
 Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
 Prints a row a shot: the sums over frames and garments. The paper's form stands without our last projection, but with
-our mending of what newly crosses.
+our mending of what newly crosses. With --way-out cloth between overlapping parts of a body is pushed out by ways so
+many cage edges long, in place of half of one.
 """
 
 from __future__ import annotations
@@ -106,6 +107,7 @@ def _plus(pair: tuple[int, int], before: int, after: int) -> tuple[int, int]:
 @click.option("--level", default=2, show_default=True)
 @click.option("--form", "forms", multiple=True, type=click.Choice(list(FORMS)), default=["ours", "paper"])
 @click.option("--shot", "shots", multiple=True, help="Only these.")
+@click.option("--way-out", default=ContactSettings().way_out, show_default=True)
 @click.option("--device", default="cpu", show_default=True)
 def main(
     folder: Path | None,
@@ -114,6 +116,7 @@ def main(
     level: int,
     forms: Sequence[str],
     shots: Sequence[str],
+    way_out: float,
     device: str,
 ) -> None:
     """Print the table."""
@@ -131,7 +134,9 @@ def main(
             shot, first = open_one(name, Path(place), folder)
             first, count = (0, len(shot.scene.times)) if whole else (first, frames)
             for form in forms:
-                sums = run(shot, first, count, level=level, settings=FORMS[form], device=device)
+                sums = run(
+                    shot, first, count, level=level, settings=replace(FORMS[form], way_out=way_out), device=device
+                )
                 say(_row(name, form, sums))
 
 

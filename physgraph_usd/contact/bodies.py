@@ -27,9 +27,6 @@ from .room import room_above
 from .settings import ContactSettings
 from .track import Track
 
-PINCHED = 0.5
-"""Way out from between overlapping parts of a body, in mean cage edges, beyond which a vertex is left there."""
-
 LIFT = 2.0
 """Farthest that cloth is lifted over what comes through its faces, in edge lengths: a spike would show more."""
 STALE = 0.1
@@ -302,7 +299,7 @@ class FrameBodies:
             known = torch.where(feels, known, torch.full_like(known, float("inf")))
             inside.append(closest if bool(feels.all()) else None)
             side = _start_sides(each.surface, coarse + shift, finest)
-            longest = PINCHED * float(levels[0].spacing.mean())
+            longest = settings.way_out * float(levels[0].spacing.mean())
             tracks.append(Track(each.surface, shift, offset, side, base, known, longest))
         return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], inside, tracks, settings)
 

@@ -22,6 +22,7 @@ class ContactSettings:
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
         lifts: How often it moves faces outwards that a body comes through.
+        way_out: How far vertices between overlapping parts of a body are pushed out at most, in the cage's mean edges.
         measured: Whether what is off is measured all the same.
     """
 
@@ -35,6 +36,7 @@ class ContactSettings:
     clearance: float = 0.25
     projections: int = 10
     lifts: int = 40
+    way_out: float = 0.5
     measured: bool = False
 
     @property
