@@ -136,6 +136,24 @@ class TestWholeRounds:
         for x in (*integrator.started, *integrator.resumed):
             assert fold.crossings(x) == 0
 
+    def test_the_first_starts_from_what_the_way_off_a_saddle_did_not_make_cross(self, monkeypatch):
+        fold, integrator = Fold(), Noting(0)
+        monkeypatch.setattr(rounds, "leave_saddle", lambda *_, **__: fold.goal)
+        monkeypatch.setattr(rounds, "crowded", lambda *_: True)
+        system = system_of(fold.level, Springs(fold.x))
+        rounds.solve_touching(
+            lambda *_: system,
+            integrator,
+            fold.x,
+            view=fold.view,
+            level=fold.level,
+            finest=True,
+            outward=torch.ones(1),
+            budget=Budget(1),
+        )
+        assert fold.crossings(fold.goal) > 0
+        assert fold.crossings(integrator.started[0]) == 0
+
     def test_nothing_is_taken_back_to_a_start_that_crosses(self):
         fold = Fold()
         assert fold.view.uncrossed(fold.x, fold.goal) is fold.x
