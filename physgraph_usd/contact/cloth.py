@@ -45,7 +45,7 @@ AHEAD = 0.5
 STALE, FEW, MOST = 0.1, 1e-3, 0.35
 """Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
 has, and everywhere where more than the last part has."""
-CROSSED = 0.015
+CROSSED = 0.02
 """Part of the vertices round crossings of the input beyond which parts one edge apart are no pairs, however folded."""
 LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
@@ -266,9 +266,7 @@ class ClothView:
         """
         if self._level.index == 0:
             return None
-        # As wide at every level.
-        rings = ZONE << (self._level.index - 1)
-        crossed = self._mesh.grown(self._mesh.crossed(self.before.crossings), rings)
+        crossed = self._mesh.grown(self._mesh.crossed(self.before.crossings), ZONE)
         return None if float(crossed.to(self._base.dtype).mean()) > CROSSED else ~crossed
 
     def mend(self, x: Float[Tensor, "vertices 3"], good: ClothState | None = None) -> ClothState:
