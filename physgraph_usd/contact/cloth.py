@@ -45,8 +45,6 @@ AHEAD = 0.5
 STALE, FEW, MOST = 0.1, 1e-3, 0.35
 """Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
 has, and everywhere where more than the last part has."""
-CROSSED = 0.02
-"""Part of the vertices round crossings of the input beyond which parts one edge apart are no pairs, however folded."""
 LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
 EVERYWHERE = 0.5
@@ -250,24 +248,13 @@ class ClothView:
             self._found = None
             return None, none
         again = self._sides is None or self.tangled or self.before.crossings.count > 0
-        crossings, folds = self.look(x).crossings if again else none, self._folds
+        crossings = self.look(x).crossings if again else none
         self._mesh.move(x)
         before = None if known is None or part > MOST else known.nearest
         reach = torch.full_like(self._level.spacing, self._reach)
-        nearest = self._mesh.nearest(busy, reach, known=before, moved=moved, folds=folds)
+        nearest = self._mesh.nearest(busy, reach, known=before, moved=moved)
         self._found = _Found(nearest, nearest.pairs(self._level))
         return self._found.pairs, crossings
-
-    @cached_property
-    def _folds(self) -> Bool[Tensor, " vertices"] | None:
-        """Where parts one edge apart may be pairs in sharp folds; None at the cage, whose folds are the input's own.
-
-        Of what crosses in the input no side is known, and where much does nearly all sharp folds are of that.
-        """
-        if self._level.index == 0:
-            return None
-        crossed = self._mesh.grown(self._mesh.crossed(self.before.crossings), ZONE)
-        return None if float(crossed.to(self._base.dtype).mean()) > CROSSED else ~crossed
 
     def mend(self, x: Float[Tensor, "vertices 3"], good: ClothState | None = None) -> ClothState:
         """Smooth the move from good positions, and then take it back, wherever something crosses that did not.
