@@ -41,14 +41,14 @@ HELD = {"06_torus_pull.usda": 20}
 def main(folder: Path | None, level: int, frames: int, lead: int, shots: Sequence[str]) -> None:
     """Print the table."""
     prepare_device("cpu")
-    print(f"level {level}, {frames} held frames, means of the last {LAST}")
-    print("| shot | vertices | farthest move mm | over 1 mm |")
-    print("|---|---|---|---|")
+    click.echo(f"level {level}, {frames} held frames, means of the last {LAST}")
+    click.echo("| shot | vertices | farthest move mm | over 1 mm |")
+    click.echo("|---|---|---|---|")
     with tempfile.TemporaryDirectory() as place:
         for name in [*SAMPLES, *(REAL if folder else ())]:
             if shots and not any(each in name for each in shots):
                 continue
-            print(_row(name, Path(place), folder, level=level, frames=frames, lead=lead), flush=True)
+            click.echo(_row(name, Path(place), folder, level=level, frames=frames, lead=lead))
 
 
 def _row(name: str, place: Path, folder: Path | None, *, level: int, frames: int, lead: int) -> str:
