@@ -7,53 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from bodies import ball, box, surfaces, together
+from bodies import box
 from brute import Soup, crossings
 from folds import EDGE, contact_of, frame_with, levels_of, named, refiner_with, square
 from test_untangle import BOTH, UPPER
 
 from physgraph_usd.contact.cloth_mesh import ClothMesh
-from physgraph_usd.contact.measure import depths, pinched
 from physgraph_usd.contact.squeeze import squeezed
 
 GAP = 0.002
-
-
-class TestParts:
-    def test_points_are_inside_as_many_parts_as_overlap_there(self):
-        """Two balls of 10 cm whose centres are 14 cm apart: 6 cm of either lie in the other."""
-        surface = surfaces(together(ball(0.1, at=(-0.07, 0.0, 0.0)), ball(0.1, at=(0.07, 0.0, 0.0))))[0]
-        x = torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.03, 0.0], [0.08, 0.0, 0.0], [-0.08, 0.0, 0.0], [0.0, 0.09, 0.0]])
-        x = x - torch.as_tensor(surface.origin).to(x)
-        assert surface.inside(x).tolist() == [True, True, True, True, False]
-        assert surface.inside(x, parts=2).tolist() == [True, True, False, False, False]
-
-    def test_cloth_between_them_is_not_sent_through_one_of_them(self):
-        """A point in one part alone, 5 cm from its bare side: it comes out there, unless its cloth was between them."""
-        surface = surfaces(together(ball(0.1, at=(-0.07, 0.0, 0.0)), ball(0.1, at=(0.07, 0.0, 0.0))))[0]
-        x = torch.tensor([[0.12, 0.0, 0.0]]) - torch.as_tensor(surface.origin).to(torch.float32)
-        found = surface.closest(x, torch.full((1,), torch.inf))
-        way = surface.exit(x, found)
-        lost = torch.ones(1, dtype=torch.bool)
-        assert not bool(pinched(surface, x, found, way, longest=0.02))
-        assert bool(pinched(surface, x, found, way, longest=0.02, lost=lost))
-        assert not bool(pinched(surface, x, found, way, longest=0.06, lost=lost))
-        # The report counts it as the solve leaves it.
-        assert [bool(depths(surface, x, -found.distance, 0.02, lost=each)[1]) for each in (None, lost)] == [False, True]
-
-    @pytest.mark.parametrize("along", [0.5, -0.5])
-    def test_a_face_that_a_part_comes_through_is_no_way_out_there(self, along: float):
-        """A ball of 5 cm in the middle of a slab's top, whose corners lie bare: beside it one leaves through the top.
-
-        Half a millimetre under the top or over it, in the ball, one would only change sides.
-        """
-        surface = surfaces(together(box((1.0, 0.2, 1.0)), ball(0.05, at=(0.02, 0.1, 0.01))))[0]
-        x = torch.tensor([[0.02, 0.1 - 1e-3 * along, 0.01], [0.3, 0.1 - 5e-4, 0.01]])
-        x = x - torch.as_tensor(surface.origin).to(x)
-        way = surface.exit(x, surface.closest(x, torch.full((2,), torch.inf)))
-        assert not bool(surface.inside(way.point + 1e-3 * way.normal).any())
-        assert 0.03 < float(way.distance[0]) < 0.06
-        assert float(way.distance[1]) == pytest.approx(5e-4, rel=1e-3)
 
 
 class TestCorners:

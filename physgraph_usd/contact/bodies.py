@@ -21,8 +21,9 @@ from ..colliders.sign import signed_and_closest, signed_distances
 from ..forces.contact import Contact, Planes
 from ..forces.seam import Seam
 from ..level import Level
+from ..mesh.topology import patches_with
 from .corners import lift_over
-from .measure import DEEP, depths, penetration
+from .measure import DEEP, Pierced, depths, penetration
 from .room import room_above
 from .settings import ContactSettings
 from .track import Track
@@ -150,10 +151,31 @@ class LevelBodies:
             held |= pinned
         return inside, held
 
-    def lose(self, lost: Bool[Tensor, " vertices"]) -> None:
-        """From now on send these vertices of cloth between overlapping parts out of a body by short ways only."""
+    def crossings(self, x: Float[Tensor, "vertices 3"]) -> int:
+        """How many edges of cloth pass through bodies at x [m], and of bodies through cloth."""
+        return sum(len(self._pierced(track, x)) for track in self._tracks)
+
+    def lose(self, x: Float[Tensor, "vertices 3"]) -> None:
+        """From now on leave cloth that is between overlapping parts of a body at x [m] to itself while inside that.
+
+        It is a patch of vertices whose closest faces are buried, some of them inside two parts at once. Pushed out, it
+        would fold through its neighbours, whose way out is on the other side.
+        """
         for track in self._tracks:
-            track.lost = lost
+            between, in_two = track.between(x)
+            track.lost = self._patches(between, between[in_two]) if bool(in_two.any()) else None
+
+    def _patches(self, some: Tensor, seeds: Tensor) -> Bool[Tensor, " vertices"]:
+        """Of some vertices, by number, the connected patches that hold a seed."""
+        kept, wanted = (torch.zeros_like(self._level.free[:, 0]) for _ in range(2))
+        kept[some], wanted[seeds] = True, True
+        masks = (each.cpu().numpy() for each in (kept, wanted))
+        return torch.as_tensor(patches_with(self._level.edges.cpu().numpy(), *masks), device=kept.device)
+
+    @property
+    def lost(self) -> tuple[Bool[Tensor, " vertices"] | None, ...]:
+        """The vertices that each body lost; None where there are none."""
+        return tuple(track.lost for track in self._tracks)
 
     def hold(self, held: Bool[Tensor, " vertices"] | None) -> None:
         """From now on leave these vertices where they are between overlapping parts of a body."""
@@ -219,7 +241,7 @@ class LevelBodies:
 
     def _pierced_faces(self, track: Track, x: Tensor) -> Tensor:
         """Faces that a body comes through though none of their corners is left inside it."""
-        found = track.pierced(self._level, x, (track.known.abs() - (x - track.at).norm(dim=1)).clamp_min(0.0))
+        found = self._pierced(track, x)
         triangles, ends = self._level.triangles.long(), self._level.edges[found.edges].long()
         hit = torch.zeros(len(triangles), dtype=torch.bool, device=x.device)
         hit[found.triangles] = True
@@ -236,6 +258,10 @@ class LevelBodies:
                 moved = (x - other.at).norm(dim=1)
                 stays |= other.known - moved < 2.0 * self._settings.clearance * other.offset
         return torch.nonzero(hit & ~stays[triangles].any(dim=1)).squeeze(1)
+
+    def _pierced(self, track: Track, x: Tensor) -> Pierced:
+        """What goes through a body and through what it goes."""
+        return track.pierced(self._level, x, (track.known.abs() - (x - track.at).norm(dim=1)).clamp_min(0.0))
 
     def _depth(self, x: Tensor) -> Tensor:
         """How deep each vertex is in the deepest body [m]."""
@@ -310,7 +336,7 @@ class FrameBodies:
         x: Float[Tensor, "vertices 3"],
         *,
         held: Bool[Tensor, " vertices"] | None = None,
-        lost: Bool[Tensor, " vertices"] | None = None,
+        lost: Sequence[Bool[Tensor, " vertices"] | None] = (),
     ) -> dict[str, object]:
         """What is in each body and what crosses it, before and after, as plain values.
 
@@ -319,18 +345,19 @@ class FrameBodies:
             base: The upsampled cage [m].
             x: The result [m].
             held: Vertices that count as pinched between overlapping parts, however short the way out, or None.
-            lost: Vertices of cloth that lies between overlapping parts, or None.
+            lost: `LevelBodies.lost`.
         """
         bodies: dict[str, object] = {}
-        known = zip(self.touching, self._tracks, self.distances, self._inside, strict=True)
-        for each, track, before, inside in known:
+        lost = lost or [None] * len(self._tracks)
+        known = zip(self.touching, self._tracks, self.distances, self._inside, lost, strict=True)
+        for each, track, before, inside, own in known:
             surface, shift = each.surface, track.shift
             after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
             through, longest = len(track.pierced(finest, x, after.abs())), track.longest
             first = penetration(surface, finest, base + shift, before, longest=longest, inside=inside)
             last = penetration(
-                surface, finest, x + shift, after, longest=longest, held=held, lost=lost, crossings=through
+                surface, finest, x + shift, after, longest=longest, held=held, lost=own, crossings=through
             )
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {"before": asdict(first), "after": asdict(last)}

@@ -156,6 +156,7 @@ class ClothView:
         self._looked: ClothState | None = None
         self.tangled, self._everywhere = False, False
         self.allowed: ClothState | None = None
+        self._in_folds = False
         self._reach = float(thickness.max()) + (AHEAD if level.index else 1.0) * float(level.spacing.mean())
 
     @cached_property
@@ -168,6 +169,15 @@ class ClothView:
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
             self._looked = self._look(x, self._looked)
         return self._looked
+
+    def look_in_folds(self, wanted: bool) -> None:
+        """From now on make pairs of parts one edge apart in sharp folds, or no more: they take steps to settle.
+
+        Never at the cage, whose folds are the input's own, nor where the input crosses: of that no side is known.
+        """
+        wanted = wanted and self._level.index > 0 and not self.before.crossings.count
+        if wanted != self._in_folds:
+            self._in_folds, self._found = wanted, None
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with their seams closed [m]."""
@@ -252,7 +262,7 @@ class ClothView:
         self._mesh.move(x)
         before = None if known is None or part > MOST else known.nearest
         reach = torch.full_like(self._level.spacing, self._reach)
-        nearest = self._mesh.nearest(busy, reach, known=before, moved=moved)
+        nearest = self._mesh.nearest(busy, reach, known=before, moved=moved, folds=self._in_folds)
         self._found = _Found(nearest, nearest.pairs(self._level))
         return self._found.pairs, crossings
 

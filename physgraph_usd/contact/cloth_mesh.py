@@ -4,6 +4,7 @@
 # pyright: reportArgumentType=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,8 +22,28 @@ from .again import edges_again, faces_again
 from .beside import add_neighbours, beside_table
 from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
+from .folds import in_sharp_folds
 from .nearest import Nearest, Pairs
 from .proximity import edges_near, faces_near, vertex_normals
+
+
+@dataclass(frozen=True, eq=False)
+class _Own:
+    """What makes no pairs with each vertex, as kernels read it.
+
+    Attributes:
+        rings: Where the vertices beside each begin, and those.
+        faces: The faces of clusters with one of them or the vertex itself as a corner, as `beside_table` gives them.
+        edges: The edges.
+    """
+
+    rings: list[wp.array]
+    faces: tuple[wp.array, ...]
+    edges: tuple[wp.array, ...]
+
+
+_Asked = tuple[Bool[Tensor, " vertices"], _Own]
+"""Vertices that are asked, and what makes no pairs with them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +101,7 @@ class ClothMesh:
         self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
         self._rest = level.rest.to(torch.float32).contiguous()
         self._apart, self.sewn = self.beside, np.zeros((0, 2), np.int64)
-        self._rings, self._beside_parts = self._arrays(self.beside), self._tables(self.beside)
+        self._take_neighbours(sp.identity(level.vertex_count, dtype=np.float32, format="csr"))
         corner = np.argsort(triangles.ravel(), kind="stable")
         starts = np.concatenate([[0], np.cumsum(np.bincount(triangles.ravel(), minlength=level.vertex_count))])
         about = [wp.array(each.astype(np.int32), dtype=wp.int32, device=level.device) for each in (starts, corner // 3)]
@@ -120,7 +141,22 @@ class ClothMesh:
         beside.setdiag(0.0)
         beside.eliminate_zeros()
         beside.data[:] = 1.0
-        self.beside, self._rings, self._beside_parts = beside, self._arrays(beside), self._tables(beside)
+        self.beside = beside
+        self._take_neighbours(same)
+
+    def _take_neighbours(self, same: sp.csr_matrix) -> None:
+        """Make the tables of what makes no pairs: with its neighbours, and with what is the same alone."""
+        self._neighbours, self._itself = self._own(self.beside), self._own(same)
+
+    def _own(self, beside: sp.csr_matrix) -> _Own:
+        """What lies beside each vertex, as kernels read it."""
+        parts = [self._clusters.faces[:2], self._clusters.edges[:2]]
+        device = self.level.device
+        tables = [beside_table(beside, corners.numpy(), first.numpy(), device=device) for first, corners in parts]
+        rings = [
+            wp.array(each.astype(np.int32), dtype=wp.int32, device=device) for each in (beside.indptr, beside.indices)
+        ]
+        return _Own(rings, *tables)
 
     def move(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions [m]; what is asked afterwards is asked of them.
@@ -152,6 +188,7 @@ class ClothMesh:
         *,
         known: Nearest | None = None,
         moved: Bool[Tensor, " vertices"] | None = None,
+        folds: bool = False,
     ) -> Nearest:
         """The closest parts above and below what is busy.
 
@@ -161,6 +198,7 @@ class ClothMesh:
             known: What was closest before some vertices moved: what is not within reach of those is not asked again,
                 and only the closest points on it are found anew.
             moved: Those vertices.
+            folds: Whether in sharp folds parts one edge apart may be near each other, too.
         """
         assert self._at is not None
         self.normals()
@@ -172,13 +210,14 @@ class ClothMesh:
             found = known.copy()
             again = self._beside(moved, float(limit.max())) | known.beside_moved(level, moved) | self._slid(found)
             found, beside = found.without(again, x=x), self.grown(again, 1)
-        self._ask_faces(busy & again, limit, found)
+        sharp = self._sharp() if folds else None
+        self._ask_faces(self._parted(busy & again, sharp), limit, found)
         # An edge near another has a vertex near a face, or next to one that is.
         close = self.grown(found.close(level), 1) & beside
         if known is not None:
             unknown, (first, second) = close | again, self._ends
             found.edge[unknown[first] | unknown[second]] = -1
-        self._ask_edges(close, limit, found)
+        self._ask_edges(self._parted(close, sharp), limit, found)
         return found
 
     def crossings(self, busy: Bool[Tensor, " vertices"]) -> Crossings:
@@ -211,7 +250,7 @@ class ClothMesh:
         """Vertices at most some edges away from given ones."""
         for _ in range(rings):
             given, vertices = vertices, vertices.clone()
-            inputs = [*self._rings, _flags(given), _flags(vertices)]
+            inputs = [*self._neighbours.rings, _flags(given), _flags(vertices)]
             Launch(add_neighbours, len(given), inputs, device=self.level.device, lanes=self.level.lanes)({})
         return vertices
 
@@ -274,45 +313,44 @@ class ClothMesh:
         ends[self.level.edges[slid].long().reshape(-1)] = True
         return ends
 
-    def _ask_faces(self, asked: Bool[Tensor, " vertices"], reach: Tensor, found: Nearest) -> None:
+    def _ask_faces(self, asked: Sequence[_Asked], reach: Tensor, found: Nearest) -> None:
         """Write the closest faces of the vertices that are asked."""
-        best = torch.empty((len(asked), 2), dtype=torch.float32, device=asked.device)
+        best = torch.empty((len(self.level.rest), 2), dtype=torch.float32, device=reach.device)
         clusters = self._clusters
-        inputs = [
-            *self._asked(asked, reach),
-            *self._beside_parts[0],
-            *clusters.vertices,
-            *clusters.faces,
-            *clusters.face_boxes,
-        ]
         outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.face, dtype=wp.vec2i)]
-        clusters.run(faces_near, [*inputs, *outputs, *[_vectors(each) for each in found.weight]])
+        outputs += [_vectors(each) for each in found.weight]
+        for which, own in asked:
+            inputs = [*own.rings, *self._moving(which, reach), *own.faces]
+            clusters.run(faces_near, [*inputs, *clusters.vertices, *clusters.faces, *clusters.face_boxes, *outputs])
 
-    def _ask_edges(self, asked: Bool[Tensor, " vertices"], reach: Tensor, found: Nearest) -> None:
+    def _ask_edges(self, asked: Sequence[_Asked], reach: Tensor, found: Nearest) -> None:
         """Write the closest edges of those that have an end that is asked."""
-        best = torch.empty((len(found.edge), 2), dtype=torch.float32, device=asked.device)
+        best = torch.empty((len(found.edge), 2), dtype=torch.float32, device=reach.device)
         clusters = self._clusters
-        inputs = [*self._asked(asked, reach), *self._beside_parts[1], *clusters.edges, *clusters.edge_boxes]
         outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.edge, dtype=wp.vec2i)]
-        clusters.run_shared(
-            edges_near, [*inputs, *outputs, *[wp.from_torch(each, dtype=wp.vec2f) for each in found.place]]
-        )
+        outputs += [wp.from_torch(each, dtype=wp.vec2f) for each in found.place]
+        for which, own in asked:
+            inputs = [*own.rings, *self._moving(which, reach), *own.edges]
+            clusters.run_shared(edges_near, [*inputs, *clusters.edges, *clusters.edge_boxes, *outputs])
 
-    def _asked(self, asked: Tensor, reach: Tensor) -> list[object]:
-        """What both proximity kernels are told first."""
+    def _sharp(self) -> Bool[Tensor, " vertices"]:
+        """Vertices in sharp folds."""
+        sharp = torch.zeros_like(self.level.free[:, 0])
+        inputs = [self._triangles, _vectors(self._position), _vectors(self._normal), _flags(sharp)]
+        Launch(in_sharp_folds, len(self.triangles), inputs, device=self.level.device, lanes=self.level.lanes)({})
+        return sharp
+
+    def _parted(self, asked: Bool[Tensor, " vertices"], sharp: Tensor | None) -> list[_Asked]:
+        """What is asked, with what makes no pairs with it: its neighbours; in sharp folds, last, only what it is."""
+        sharp = None if sharp is None else sharp & asked
+        if sharp is None or not bool(sharp.any()):
+            return [(asked, self._neighbours)]
+        return [(asked & ~sharp, self._neighbours), (sharp, self._itself)]
+
+    def _moving(self, asked: Tensor, reach: Tensor) -> list[object]:
+        """What both proximity kernels are told of the positions."""
         moving = [_vectors(self._position), _flags(asked), wp.from_torch(reach), _vectors(self._normal)]
-        return [*self._rings, *moving, _vectors(self._rest)]
-
-    def _tables(self, beside: sp.csr_matrix) -> list[tuple[wp.array, ...]]:
-        """The faces and the edges beside each vertex, as kernels read them."""
-        parts = [self._clusters.faces[:2], self._clusters.edges[:2]]
-        given = {"device": self.level.device}
-        return [beside_table(beside, corners.numpy(), first.numpy(), **given) for first, corners in parts]
-
-    def _arrays(self, beside: sp.csr_matrix) -> list[wp.array]:
-        """An adjacency as kernels read it: where each row starts, and the neighbours."""
-        each = (beside.indptr.astype(np.int32), beside.indices.astype(np.int32))
-        return [wp.array(values, dtype=wp.int32, device=self.level.device) for values in each]
+        return [*moving, _vectors(self._rest)]
 
 
 def _adjacency(edges: np.ndarray, count: int) -> sp.csr_matrix:

@@ -19,8 +19,9 @@ from .bodies import FrameBodies, LevelBodies, moves
 from .cloth import ClothContact, ClothView
 from .cloth_mesh import ClothMesh
 from .last_resort import FIRST, returned, taken_back
+from .mend import smoothed
 from .metric import HeldMetric
-from .repair import hidden_between, repaired_cage
+from .repair import repaired_cage
 from .seams import Seams
 from .settings import ContactSettings
 from .squeeze import squeezed
@@ -33,6 +34,8 @@ HOLDS = 6
 """How often more of what is between overlapping parts of a body is left there, while pushing it out makes it cross."""
 MIXED = 4
 """Rings round what crosses in a warm start that start from the coarse levels instead; it fades over as many more."""
+SMOOTHINGS = 8
+"""Passes that smooth wrinkles of cloth between overlapping parts."""
 Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
 
@@ -80,6 +83,11 @@ class LevelContact:
         parts = [part.term(x) for part in (self.bodies, self.cloth) if part is not None]
         return tuple(term for term in parts if term is not None)
 
+    def look_in_folds(self, wanted: bool) -> None:
+        """As `ClothView.look_in_folds`, where there is cloth."""
+        if self.cloth is not None:
+            self.cloth.look_in_folds(wanted)
+
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with their seams closed [m]."""
         return x if self.seam is None else self.seam.closed(x)
@@ -122,7 +130,6 @@ class FrameContact:
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._aim: Tensor | None = None
         self._held: Tensor | None = None
-        self._lost: Tensor | None = None
         self._bodies, self._cloth = bodies, cloth
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
         self._views: dict[int, LevelContact] = {}
@@ -168,10 +175,7 @@ class FrameContact:
             seam, cloth = self._seam_at(level, base), self._cloth_at(level, base)
             if bodies is not None:
                 bodies.seam = seam
-            if bodies is not None and self._cloth is not None and self.aim is not self._coarse:
-                lost = hidden_between(level, base, bodies, self._cloth.mesh(level))
-                bodies.lose(lost)
-                self._lost = lost if level is self._levels[-1] else self._lost
+                bodies.lose(base)
             if cloth is not None and level is self._levels[-1] and self._judge is not None:
                 cloth.allowed = self._judge.before
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
@@ -246,9 +250,23 @@ class FrameContact:
             x, passes = bodies.project(mended)
             if cloth is not None and cloth.look(x).crossings.count:
                 x = self._least_crossed(cloth, bodies, mended, x)
-        if cloth is None or not cloth.worse(x):
-            return mended, x, passes
-        return mended, self._not_worse(cloth, bodies, mended, x), passes
+        x = self._not_worse(cloth, bodies, mended, x) if cloth is not None and cloth.worse(x) else x
+        return mended, x if cloth is None or bodies is None else self._laid_smooth(cloth, bodies, x), passes
+
+    def _laid_smooth(self, cloth: ClothView, bodies: LevelBodies, x: Tensor) -> Tensor:
+        """Cloth between overlapping parts without its wrinkles, where it goes through more of a body than the input.
+
+        Not where it then crosses itself in more places than the input does.
+        """
+        lost = [each for each in bodies.lost if each is not None]
+        if not lost:
+            return x
+        count = bodies.crossings(x)
+        if count <= bodies.crossings(self._levels[-1].base.apply(self._coarse)):
+            return x
+        smooth = smoothed(self._cloth_mesh, x, torch.stack(lost).any(dim=0), passes=SMOOTHINGS)
+        out = bodies.push_out(cloth.closed(smooth))
+        return x if cloth.worse(out) or bodies.crossings(out) >= count else out
 
     def _least_crossed(self, cloth: ClothView, bodies: LevelBodies, mended: Tensor, x: Tensor) -> Tensor:
         """Push cloth along that bodies push onto; where more crosses than in the input even then, leave more of it.
@@ -344,7 +362,9 @@ class FrameContact:
         said: dict[str, object] = {}
         if self._bodies is not None:
             base = finest.base.apply(self._coarse)
-            said |= self._bodies.measure(finest, base, x, held=self._held, lost=self._lost)
+            bodies = self.at(finest).bodies
+            lost = () if bodies is None else bodies.lost
+            said |= self._bodies.measure(finest, base, x, held=self._held, lost=lost)
         if view is not None:
             cloth, crossing = view.measure(x)
             said |= {"cloth": cloth} if cloth else {}

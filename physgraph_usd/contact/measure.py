@@ -38,8 +38,9 @@ class Penetration:
         percent: Their part of all free vertices.
         deepest_mm: Depth of the deepest free vertex [mm].
         pinned: Pinned vertices deeper than `DEEP`: they stay.
-        pinched: Free vertices between parts of the body that overlap, farther from any way out than half a cage
-            edge: they stay too, out of sight; forced out, they would tear the cloth.
+        pinched: Free vertices inside whose cloth lies between overlapping parts of the body in the input, or that are
+            there now and farther from any way out than half a cage edge: they stay, out of sight; forced out, they
+            would fold through their neighbours.
         crossings: Edges of the cloth through faces of the body, and edges of the body through faces of the cloth.
     """
 
@@ -141,14 +142,25 @@ def pinched(
         way: The closest points on faces that lie bare.
         longest: Longest way out [m].
         held: Points that stay, however short the way out, if they are inside two parts at once; or None.
-        lost: Points of cloth that lies between overlapping parts, wherever it was pushed from there; or None.
+        lost: Points of cloth that lies between overlapping parts: they stay, wherever they went from there; or None.
     """
-    far, detour = way.distance > longest, way.distance > DETOUR * found.distance
-    stays = far & (detour if lost is None else detour | lost)
+    detour = is_between(found, way)
+    stays = (way.distance > longest) & detour
+    stays = stays if lost is None else stays | lost
     if held is not None and bool(held.any()):
         which = torch.nonzero(held).squeeze(1)
         stays[which] |= detour[which] | surface.inside(x[which], parts=2)
     return stays
+
+
+def is_between(found: Nearest, way: Nearest) -> Bool[Tensor, " points"]:
+    """Which points inside a surface lie between parts of it that overlap: their closest face is inside it, too.
+
+    Args:
+        found: The closest points.
+        way: The closest points on faces that lie bare.
+    """
+    return way.distance > DETOUR * found.distance
 
 
 @wp.kernel

@@ -1,7 +1,7 @@
 """Which parts of the cloth are near which, asked by clusters of faces.
 
 Queries are exact for what is asked: the closest face above and below a vertex, the closest edge above and below an
-edge. Parts that share a corner, or are one edge apart, are no pairs.
+edge. Parts that share a corner are no pairs, nor are those one edge apart, but in sharp folds.
 """
 
 # Warp's kernels are typed by values that only Warp reads.

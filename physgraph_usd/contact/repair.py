@@ -17,6 +17,7 @@ from scipy.sparse import csgraph
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.topology import patches_with
 from .apart import drawn_apart
 from .bodies import LevelBodies
 from .cloth_mesh import ClothMesh
@@ -58,7 +59,7 @@ def repaired_cage(
 
 def _drawn_taut(cage: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Tensor:
     """Cloth between overlapping parts of a body as a taut membrane, and what can leave it outside."""
-    hidden = hidden_between(cage, x, bodies, mesh)
+    hidden = _hidden_between(cage, x, bodies, mesh)
     if not bool(hidden.any()):
         return x
     around = mesh.grown(hidden, 1) & cage.free[:, 0]
@@ -68,34 +69,14 @@ def _drawn_taut(cage: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) ->
     return out
 
 
-def hidden_between(
-    level: Level, x: Float[Tensor, "vertices 3"], bodies: LevelBodies, mesh: ClothMesh
-) -> Bool[Tensor, " vertices"]:
-    """Free vertices of patches inside bodies that are pinched between overlapping parts somewhere.
-
-    Args:
-        level: The level.
-        x: Its positions [m].
-        bodies: Its view of the bodies.
-        mesh: Its faces.
-    """
+def _hidden_between(level: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Bool[Tensor, " vertices"]:
+    """Free vertices of patches inside bodies that are pinched between overlapping parts somewhere."""
     inside, held = bodies.within(x)
     held &= level.free[:, 0]
     if not bool(held.any()):
         return held
-    return _patches_with(inside & level.free[:, 0], held, mesh.beside)
-
-
-def _patches_with(
-    some: Bool[Tensor, " vertices"], seeds: Bool[Tensor, " vertices"], beside: sp.csr_matrix
-) -> Bool[Tensor, " vertices"]:
-    """Of some vertices the connected patches that hold a seed."""
-    which = np.flatnonzero(some.cpu().numpy())
-    label = csgraph.connected_components(beside[which][:, which], directed=False)[1]
-    kept = np.isin(label, label[seeds.cpu().numpy()[which]])
-    out = torch.zeros_like(some)
-    out[torch.as_tensor(which[kept], device=some.device)] = True
-    return out
+    some, seeds = ((each & level.free[:, 0]).cpu().numpy() for each in (inside, held))
+    return torch.as_tensor(patches_with(np.stack(mesh.beside.nonzero(), axis=1), some, seeds), device=held.device)
 
 
 def _membrane(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:

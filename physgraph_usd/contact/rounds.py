@@ -72,12 +72,14 @@ def solve_touching(
     if view.cloth is not None and level.index and (outward is not None or not view.cloth.before.crossings.count):
         # What a coarser level or the last frame made cross; where a warm frame's input crosses too, it is drawn out.
         x = view.cloth.mend(x).x
+    view.look_in_folds(finest and outward is None)
     x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
     start = x
     if outward is not None:
         x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
     # A warm frame has no coarse levels that settle contact before; much cloth on cloth settles slowly.
     whole = finest and (outward is None or crowded(touched, x))
+    view.look_in_folds(whole)
     x = view.uncrossed(x, start) if whole else x
     x, more, touched = solve_rounds(
         make_system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, whole=whole

@@ -22,7 +22,8 @@ class ContactSettings:
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
         lifts: How often it moves faces outwards that a body comes through.
-        way_out: How far vertices between overlapping parts of a body are pushed out at most, in the cage's mean edges.
+        way_out: How far vertices that get between overlapping parts of a body are pushed out at most, in the cage's
+            mean edges. What the input has there stays.
         measured: Whether what is off is measured all the same.
     """
 

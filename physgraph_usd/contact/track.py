@@ -10,7 +10,7 @@ from torch import Tensor
 from ..colliders.base import Nearest, Surface
 from ..colliders.sign import MARGIN, behind, is_clear
 from ..level import Level
-from .measure import Pierced, pierced, pinched
+from .measure import Pierced, is_between, pierced, pinched
 
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
@@ -29,6 +29,7 @@ class Track:
         known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
         held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
+        lost: Vertices that lay between overlapping parts in the input, and stay while inside, shape (V,), or None.
         looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
     """
 
@@ -80,6 +81,19 @@ class Track:
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
         normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
         return which[kept], normal[kept], (distance * sign)[kept]
+
+    def between(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Numbers of the vertices that are between overlapping parts of a closed surface at x [m]; which are in two."""
+        moved = (x - self.at).norm(dim=1)
+        which = torch.nonzero((self.known - moved < 0) & self.offset.isfinite()).squeeze(1)
+        if not len(which) or not self.surface.closed:
+            return which[:0], moved[:0] > 0
+        asked = x[which] + self.shift
+        found = self.surface.closest(asked, torch.full_like(asked[:, 0], float("inf")))
+        within = torch.nonzero(self._signs(which, found, asked, moved[which]) < 0).squeeze(1)
+        near = found.some(within)
+        within = within[is_between(near, self.surface.exit(asked[within], near))]
+        return which[within], self.surface.inside(asked[within], parts=2)
 
     def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
         """How far to look for the surface: what is farther away outside is known well enough by that bound."""

@@ -302,3 +302,9 @@ def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
     """The piece of each of some vertices, by the edges that hold them together, shape (V,)."""
     graph = sparse.coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
     return csgraph.connected_components(graph, directed=False)[1]
+
+
+def patches_with(edges: np.ndarray, some: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Of some vertices the patches, held together by the edges, that have a seed in them, shape (V,)."""
+    patch = joined_by(edges[some[edges].all(axis=1)], len(some))
+    return some & np.isin(patch, patch[some & seeds])

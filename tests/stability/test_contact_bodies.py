@@ -191,11 +191,6 @@ def jaws(gap: float, kind: str) -> tuple[Any, ...]:
 KINDS = {"capsules": ["capsule"] * 2, "boxes": ["mesh"] * 2, "one": ["mesh"]}
 
 
-def overlap(reason: str) -> pytest.MarkDecorator:
-    """Fails, and why."""
-    return pytest.mark.xfail(strict=True, reason=reason)
-
-
 class TestPinched:
     """S21: an armpit. The cloth is 1 mm thick and keeps 2 mm from bodies."""
 
@@ -241,14 +236,7 @@ class TestPinched:
         assert max(moves[-8:]) < STILL, moves
 
     @pytest.mark.slow
-    @pytest.mark.parametrize(
-        "kind",
-        [
-            "capsules",
-            "boxes",
-            pytest.param("one", marks=overlap("in an overlap of one mesh cloth goes 2 mm to and fro")),
-        ],
-    )
+    @pytest.mark.parametrize("kind", KINDS)
     def test_s21_jaws_that_overlap_over_24_frames(self, kind: str):
         assert max(self.closing(-0.005, kind)[-8:]) < 2 * STILL
 
