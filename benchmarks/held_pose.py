@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -48,11 +48,37 @@ def main(folder: Path | None, level: int, frames: int, lead: int, shots: Sequenc
         for name in [*SAMPLES, *(REAL if folder else ())]:
             if shots and not any(each in name for each in shots):
                 continue
-            click.echo(_row(name, Path(place), folder, level=level, frames=frames, lead=lead))
+            moves = held(name, Path(place), folder, level=level, frames=frames, lead=lead)
+            said = f"{moves.vertices} | {1e3 * moves.farthest:.2g} | {moves.many:.0f}"
+            click.echo(f"| {Path(name).parts[0].split('.')[0]} | {said} |")
 
 
-def _row(name: str, place: Path, folder: Path | None, *, level: int, frames: int, lead: int) -> str:
-    """One shot's row."""
+@dataclass(frozen=True)
+class Moves:
+    """How cloth moves from frame to frame at the end.
+
+    Attributes:
+        vertices: Fine vertices.
+        farthest: Move of the vertex that moves farthest [m], mean over frames.
+        many: Vertices that move by more than a millimetre, mean over frames.
+    """
+
+    vertices: int
+    farthest: float
+    many: float
+
+
+def held(name: str, place: Path, folder: Path | None = None, *, level: int, frames: int = 15, lead: int = 3) -> Moves:
+    """Hold one shot's pose.
+
+    Args:
+        name: A sample, or a real shot.
+        place: Where a sample is written.
+        folder: Where real shots lie.
+        level: Subdivisions.
+        frames: Held frames.
+        lead: Frames before them.
+    """
     shot, at = open_one(name, place, folder)
     times = shot.scene.times[max(at - lead, 0) : at + 1]
     settings = RefineOptions().solve_settings()
@@ -62,9 +88,8 @@ def _row(name: str, place: Path, folder: Path | None, *, level: int, frames: int
     solved = [refiner.solve(frame).points for frame in given][-LAST - 1 :]
     points = [np.concatenate([each for each in garments if each is not None]) for garments in solved]
     moves = [np.linalg.norm(after - before, axis=1) for before, after in pairwise(points)]
-    far = float(np.mean([each.max() for each in moves]))
-    many = float(np.mean([np.count_nonzero(each > 1e-3) for each in moves]))
-    return f"| {Path(name).stem} | {len(points[0])} | {1e3 * far:.2g} | {many:.0f} |"
+    farthest = float(np.mean([each.max() for each in moves]))
+    return Moves(len(points[0]), farthest, float(np.mean([np.count_nonzero(each > 1e-3) for each in moves])))
 
 
 def _held(frame: Frame, count: int) -> Frame:

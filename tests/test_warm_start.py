@@ -107,6 +107,26 @@ class TestTangledStart:
         assert torch.equal(mixed[corner], cold[corner])
         assert 0 < int(far.sum()) < len(far)
 
+    def test_few_of_the_inputs_crossings_stay_where_they_are(self):
+        """Sheets that cross along lines in the input; of the upper one only a corner still hangs through."""
+        garments = [named(square(8), "A"), named(square(8), "B")]
+        levels = levels_of(*garments)
+        level, cage = levels[-1], levels[0].rest.clone()
+        upper = torch.arange(len(cage)) >= len(cage) // 2
+        cage[upper, 1] += 0.004 + 0.008 * (cage[upper, 0].abs() > 0.11)
+        cage[upper, 1] -= 0.014 * (cage[upper, 2].abs() > 0.11)
+        contact = contact_of(levels, garments, cage, cloth_stiffness=1e5)
+        x, fine = level.base.apply(cage), level.vertex_garment == 1
+        assert contact.tangles(x)
+        x[fine, 1] = 0.004
+        assert not contact.tangles(x)
+        x[fine & (x[:, 0] > 0.17) & (x[:, 2] > 0.17), 1] -= 0.008
+        cloth = contact.at(level).cloth
+        assert cloth is not None
+        told: Any = contact.measure(x)[0]["cloth"]
+        assert 0 < cloth.look(x).crossings.count <= 0.2 * told["before"]["crossings"]
+        assert not contact.tangles(x)
+
     def test_of_a_shot_goes_through_the_levels(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         """Two frames of the T-shirt whose cages cross themselves; from the last detail alone they stay crossed."""
         shot = open_shot(str(write_sample("tshirt", tmp_path)))
