@@ -171,7 +171,7 @@ class ClothView:
         return self._looked
 
     def look_in_folds(self, wanted: bool) -> None:
-        """From now on make pairs of parts one edge apart in sharp folds, or no more: they take steps to settle.
+        """From now on make pairs of parts one edge apart in sharp folds, or no more.
 
         Never at the cage, whose folds are the input's own, nor where the input crosses: of that no side is known.
         """

@@ -79,7 +79,6 @@ def solve_touching(
         x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
     # A warm frame has no coarse levels that settle contact before; much cloth on cloth settles slowly.
     whole = finest and (outward is None or crowded(touched, x))
-    view.look_in_folds(whole)
     x = view.uncrossed(x, start) if whole else x
     x, more, touched = solve_rounds(
         make_system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, whole=whole
