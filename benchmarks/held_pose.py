@@ -3,9 +3,8 @@
     python -m benchmarks.held_pose [--level 1] [--frames 15] [--lead 3] [--shot tshirt] [FOLDER]
 
 Refines a few frames of a shot in a row, up to the first one of `contact_shots`, then holds that one's bodies and
-cage, but for a drift of a micrometre a frame: equal frames would be taken over as they are. Prints a
-row a shot: the farthest move of a vertex, and how many move by more than a millimetre, as means over the last six
-frames.
+cage, but for a drift of a micrometre a frame: equal frames would be taken over as they are. Prints a row a shot: the
+farthest move of a vertex, and how many move by more than a millimetre, as means over the last six frames.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ class ClothMesh:
         if np.array_equal(pairs, self.sewn):
             return
         self.sewn, count = pairs, self.level.vertex_count
-        for name in ("whole", "within_two"):
+        for name in ("whole", "within_two", "_itself"):
             self.__dict__.pop(name, None)
         same = sp.identity(count, dtype=np.float32, format="csr")
         if len(pairs):
@@ -145,8 +145,13 @@ class ClothMesh:
         self._take_neighbours(same)
 
     def _take_neighbours(self, same: sp.csr_matrix) -> None:
-        """Make the tables of what makes no pairs: with its neighbours, and with what is the same alone."""
-        self._neighbours, self._itself = self._own(self.beside), self._own(same)
+        """Make the tables of what makes no pairs with each vertex: its neighbours; and keep what is the same."""
+        self._neighbours, self._same = self._own(self.beside), same
+
+    @cached_property
+    def _itself(self) -> _Own:
+        """The tables of what is the same alone, made where a sharp fold first asks."""
+        return self._own(self._same)
 
     def _own(self, beside: sp.csr_matrix) -> _Own:
         """What lies beside each vertex, as kernels read it."""

@@ -72,6 +72,7 @@ def solve_touching(
     if view.cloth is not None and level.index and (outward is not None or not view.cloth.before.crossings.count):
         # What a coarser level or the last frame made cross; where a warm frame's input crosses too, it is drawn out.
         x = view.cloth.mend(x).x
+    # From cold, where folds form, pairs in them would take more steps than there are.
     view.look_in_folds(finest and outward is None)
     x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
     start = x
