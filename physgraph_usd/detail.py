@@ -89,9 +89,15 @@ class Solved:
     @property
     def crossings(self) -> tuple[int, int]:
         """How many edges pass through cloth, in the upsampled input and in the result."""
-        cloth = self.telemetry.get("contact", {}).get("cloth", {})
-        before, after = (cloth.get(which, {}).get("crossings", 0) for which in ("before", "after"))
-        return before, after
+        return self._told("before", "crossings"), self._told("after", "crossings")
+
+    @property
+    def between_garments(self) -> int:
+        """How many of the result's edges pass through another garment's cloth."""
+        return self._told("after", "between_garments")
+
+    def _told(self, which: str, name: str) -> int:
+        return self.telemetry.get("contact", {}).get("cloth", {}).get(which, {}).get(name, 0)
 
 
 class MovingFrames:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .attempts import TORN, best_of
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
@@ -35,8 +36,6 @@ from .resolution import edge_strain, sharp_folds
 from .scene import Garment, GarmentFrame, recentred
 from .solve_settings import SolveSettings
 
-TORN = 0.5
-"""The same percentile of a result beyond which a frame that started warm is solved again from cold."""
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
@@ -110,20 +109,22 @@ class Group:
         Raises:
             SolveError: A term of the potential is not finite.
         """
-        solved, strain = self._attempt(frames, kept, at, touching)
-        before, after = solved.crossings if self._settings.contact.cloth != "off" else (0, 0)
-        if not solved.telemetry["start"].startswith("warm") or (strain <= TORN and after <= before):
-            return solved
-        torn = f"tore the cloth, straining it by {strain:.3g}"
-        why = torn if strain > TORN else f"made {after} edges cross, {before} in the input"
-        cold, _ = self._attempt(frames, None, at, touching)
-        cold.telemetry["start"] = f"cold: the last frame's detail {why}"
-        return cold if strain > TORN or cold.crossings[1] < after else solved
+
+        def attempt(kept: Carried | None, *, anew: bool = False) -> tuple[Solved, float]:
+            return self._attempt(frames, kept, at, touching, anew=anew)
+
+        return best_of(attempt, kept, counts=self._settings.contact.cloth != "off")
 
     def _attempt(
-        self, frames: Sequence[GarmentFrame], kept: Carried | None, at: float | None, touching: Sequence[Touching]
+        self,
+        frames: Sequence[GarmentFrame],
+        kept: Carried | None,
+        at: float | None,
+        touching: Sequence[Touching],
+        *,
+        anew: bool,
     ) -> tuple[Solved, float]:
-        """Solve one frame; also the 99th percentile of the edges' strain."""
+        """Solve one frame once; also the 99th percentile of the edges' strain."""
         clock = time.perf_counter()
         forces = self._forces_for(frames)
         world, origin, coarse = self._placed(frames)
@@ -132,7 +133,7 @@ class Group:
         aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            x, reports, module, told = self._descend(forces, aim, predicted, clock, contact=contact)
+            x, reports, module, told = self._descend(forces, aim, predicted, clock, contact=contact, anew=anew)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
@@ -304,19 +305,20 @@ class Group:
         clock: float,
         *,
         contact: FrameContact | None,
+        anew: bool,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
-        """Walk the levels; a warm start goes to the finest, but where it is tangled. Also says why, for the report."""
+        """Walk the levels; a warm start goes to the finest, unless what crosses starts anew. Also says why."""
         choice, last = self._choose(forces[0], coarse, contact, warm=predicted is not None), len(self.levels) - 1
-        tangled = predicted is not None and contact is not None and contact.crossed and contact.tangles(predicted)
-        first = 0 if choice.nested or tangled else last
-        x = predicted if predicted is not None and not tangled else self.levels[first].base.apply(coarse)
+        anew = anew and predicted is not None and contact is not None and contact.crossed
+        first = 0 if choice.nested or anew else last
+        x = predicted if predicted is not None and not anew else self.levels[first].base.apply(coarse)
         reports: list[LevelReport] = []
         module = ForceModule(())
         for index in range(first, last + 1):
             level, lasting = self.levels[index], forces[index]
             if index > first and level.from_below is not None:
                 x = level.from_below.apply(x)
-            if index == last and tangled and predicted is not None and contact is not None:
+            if index == last and anew and predicted is not None and contact is not None:
                 predicted = x = contact.mixed(predicted, x)
             module = lasting.module(coarse)
             warm = predicted if index == last else None
@@ -329,7 +331,7 @@ class Group:
                 made[-1].energies = module.energies(x)
             reports += made
             module = ForceModule((*module.forces, *touched))
-        told: dict[str, object] = {"start": "warm: from the coarse levels round what crossed"} if tangled else {}
+        told: dict[str, object] = {"start": "warm: from the coarse levels round what crossed"} if anew else {}
         return x, reports, module, told | ({"chosen": choice.reason} if choice.reason else {})
 
     def _choose(self, cage: LevelForces, coarse: Tensor, contact: FrameContact | None, *, warm: bool) -> Choice:

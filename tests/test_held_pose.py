@@ -28,7 +28,7 @@ def test_in_layers_it_rests(level: int, tmp_path: Path):
 
 @pytest.mark.slow
 def test_between_overlapping_parts_it_rests(tmp_path: Path):
-    """A T-shirt whose arm has come down onto a torso that it overlaps."""
-    moves = held("tshirt", tmp_path, level=2)
+    """A T-shirt whose arm has come down onto a torso that it overlaps; what crosses starts anew in the first frames."""
+    moves = held("tshirt", tmp_path, level=2, frames=18)
     assert moves.many == 0, moves
-    assert moves.farthest < 5 * REST, moves
+    assert moves.farthest < REST, moves

@@ -32,9 +32,6 @@ SQUEEZED = 2.0
 """Distance to which cloth is moved apart then, in thicknesses: what bodies push moves faces, whose middles sag."""
 HOLDS = 6
 """How often more of what is between overlapping parts of a body is left there, while pushing it out makes it cross."""
-TANGLED = 0.2
-"""Part of the input's crossings that a warm start may have: the coarse levels would leave as many again, elsewhere each
-time; from where it is, cloth that is held comes to rest."""
 MIXED = 4
 """Rings round what crosses in a warm start that start from the coarse levels instead; it fades over as many more."""
 SMOOTHINGS = 8
@@ -193,14 +190,6 @@ class FrameContact:
         if term is None or view.cloth is None:
             return 0.0
         return 1.0 if view.cloth.tangled else float(term.near(finest).to(base).mean())
-
-    def tangles(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether the finest level's cloth crosses itself at x [m], in more than a few of the input's places."""
-        cloth = self.at(self._levels[-1]).cloth
-        if cloth is None:
-            return False
-        most = TANGLED * (cloth.allowed or cloth.before).crossings.count
-        return cloth.look(cloth.closed(x)).crossings.count > most
 
     def mixed(self, x: Float[Tensor, "vertices 3"], other: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions of the finest level [m], and other ones round what crosses there."""
