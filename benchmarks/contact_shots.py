@@ -14,20 +14,18 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
+from benchmarks.temporal import detail_of
 from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.level import refine_garments
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import Frame, Garment
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.usd.reader import Shot, open_shot
 
@@ -171,32 +169,19 @@ def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSett
 
     solve = replace(RefineOptions().solve_settings(), contact=settings)
     refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), device=device, lanes=LANES)
-    sums, spent, details, off_cage = Sums(), list[float](), list[np.ndarray](), details_of(shot.scene.garments, level)
+    sums, spent, details = Sums(), list[float](), list[np.ndarray]()
     for time_code in shot.scene.times[first : first + count]:
         frame = shot.frame(time_code)
         began = time.perf_counter()
         state = refiner.solve(frame)
         spent.append(time.perf_counter() - began)
-        details.append(off_cage(frame, state.points))
+        details.append(detail_of(refiner, frame, state.points))
         for entry in groups_of(state.telemetry):
             sums.add(entry)
         sums.vertices += sum(len(points) for points in state.points if points is not None)
     sums.seconds = sorted(spent)[len(spent) // 2]
     sums.jumps = jumps(np.array(details))
     return sums
-
-
-def details_of(garments: Sequence[Garment], level: int) -> Callable[[Frame, Sequence[np.ndarray | None]], np.ndarray]:
-    """What gives fine positions off the upsampled cages [m], of a frame and its results; nan for what has none."""
-    chains = refine_garments(garments, [level] * len(garments))
-    maps = [reduce(lambda below, step: step.linear @ below, chain[1:], chain[0].linear) for chain in chains]
-
-    def off_cage(frame: Frame, points: Sequence[np.ndarray | None]) -> np.ndarray:
-        bases = [each @ garment.points for each, garment in zip(maps, frame.garments, strict=True)]
-        parts = zip(points, bases, strict=True)
-        return np.concatenate([np.full_like(base, np.nan) if own is None else own - base for own, base in parts])
-
-    return off_cage
 
 
 def jumps(details: np.ndarray) -> int:

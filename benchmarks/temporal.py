@@ -23,6 +23,7 @@ from physgraph_usd.mesh.subdivide import Refinement
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
+from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.usd.reader import Shot, open_shot
 
@@ -77,16 +78,20 @@ def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
     for time in shot.scene.times[:FRAMES]:
         frame = shot.frame(time)
         state = refiner.solve(frame)
-        smooth = [
-            upsampled(chain, each.points) for chain, each in zip(refiner.refinements, frame.garments, strict=True)
-        ]
-        details.append(np.concatenate([np.asarray(p) for p in state.points]) - np.concatenate(smooth))
+        details.append(detail_of(refiner, frame, state.points))
         entry = state.telemetry[0]
         if "energy_joules" in entry:
             energies.append(sum(entry["energy_joules"]["output"].values()))  # type: ignore[index]
     jerk: np.ndarray = np.diff(np.asarray(details, dtype=np.float64), 3, axis=0)
     edges = np.mean([mean_fine_edge(refiner, index) for index in range(len(shot.scene.garments))])
     return float(np.sqrt((jerk**2).sum(axis=-1).mean()) / edges), float(np.mean(energies))
+
+
+def detail_of(refiner: Refiner, frame: Frame, points: Sequence[np.ndarray | None]) -> np.ndarray:
+    """Fine positions off the upsampled cages [m], shape (vertices, 3); nan for a garment that has none."""
+    smooth = [upsampled(chain, each.points) for chain, each in zip(refiner.refinements, frame.garments, strict=True)]
+    parts = zip(points, smooth, strict=True)
+    return np.concatenate([np.full_like(base, np.nan) if own is None else own - base for own, base in parts])
 
 
 def upsampled(chain: Sequence[Refinement], points: np.ndarray) -> np.ndarray:

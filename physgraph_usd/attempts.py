@@ -6,6 +6,7 @@ result shows that they may do much better, and are taken only where they do: wha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from .detail import Carried, Solved
@@ -34,51 +35,53 @@ class Attempt(Protocol):
         ...
 
 
-def best_of(attempt: Attempt, kept: Carried | None, *, counts: bool) -> Solved:
+def best_of(attempt: Attempt, kept: Carried | None, *, counts: bool, again: bool) -> Solved:
     """One frame's result; its times are those of all that was tried.
 
     Args:
         attempt: Solves the frame once.
         kept: The last frame's result, or None for a cold start.
         counts: Whether crossings of cloth count: not where they are only measured.
+        again: Whether there is time to solve on from the coarse levels.
 
     Raises:
         SolveError: A term of the potential is not finite.
     """
-    solved, strain = attempt(kept)
-    if not _is_warm(solved):
-        return solved
-    before, after = solved.crossings if counts else (0, 0)
-    if strain <= TORN and before and (after > TANGLED * before or solved.between_garments):
-        again, torn = attempt(solved.carried, anew=True)
-        if _is_warm(again) and torn <= TORN and _is_better(again, solved):
-            solved, strain, after = _instead_of(solved, again), torn, again.crossings[1]
-        else:
-            _instead_of(again, solved)
-    if strain <= TORN and after <= before:
-        return solved
-    why = f"made {after} edges cross, {before} in the input"
-    why = f"tore the cloth, straining it by {strain:.3g}" if strain > TORN else why
-    cold, _ = attempt(None)
-    cold.telemetry["start"] = f"cold: the last frame's detail {why}"
-    if strain > TORN or cold.crossings[1] < after:
-        return _instead_of(solved, cold)
-    return _instead_of(cold, solved)
+    best, strain = attempt(kept)
+    if not _is_warm(best):
+        return best
+    tried = [best]
+    before, after = best.crossings if counts else (0, 0)
+    if again and strain <= TORN and before and (after > TANGLED * before or best.between_garments):
+        anew, torn = attempt(best.carried, anew=True)
+        tried.append(anew)
+        if _is_warm(anew) and torn <= TORN and _is_better(anew, best):
+            best, after = anew, anew.crossings[1]
+    if strain > TORN or after > before:
+        why = f"made {after} edges cross, {before} in the input"
+        why = f"tore the cloth, straining it by {strain:.3g}" if strain > TORN else why
+        cold, _ = attempt(None)
+        tried.append(cold)
+        cold.telemetry["start"] = f"cold: the last frame's detail {why}"
+        best = cold if strain > TORN or cold.crossings[1] < after else best
+    _tell_times(best, tried)
+    return best
 
 
 def _is_warm(solved: Solved) -> bool:
     return solved.telemetry["start"].startswith("warm")
 
 
-def _is_better(again: Solved, solved: Solved) -> bool:
+def _is_better(anew: Solved, best: Solved) -> bool:
     """Whether so much less crosses: between garments any less is, for the wrong one shows."""
-    apart = again.between_garments - solved.between_garments
-    fewer = again.crossings[1] <= BETTER * solved.crossings[1]
-    return again.crossings[1] <= solved.crossings[1] and (apart < 0 or (not apart and fewer))
+    apart = anew.between_garments - best.between_garments
+    fewer = anew.crossings[1] <= BETTER * best.crossings[1]
+    return anew.crossings[1] <= best.crossings[1] and (apart < 0 or (not apart and fewer))
 
 
-def _instead_of(dropped: Solved, taken: Solved) -> Solved:
-    """What is taken, with the time of what is not added to its own."""
-    times, more = (each.telemetry.get("milliseconds", {}) for each in (taken, dropped))
-    times |= {name: round(times.get(name, 0.0) + value, 3) for name, value in more.items()}
-    return taken
+def _tell_times(best: Solved, tried: Sequence[Solved]) -> None:
+    """Add the times of what was tried and dropped to those of what is taken [ms]."""
+    times: dict[str, float] = best.telemetry["milliseconds"]
+    best.telemetry["milliseconds"] = {
+        name: round(sum(each.telemetry["milliseconds"][name] for each in tried), 3) for name in times
+    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -109,20 +110,17 @@ class Group:
         Raises:
             SolveError: A term of the potential is not finite.
         """
-
-        def attempt(kept: Carried | None, *, anew: bool = False) -> tuple[Solved, float]:
-            return self._attempt(frames, kept, at, touching, anew=anew)
-
-        return best_of(attempt, kept, counts=self._settings.contact.cloth != "off")
+        settings, attempt = self._settings, partial(self._attempt, frames, at, touching)
+        return best_of(attempt, kept, counts=settings.contact.cloth != "off", again=settings.budget_ms is None)
 
     def _attempt(
         self,
         frames: Sequence[GarmentFrame],
-        kept: Carried | None,
         at: float | None,
         touching: Sequence[Touching],
+        kept: Carried | None,
         *,
-        anew: bool,
+        anew: bool = False,
     ) -> tuple[Solved, float]:
         """Solve one frame once; also the 99th percentile of the edges' strain."""
         clock = time.perf_counter()

@@ -47,9 +47,9 @@ class Tries:
         told |= {"milliseconds": {"solve": 10.0}, "how": how}
         return Solved([], carried(1.0 + len(self.made)), told, []), self.strain.get(how, 0.1)
 
-    def taken(self, kept: Carried | None, *, counts: bool = True) -> str:
+    def taken(self, kept: Carried | None, *, counts: bool = True, again: bool = True) -> str:
         """Which one is taken; the time of all is told, whichever it is."""
-        solved = best_of(self, kept, counts=counts)
+        solved = best_of(self, kept, counts=counts, again=again)
         assert solved.telemetry["milliseconds"]["solve"] == 10.0 * len(self.made)
         return solved.telemetry["how"]
 
@@ -127,7 +127,7 @@ def test_torn_cloth_is_solved_from_cold_and_that_is_taken():
 
 def test_a_cold_frame_and_one_whose_crossings_do_not_count_are_tried_once():
     """What is only measured is no reason."""
-    tries = Tries({"warm": 200, "anew": 0, "cold": 200})
+    tries = Tries({"warm": 40, "anew": 0, "cold": 200})
     assert tries.taken(None) == "cold"
     assert tries.made == ["cold"]
     tries = Tries({"warm": 200, "anew": 0, "cold": 0})
@@ -135,14 +135,29 @@ def test_a_cold_frame_and_one_whose_crossings_do_not_count_are_tried_once():
     assert tries.made == ["warm"]
 
 
-@pytest.mark.parametrize(("cloth", "made"), [("pairs", ["warm", "anew", "cold"]), ("off", ["warm"])])
-def test_a_group_tries_what_its_settings_say(monkeypatch: pytest.MonkeyPatch, cloth: str, made: list[str]):
-    """Crossings count where cloth touches cloth; the start is told with its reason."""
+def test_without_time_nothing_is_solved_on():
+    """What must be solved from cold is."""
+    tries = Tries({"warm": 40, "anew": 0, "cold": 0})
+    assert tries.taken(carried(1.0), again=False) == "warm"
+    assert tries.made == ["warm"]
+    tries = Tries({"warm": 120, "anew": 0, "cold": 0})
+    assert tries.taken(carried(1.0), again=False) == "cold"
+    assert tries.made == ["warm", "cold"]
+
+
+@pytest.mark.parametrize(
+    ("cloth", "budget_ms", "made"),
+    [("pairs", None, ["warm", "anew", "cold"]), ("pairs", 1e6, ["warm", "cold"]), ("off", None, ["warm"])],
+)
+def test_a_group_tries_what_its_settings_say(
+    monkeypatch: pytest.MonkeyPatch, cloth: str, budget_ms: float | None, made: list[str]
+):
+    """Crossings count where cloth touches cloth, a budget is for one solve; the start is told with its reason."""
     group, frames = group_of(MESH, REST, level=1), list(frame_of(wave(REST)).garments)
     kept = group.solve(frames, None, at=None).carried
-    group.use(replace(group._settings, contact=ContactSettings(cloth=cloth)))
+    group.use(replace(group._settings, contact=ContactSettings(cloth=cloth), budget_ms=budget_ms))
     tries = Tries({"warm": 120, "anew": 110, "cold": 80})
-    monkeypatch.setattr(group, "_attempt", lambda _frames, kept, _at, _touching, *, anew: tries(kept, anew=anew))
+    monkeypatch.setattr(group, "_attempt", lambda _frames, _at, _touching, kept, *, anew=False: tries(kept, anew=anew))
     told = group.solve(frames, kept, at=None).telemetry
     assert tries.made == made
     assert told["start"] == (
