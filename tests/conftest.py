@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import random
 import signal
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import settings
 from shapes import check_shapes
 
@@ -31,8 +31,7 @@ def seed() -> int:
     """Seed every generator that a test may draw from; the seed itself for those that make their own."""
     random.seed(SEED)
     np.random.seed(SEED)
-    if "torch" in sys.modules:
-        sys.modules["torch"].manual_seed(SEED)
+    torch.manual_seed(SEED)
     return SEED
 
 
@@ -66,13 +65,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     gpu = [item for item in items if item.get_closest_marker("gpu")]
     if not gpu:
         return
-    import torch
-
     if not torch.cuda.is_available():
         for item in gpu:
             item.add_marker(pytest.mark.skip(reason="no CUDA device"))
 
 
 def pytest_collection_finish() -> None:
-    """Hold every annotated tensor shape to its word, in the modules that the collected tests import."""
+    """Hold every annotated tensor shape to its word; keep torch on one thread, as commands do.
+
+    Its sums depend on how many share them, so that a test of a chaotic scene would depend on which ran before it.
+    """
     check_shapes("physgraph_usd")
+    torch.set_num_threads(1)
