@@ -168,6 +168,49 @@ class TestWholeRounds:
         assert fold.view.uncrossed(fold.goal, fold.x) is fold.goal
 
 
+class TestRelaxing:
+    """What was mended is where no force would put it: rounds of fewer steps follow, none of which leaves it crossed."""
+
+    @staticmethod
+    def relaxed(fold: Fold, x: torch.Tensor) -> tuple[torch.Tensor, int]:
+        system = system_of(fold.level, Springs(fold.goal))
+        out, reports = rounds.relax(
+            lambda *_: system, QuasiNewton(), x, view=fold.view, level=fold.level.index, budget=Budget(3)
+        )
+        return out, len(reports)
+
+    def test_energy_falls_and_nothing_crosses(self):
+        fold = Fold()
+        field = Springs(fold.goal)
+        out, made = self.relaxed(fold, fold.x)
+        assert made == rounds.RELAXATIONS
+        assert fold.crossings(fold.goal) > fold.crossings(out) == 0
+        assert float(field.energy_and_force(out)[0]) < 0.5 * float(field.energy_and_force(fold.x)[0])
+
+    def test_what_crosses_is_left_as_it_is(self):
+        fold = Fold()
+        out, made = self.relaxed(fold, fold.goal)
+        assert out is fold.goal
+        assert made == 0
+
+    def test_it_follows_where_the_last_round_was_mended(self, monkeypatch: pytest.MonkeyPatch):
+        fold, made = Fold(), list[torch.Tensor]()
+        monkeypatch.setattr(rounds, "relax", lambda *args, **_: (made.append(args[2]) or args[2], []))
+        for goal in (fold.goal, fold.x):
+            system = system_of(fold.level, Springs(goal))
+            rounds.solve_touching(
+                lambda *_, system=system: system,
+                QuasiNewton(),
+                fold.x,
+                view=fold.view,
+                level=fold.level,
+                finest=True,
+                outward=None,
+                budget=Budget(3),
+            )
+        assert len(made) == 1
+
+
 class TestPlanes:
     def test_those_of_vertices_that_stay_are_not_looked_for_again(self, monkeypatch):
         garment = named(square(6))

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
 from ..colliders.sign import signed_and_closest, signed_distances
-from ..forces.contact import Contact, Planes
+from ..forces.contact import Contact
 from ..forces.seam import Seam
 from ..level import Level
 from ..mesh.topology import patches_with
@@ -26,12 +26,15 @@ from .corners import lift_over
 from .measure import DEEP, Pierced, depths, penetration
 from .room import room_above
 from .settings import ContactSettings
+from .sight import Sight
 from .track import Track
 
 LIFT = 2.0
 """Farthest that cloth is lifted over what comes through its faces, in edge lengths: a spike would show more."""
 STALE = 0.1
 """How far a vertex moves before the plane that it sees is found anew, in edge lengths."""
+HOLLOW = 0.02
+"""How far in front of a plane seen before the closest point lies in a crease of the body, in edge lengths."""
 STALLED = 6
 """How often faces that a body comes through are moved in vain, once none more comes clear."""
 
@@ -61,26 +64,6 @@ class Touching:
     offset: tuple[float, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """The planes that vertices see in one body: where each vertex was then [m], unit normals, heights [m]."""
-
-    there: Bool[Tensor, " vertices"]
-    at: Float[Tensor, "vertices 3"]
-    normal: Float[Tensor, "vertices 3"]
-    height: Float[Tensor, " vertices"]
-
-    @staticmethod
-    def none(x: Float[Tensor, "vertices 3"]) -> _Seen:
-        """No planes."""
-        return _Seen(torch.zeros_like(x[:, 0], dtype=torch.bool), x, torch.zeros_like(x), torch.zeros_like(x[:, 0]))
-
-    def planes(self) -> Planes:
-        """Those that there are."""
-        which = torch.nonzero(self.there).squeeze(1)
-        return Planes(which.to(torch.int32), self.normal[which], self.height[which])
-
-
 class LevelBodies:
     """One level's view of the bodies.
 
@@ -93,29 +76,35 @@ class LevelBodies:
         self.seam: Seam | None = None
         self._level, self._tracks, self._settings = level, tuple(tracks), settings
         self._reach = float(level.spacing.mean())
-        self._seen: list[_Seen] = []
+        self._sights: list[Sight] = []
 
     def term(self, x: Float[Tensor, "vertices 3"]) -> Contact | None:
         """The contact force near positions x [m], or None where nothing can touch."""
-        before = self._seen or [_Seen.none(x)] * len(self._tracks)
-        self._seen = [self._look(*each, x) for each in zip(self._tracks, before, strict=True)]
-        planes = [seen.planes() for seen in self._seen]
+        before = self._sights or [Sight.none(x)] * len(self._tracks)
+        self._sights = [self._look(*each, x) for each in zip(self._tracks, before, strict=True)]
+        planes = [each.planes() for sight in self._sights for each in (sight.closest, sight.crease)]
         if not any(len(each.vertex) for each in planes):
             return None
         return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form)
 
-    def _look(self, track: Track, seen: _Seen, x: Tensor) -> _Seen:
+    def _look(self, track: Track, known: Sight, x: Tensor) -> Sight:
         """What is seen of one body; planes of vertices that have hardly moved stay."""
-        still = seen.there & ((x - seen.at).norm(dim=1) <= STALE * self._level.spacing)
+        still = known.closest.there & ((x - known.at).norm(dim=1) <= STALE * self._level.spacing)
         reach = track.offset + self._reach
         vertex, normal, signed = track.refresh(x, torch.where(still, torch.full_like(reach, -torch.inf), reach))
         near = signed < reach[vertex]
         vertex, normal, signed = vertex[near], normal[near], signed[near]
         offset = self._kept(track, x[vertex], normal, signed, track.offset[vertex])
-        out = _Seen(still, torch.where(still.unsqueeze(1), seen.at, x), seen.normal.clone(), seen.height.clone())
-        out.there[vertex], out.normal[vertex] = True, normal
-        out.height[vertex] = (normal * x[vertex]).sum(dim=1) - signed + offset
-        return out
+        # Where parts of the body overlap there is no room in the crease between them.
+        return known.renewed(
+            x,
+            still,
+            vertex=vertex,
+            normal=normal,
+            signed=signed,
+            offset=offset,
+            hollow=HOLLOW * self._level.spacing if track.lost is None else None,
+        )
 
     def project(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], int]:
         """Move free vertices that are under the least clearance to it, and farther where a body comes through a face.

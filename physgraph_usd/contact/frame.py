@@ -49,12 +49,14 @@ class LevelContact:
         cloth: Its view of the cloth, or None when cloth is not to touch cloth.
         rounds: How often in the level's steps pairs and planes are found anew.
         seam: What is sewn together, or None without seams.
+        mended: Whether what was asked for last to be uncrossed had to be taken back.
     """
 
     bodies: LevelBodies | None
     cloth: ClothView | None
     rounds: int
     seam: Seam | None = None
+    mended: bool = False
     _held: HeldMetric | None = None
 
     def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric | HeldMetric:
@@ -99,7 +101,9 @@ class LevelContact:
         if self.cloth is None or not self.cloth.keeps_sides:
             return x
         good = self.cloth.look(start)
-        return x if good.crossings.count else self.cloth.mend(x, good).x
+        out = x if good.crossings.count else self.cloth.mend(x, good).x
+        self.mended = out is not x
+        return out
 
 
 class FrameContact:

@@ -32,6 +32,8 @@ UNSETTLED = 0.2
 pinched between bodies cannot settle and holds up the steps of all the rest."""
 LAST_UNTANGLINGS, LAST_TRIES = 4, 3
 """Rounds that draw out what still crosses at the end, and how often while they help."""
+RELAXATIONS, RELAXING = 4, 8
+"""Rounds of half the steps, at most so many, after the last mending: mended cloth is where no force would put it."""
 CROWDED = 5e-3
 """Part of the vertices that cloth must push for a level to get a budget's steps a round: a few are left to mending."""
 
@@ -86,6 +88,7 @@ def solve_touching(
     )
     made = made + more
     if finest:
+        view.mended |= whole and outward is not None  # The next frame sees sharp folds, which these rounds did not.
         x, more = finish_rounds(
             make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
         )
@@ -242,16 +245,46 @@ def finish_rounds(
     last: LevelReport,
     budget: Budget,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
-    """What follows a finest level's rounds: the cloth away from what touches settles, and what crosses is drawn out.
+    """What follows a finest level's rounds: what is away from contact settles, what crosses is drawn out and relaxed.
 
     Arguments and results are those of `solve_rounds`, but for the level itself; ``last`` is its last report.
     """
     made: list[LevelReport] = []
+    mended = view.mended or (view.cloth is not None and view.cloth.look(x).crossings.count > 0)
     if terms and last.remaining_move > UNSETTLED:
         x, made = _solve_apart(make_system((), x), integrator, x, terms=terms, level=level, budget=budget)
         x = view.closed(x)
     x, more = untangle_last(make_system, integrator, x, view=view, level=level.index, budget=budget)
-    return x, made + more
+    made += more
+    if mended:
+        x, more = relax(make_system, integrator, x, view=view, level=level.index, budget=budget)
+        made += more
+    return x, made
+
+
+def relax(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
+    integrator: Integrator,
+    x: Float[Tensor, "vertices 3"],
+    *,
+    view: LevelContact,
+    level: int,
+    budget: Budget,
+) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
+    """Rounds of fewer steps after mending, after none of which anything crosses; none where the input or x does.
+
+    Arguments and results are those of `untangle`.
+    """
+    reports: list[LevelReport] = []
+    if view.cloth is None or view.cloth.before.crossings.count or view.cloth.look(x).crossings.count:
+        return x, reports
+    view.look_in_folds(True)
+    short = replace(budget, steps=min(-(-budget.steps // 2), RELAXING), tolerance=0.0)
+    while len(reports) < RELAXATIONS and (not reports or reports[-1].stopped != "budget"):
+        out, report = solve_level(make_system(view.terms(x), x), integrator, x, level=level, budget=short)
+        x = view.uncrossed(view.closed(out), x)
+        reports.append(report)
+    return x, reports
 
 
 def _solve_apart(
