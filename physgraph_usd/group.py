@@ -36,10 +36,7 @@ from .mesh.subdivide import Refinement
 from .resolution import edge_strain, sharp_folds
 from .scene import Garment, GarmentFrame, recentred
 from .solve_settings import SolveSettings
-
-WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
-"""A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
-upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
+from .start import Start, start_of
 
 
 class Group:
@@ -126,12 +123,12 @@ class Group:
         clock = time.perf_counter()
         forces = self._forces_for(frames)
         world, origin, coarse = self._placed(frames)
-        predicted, start = self._predict(kept, coarse, torch.as_tensor(world))
+        start = self._start(kept, coarse, world)
         contact = self._contact(touching, coarse, origin, frames)
         aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            x, reports, module, told = self._descend(forces, aim, predicted, clock, contact=contact, anew=anew)
+            x, reports, module, told = self._descend(forces, aim, start, clock, contact=contact, anew=anew)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
@@ -144,7 +141,7 @@ class Group:
         solved = time.perf_counter()
         carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world))
         strain = edge_strain(self.levels[-1], result)
-        telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start} | told
+        telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start.why} | told
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
         measured, crossing = ({}, None) if judge is None else judge.measure(result)
         if measured:
@@ -237,22 +234,11 @@ class Group:
             self._stretch = max(frame.fabric.stretch for frame in frames)
         return self._forces
 
-    def _predict(self, kept: Carried | None, coarse: Tensor, world: Tensor) -> tuple[Tensor | None, str]:
-        """Where the last frame's detail would be now, unless the cage jumped."""
-        if kept is None or self._settings.temporal == "off":
-            return None, "cold"
-        shifted = Carried(self._tensor((kept.coarse - world.mean(dim=0)).numpy()), kept.detail, kept.frames)
-        predicted, motion, turn = self._frames.predict(shifted, coarse)
-        reset = self._settings.reset
-        if motion > reset.move or turn > reset.turn:
-            return None, f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees"
-        finest = self.levels[-1]
-        base = finest.base.apply(coarse)
-        predicted = torch.where(finest.free, predicted, base)
-        carried, plain = (edge_strain(finest, x)["p99"] for x in (predicted, base))
-        if carried > min(max(WORTH * plain, LEAST_STRAIN), MOST_STRAIN):
-            return None, f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}"
-        return predicted, "warm"
+    def _start(self, kept: Carried | None, coarse: Tensor, world: np.ndarray) -> Start:
+        """Where a frame starts."""
+        kept = None if self._settings.temporal == "off" else kept
+        frames, reset = self._frames, self._settings.reset
+        return start_of(kept, coarse, torch.as_tensor(world), frames=frames, finest=self.levels[-1], reset=reset)
 
     def _contact(
         self,
@@ -299,14 +285,15 @@ class Group:
         self,
         forces: list[LevelForces],
         coarse: Tensor,
-        predicted: Tensor | None,
+        start: Start,
         clock: float,
         *,
         contact: FrameContact | None,
         anew: bool,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
         """Walk the levels; a warm start goes to the finest, unless what crosses starts anew. Also says why."""
-        choice, last = self._choose(forces[0], coarse, contact, warm=predicted is not None), len(self.levels) - 1
+        predicted, last = start.detailed, len(self.levels) - 1
+        choice = self._choose(forces[0], coarse, contact, warm=predicted is not None)
         anew = anew and predicted is not None and contact is not None and contact.crossed
         first = 0 if choice.nested or anew else last
         x = predicted if predicted is not None and not anew else self.levels[first].base.apply(coarse)
@@ -321,10 +308,12 @@ class Group:
             module = lasting.module(coarse)
             warm = predicted if index == last else None
             tie = None if warm is None or self._settings.temporal != "tether" else (self._settings.tether, warm)
-            budget = self._settings.budget(last - index, clock, more=choice.steps)
+            budget = self._settings.budget(last - index, clock, more=choice.steps, warm=warm is not None)
             view = None if contact is None else contact.at(level)
             alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
-            x, made, touched = self._solve_level(alone, level, x=x, cold=warm is None, view=view, budget=budget)
+            x, made, touched = self._solve_level(
+                alone, level, x=x, cold=warm is None, still=start.still, view=view, budget=budget
+            )
             if index < last:
                 made[-1].energies = module.energies(x)
             reports += made
@@ -359,7 +348,15 @@ class Group:
         return system.remaining_move(system.apply_metric_inverse(force))
 
     def _solve_level(
-        self, alone: System, level: Level, *, x: Tensor, cold: bool, view: LevelContact | None, budget: Budget
+        self,
+        alone: System,
+        level: Level,
+        *,
+        x: Tensor,
+        cold: bool,
+        still: bool,
+        view: LevelContact | None,
+        budget: Budget,
     ) -> tuple[Tensor, list[LevelReport], tuple[Touch, ...]]:
         """Solve one level, in rounds where something is near; returns the contact terms too."""
         integrator = self._integrator
@@ -380,7 +377,7 @@ class Group:
 
         finest, outward = level is self.levels[-1], self._outward if cold else None
         return solve_touching(
-            system, integrator, x, view=view, level=level, finest=finest, outward=outward, budget=budget
+            system, integrator, x, view=view, level=level, finest=finest, outward=outward, still=still, budget=budget
         )
 
     def _telemetry(

@@ -11,6 +11,8 @@ from .integrate.solve import Budget
 
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
 """Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
+REST = 2.0
+"""Tolerances by which cloth at rest may stray before a frame that starts from it moves it."""
 
 
 @dataclass(frozen=True)
@@ -39,17 +41,18 @@ class SolveSettings:
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
 
-    def budget(self, below: int, clock: float, *, more: int) -> Budget:
+    def budget(self, below: int, clock: float, *, more: int, warm: bool) -> Budget:
         """Steps and deadline of a level.
 
         Args:
             below: How many levels lie above it.
             clock: When the frame began [s].
             more: How many times its steps the finest level takes.
+            warm: Whether it starts from the last frame's result.
         """
         deadline = None
         if self.budget_ms is not None:
             deadline = clock + 1e-3 * self.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
         if not below:
-            return Budget(more * self.steps, self.tolerance, deadline)
+            return Budget(more * self.steps, self.tolerance, deadline, REST if warm else 1.0)
         return Budget(COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance, deadline)

@@ -168,6 +168,33 @@ class TestWholeRounds:
         assert fold.view.uncrossed(fold.goal, fold.x) is fold.goal
 
 
+@pytest.mark.parametrize(
+    ("warm", "still", "much", "each"),
+    [(True, False, False, 4), (True, True, False, 12), (True, False, True, 12), (False, True, False, 4)],
+)
+def test_rounds_share_a_budget_but_in_a_held_pose_and_where_it_is_crowded(warm, still, much, each, monkeypatch):
+    """Far from its goal, which is not in reach, each round makes all the steps that it has."""
+    fold, asked = Fold(), list[int]()
+    monkeypatch.setattr(rounds, "crowded", lambda *_: much)
+    solve = rounds.solve_level
+    monkeypatch.setattr(
+        rounds, "solve_level", lambda *args, **more: asked.append(more["budget"].steps) or solve(*args, **more)
+    )
+    system = system_of(fold.level, Springs(fold.x))
+    rounds.solve_touching(
+        lambda *_: system,
+        QuasiNewton(),
+        fold.x,
+        view=fold.view,
+        level=fold.level,
+        finest=True,
+        outward=None if warm else torch.ones(1),
+        still=still,
+        budget=Budget(12),
+    )
+    assert asked[0] == each
+
+
 class TestRelaxing:
     """What was mended is where no force would put it: rounds of fewer steps follow, none of which leaves it crossed."""
 
@@ -194,9 +221,11 @@ class TestRelaxing:
         assert made == 0
 
     def test_it_follows_where_the_last_round_was_mended(self, monkeypatch: pytest.MonkeyPatch):
+        """And only where much cloth pushes cloth: elsewhere it would cost more than it wins."""
         fold, made = Fold(), list[torch.Tensor]()
         monkeypatch.setattr(rounds, "relax", lambda *args, **_: (made.append(args[2]) or args[2], []))
-        for goal, wanted in ((fold.x, 0), (fold.goal, 1)):
+        for much, goal, wanted in ((True, fold.x, 0), (False, fold.goal, 0), (True, fold.goal, 1)):
+            monkeypatch.setattr(rounds, "crowded", lambda *_, much=much: much)
             system = system_of(fold.level, Springs(goal))
             rounds.solve_touching(
                 lambda *_, system=system: system,

@@ -53,6 +53,7 @@ def solve_touching(
     level: Level,
     finest: bool,
     outward: Float[Tensor, " garments"] | None,
+    still: bool = False,
     budget: Budget,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
     """Solve one level: mend and draw out what crosses, leave the saddle, then rounds, and what follows them.
@@ -67,6 +68,7 @@ def solve_touching(
         level: The level.
         finest: Whether it is the last.
         outward: As `leave_saddle` takes it, or None in a warm frame.
+        still: Whether the pose is held in a warm frame.
         budget: When to stop.
     """
     most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS * (outward is None)
@@ -80,17 +82,18 @@ def solve_touching(
     start = x
     if outward is not None:
         x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
-    # A warm frame has no coarse levels that settle contact before; much cloth on cloth settles slowly.
-    whole = finest and (outward is None or crowded(touched, x))
+    # Much cloth on cloth settles slowly, and in a held pose one sees it settle.
+    much = finest and crowded(touched, x)
+    whole = much or (finest and still and outward is None)
     x = view.uncrossed(x, start) if whole else x
     x, more, touched = solve_rounds(
         make_system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, whole=whole
     )
     made = made + more
     if finest:
-        view.mended |= whole and outward is not None  # The next frame sees sharp folds, which these rounds did not.
+        view.mended |= outward is not None  # The next frame sees sharp folds, which these rounds did not.
         x, more = finish_rounds(
-            make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
+            make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], much=much, budget=budget
         )
         made += more
     return x, made, touched
@@ -195,7 +198,7 @@ def solve_rounds(
             integrator,
             start,
             level=level,
-            budget=_round_of(budget, system, min(left, share) if terms else left),
+            budget=_round_of(budget, system, min(left, share) if terms else left, first=not reports),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
             resume=going if last is not None and system.shares_metric(last) else None,
         )
@@ -228,10 +231,10 @@ def _uncrossed(view: LevelContact, x: Tensor, *, start: Tensor, carry: Carry) ->
     return out, None if carry.setbacks else replace(carry, x=out)
 
 
-def _round_of(budget: Budget, system: System, steps: int) -> Budget:
+def _round_of(budget: Budget, system: System, steps: int, *, first: bool) -> Budget:
     """The budget of a round: what a held metric calls a small move is that much smaller."""
     shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
-    return replace(budget, steps=steps, tolerance=shrunk * budget.tolerance)
+    return replace(budget, steps=steps, tolerance=shrunk * budget.tolerance, rest=budget.rest if first else 1.0)
 
 
 def finish_rounds(
@@ -243,14 +246,16 @@ def finish_rounds(
     view: LevelContact,
     level: Level,
     last: LevelReport,
+    much: bool,
     budget: Budget,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
     """What follows a finest level's rounds: what is away from contact settles, what crosses is drawn out and relaxed.
 
-    Arguments and results are those of `solve_rounds`, but for the level itself; ``last`` is its last report.
+    Arguments and results are those of `solve_rounds`, but for the level itself; ``last`` is its last report,
+    ``much`` whether so much cloth pushes cloth that what was mended is relaxed.
     """
     made: list[LevelReport] = []
-    mended = view.mended or (view.cloth is not None and view.cloth.look(x).crossings.count > 0)
+    mended = much and (view.mended or (view.cloth is not None and view.cloth.look(x).crossings.count > 0))
     if terms and last.remaining_move > UNSETTLED:
         x, made = _solve_apart(make_system((), x), integrator, x, terms=terms, level=level, budget=budget)
         x = view.closed(x)

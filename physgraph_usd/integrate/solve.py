@@ -22,11 +22,13 @@ class Budget:
         steps: Most steps at one level.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
         deadline: `time.perf_counter` value after which no step begins, or None.
+        rest: Tolerances under which no step is made from the start: what rests but for a little stays where it is.
     """
 
     steps: int
     tolerance: float = 0.0
     deadline: float | None = None
+    rest: float = 1.0
 
 
 @dataclass(eq=False)
@@ -121,7 +123,7 @@ def solve_level(
 def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) -> str:
     if carry.mover == "stayed":
         return "stalled"
-    if budget.tolerance > 0 and _remaining_move(system, carry) < budget.tolerance:
+    if budget.tolerance > 0 and _remaining_move(system, carry) < budget.tolerance * (1.0 if steps else budget.rest):
         return "tolerance"
     if steps >= budget.steps:
         return "steps"
