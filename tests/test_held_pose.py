@@ -22,11 +22,8 @@ def test_it_rests(name: str, tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [1, 2])
 def test_in_layers_it_rests(level: int, tmp_path: Path):
-    """In sharp folds what passed through itself was mended, and did so again, for ever.
-
-    Held for long: once in a while a vertex still gets away, and what is held less long may end with that.
-    """
-    assert held("layers", tmp_path, level=level, frames=24).farthest < REST
+    """In sharp folds what passed through itself was mended, and did so again, for ever."""
+    assert held("layers", tmp_path, level=level).farthest < REST
 
 
 @pytest.mark.slow
