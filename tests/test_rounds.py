@@ -94,6 +94,31 @@ class Fold:
             whole=whole,
         )[0]
 
+    def touching(
+        self,
+        goal: torch.Tensor,
+        x: torch.Tensor,
+        *,
+        integrator: QuasiNewton | None = None,
+        finest: bool = True,
+        warm: bool = True,
+        still: bool = False,
+        steps: int = 3,
+    ) -> torch.Tensor:
+        """The level solved from x, drawn to a goal."""
+        system = system_of(self.level, Springs(goal))
+        return rounds.solve_touching(
+            lambda *_: system,
+            integrator or QuasiNewton(),
+            x,
+            view=self.view,
+            level=self.level,
+            finest=finest,
+            outward=None if warm else torch.ones(1),
+            still=still,
+            budget=Budget(steps),
+        )[0]
+
     def crossings(self, x: torch.Tensor) -> int:
         assert self.view.cloth is not None
         return self.view.cloth.look(x).crossings.count
@@ -105,18 +130,7 @@ def test_what_crosses_at_a_levels_start_is_mended(warm):
     assert fold.crossings(fold.goal) > 0
     assert fold.view.cloth is not None
     assert fold.view.cloth.before.crossings.count == 0
-    system = system_of(fold.level, Springs(fold.goal))
-    out, _, _ = rounds.solve_touching(
-        lambda *_: system,
-        QuasiNewton(),
-        fold.goal,
-        view=fold.view,
-        level=fold.level,
-        finest=False,
-        outward=None if warm else torch.ones(1),
-        budget=Budget(0),
-    )
-    assert fold.crossings(out) == 0
+    assert fold.crossings(fold.touching(fold.goal, fold.goal, finest=False, warm=warm, steps=0)) == 0
 
 
 class TestWholeRounds:
@@ -140,17 +154,7 @@ class TestWholeRounds:
         fold, integrator = Fold(), Noting(0)
         monkeypatch.setattr(rounds, "leave_saddle", lambda *_, **__: fold.goal)
         monkeypatch.setattr(rounds, "crowded", lambda *_: True)
-        system = system_of(fold.level, Springs(fold.x))
-        rounds.solve_touching(
-            lambda *_: system,
-            integrator,
-            fold.x,
-            view=fold.view,
-            level=fold.level,
-            finest=True,
-            outward=torch.ones(1),
-            budget=Budget(1),
-        )
+        fold.touching(fold.x, fold.x, integrator=integrator, warm=False, steps=1)
         assert fold.crossings(fold.goal) > 0
         assert fold.crossings(integrator.started[0]) == 0
 
@@ -173,25 +177,13 @@ class TestWholeRounds:
     [(True, False, False, 4), (True, True, False, 12), (True, False, True, 12), (False, True, False, 4)],
 )
 def test_rounds_share_a_budget_but_in_a_held_pose_and_where_it_is_crowded(warm, still, much, each, monkeypatch):
-    """Far from its goal, which is not in reach, each round makes all the steps that it has."""
     fold, asked = Fold(), list[int]()
     monkeypatch.setattr(rounds, "crowded", lambda *_: much)
     solve = rounds.solve_level
     monkeypatch.setattr(
         rounds, "solve_level", lambda *args, **more: asked.append(more["budget"].steps) or solve(*args, **more)
     )
-    system = system_of(fold.level, Springs(fold.x))
-    rounds.solve_touching(
-        lambda *_: system,
-        QuasiNewton(),
-        fold.x,
-        view=fold.view,
-        level=fold.level,
-        finest=True,
-        outward=None if warm else torch.ones(1),
-        still=still,
-        budget=Budget(12),
-    )
+    fold.touching(fold.x, fold.x, warm=warm, still=still, steps=12)
     assert asked[0] == each
 
 
@@ -226,17 +218,7 @@ class TestRelaxing:
         monkeypatch.setattr(rounds, "relax", lambda *args, **_: (made.append(args[2]) or args[2], []))
         for much, goal, wanted in ((True, fold.x, 0), (False, fold.goal, 0), (True, fold.goal, 1)):
             monkeypatch.setattr(rounds, "crowded", lambda *_, much=much: much)
-            system = system_of(fold.level, Springs(goal))
-            rounds.solve_touching(
-                lambda *_, system=system: system,
-                QuasiNewton(),
-                fold.x,
-                view=fold.view,
-                level=fold.level,
-                finest=True,
-                outward=None,
-                budget=Budget(3),
-            )
+            fold.touching(goal, fold.x)
             assert len(made) == wanted
 
 

@@ -42,10 +42,8 @@ def said(group: Group, *, strain: float, squeeze: float = 0.0) -> tuple[str, flo
         detailed = replace(kept, coarse=world, detail=middle * kept.detail)
         start = group._start(detailed, coarse, cage)
         moved = group._frames.predict(replace(detailed, coarse=coarse), coarse)[0]
-        found, here = (
-            start.why,
-            edge_strain(group.levels[-1], moved if start.detailed is None else start.detailed)["p99"],
-        )
+        found, detail = start.why, moved if start.detailed is None else start.detailed
+        here = edge_strain(group.levels[-1], detail)["p99"]
         low, high = (middle, high) if here < strain else (low, middle)
     return found, here
 

@@ -80,6 +80,10 @@ class LevelContact:
         """Whether cloth crossed cloth where the terms were asked for last."""
         return self.cloth is not None and self.cloth.tangled
 
+    def crosses(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """Whether cloth crosses cloth at positions x [m]."""
+        return self.cloth is not None and self.cloth.look(x).crossings.count > 0
+
     def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
         """The forces of what is near positions x [m]; empty where nothing is."""
         parts = [part.term(x) for part in (self.bodies, self.cloth) if part is not None]

@@ -91,11 +91,15 @@ def solve_touching(
     )
     made = made + more
     if finest:
-        view.mended |= outward is not None  # The next frame sees sharp folds, which these rounds did not.
+        # From cold the rounds did not see sharp folds, which the next frame will.
+        relaxing = much and (outward is not None or view.mended or view.crosses(x))
         x, more = finish_rounds(
-            make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], much=much, budget=budget
+            make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
         )
         made += more
+        if relaxing:
+            x, more = relax(make_system, integrator, x, view=view, level=level.index, budget=budget)
+            made += more
     return x, made, touched
 
 
@@ -246,25 +250,18 @@ def finish_rounds(
     view: LevelContact,
     level: Level,
     last: LevelReport,
-    much: bool,
     budget: Budget,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
-    """What follows a finest level's rounds: what is away from contact settles, what crosses is drawn out and relaxed.
+    """What follows a finest level's rounds: the cloth away from what touches settles, and what crosses is drawn out.
 
-    Arguments and results are those of `solve_rounds`, but for the level itself; ``last`` is its last report,
-    ``much`` whether so much cloth pushes cloth that what was mended is relaxed.
+    Arguments and results are those of `solve_rounds`, but for the level itself; ``last`` is its last report.
     """
     made: list[LevelReport] = []
-    mended = much and (view.mended or (view.cloth is not None and view.cloth.look(x).crossings.count > 0))
     if terms and last.remaining_move > UNSETTLED:
         x, made = _solve_apart(make_system((), x), integrator, x, terms=terms, level=level, budget=budget)
         x = view.closed(x)
     x, more = untangle_last(make_system, integrator, x, view=view, level=level.index, budget=budget)
-    made += more
-    if mended:
-        x, more = relax(make_system, integrator, x, view=view, level=level.index, budget=budget)
-        made += more
-    return x, made
+    return x, made + more
 
 
 def relax(
@@ -281,7 +278,7 @@ def relax(
     Arguments and results are those of `untangle`.
     """
     reports: list[LevelReport] = []
-    if view.cloth is None or view.cloth.before.crossings.count or view.cloth.look(x).crossings.count:
+    if view.cloth is None or view.cloth.before.crossings.count or view.crosses(x):
         return x, reports
     view.look_in_folds(True)
     short = replace(budget, steps=min(-(-budget.steps // 2), RELAXING), tolerance=0.0)
