@@ -14,7 +14,7 @@ from stages import COLLIDER_API, vec3
 from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.colliders.sweep import passages, through_shape
+from physgraph_usd.colliders.sweep import Sweep, through_shape
 from physgraph_usd.contact.passed import Passed
 from physgraph_usd.samples import write_sample
 from physgraph_usd.usd.reader import open_shot
@@ -92,7 +92,7 @@ END = np.array([[0.0, -0.3, 0.0], [0.21, 0.15, 0.0], [0.3, -0.3, 0.0]])
 
 def test_what_slides_over_a_sharp_edge_of_a_mesh_does_not_come_through():
     points, triangles = box((0.4, 0.4, 0.4))
-    counts, opposed = passages(triangles, points, points, start=START, end=END)
+    counts, opposed = Sweep(triangles).passages(points, points, start=START, end=END)
     assert counts.tolist() == [2, 2, 0]
     assert (opposed & (counts > 0)).tolist() == [True, False, False]
 

@@ -91,6 +91,7 @@ class Fold:
             view=self.view,
             level=1,
             budget=Budget(3),
+            rounds=3,
             whole=whole,
         )[0]
 
@@ -174,7 +175,7 @@ class TestWholeRounds:
 
 @pytest.mark.parametrize(
     ("warm", "still", "much", "each"),
-    [(True, False, False, 4), (True, True, False, 12), (True, False, True, 12), (False, True, False, 4)],
+    [(True, False, False, 6), (True, True, False, 12), (True, False, True, 12), (False, True, False, 4)],
 )
 def test_rounds_share_a_budget_but_in_a_held_pose_and_where_it_is_crowded(warm, still, much, each, monkeypatch):
     fold, asked = Fold(), list[int]()

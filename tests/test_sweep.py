@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from bodies import ball, flipped, tube
 
-from physgraph_usd.colliders.sweep import passages
+from physgraph_usd.colliders.sweep import Sweep
 
 rng = np.random.default_rng(7)
 
 
 def through(soup: tuple, start: np.ndarray, end: np.ndarray, *, after: np.ndarray | None = None) -> np.ndarray:
     points, triangles = soup
-    return passages(triangles, points, points if after is None else after, start=start, end=end)[0]
+    return Sweep(triangles).passages(points, points if after is None else after, start=start, end=end)[0]
 
 
 def turn(angle: float) -> np.ndarray:
@@ -89,7 +89,18 @@ class TestTurning:
     def test_nothing_gives_nothing(self):
         none = np.zeros((0, 3))
         assert through(ball(), none, none).shape == (0,)
-        assert passages(np.zeros((0, 3), int), none, none, start=np.ones((2, 3)), end=np.zeros((2, 3)))[0].tolist() == [
-            0,
-            0,
-        ]
+        found, _ = Sweep(np.zeros((0, 3), int)).passages(none, none, start=np.ones((2, 3)), end=np.zeros((2, 3)))
+        assert found.tolist() == [0, 0]
+
+    def test_the_next_pose_is_seen_as_if_it_were_the_first(self):
+        """Also one with a corner that is not finite, whose faces nothing passes, and the one after it."""
+        points, triangles = ball()
+        kept = Sweep(triangles)
+        x = rng.uniform(-1.0, 1.0, (2, 200, 3))
+        broken = points + 0.4
+        broken[triangles[0, 0]] = np.nan
+        for after in (points, points @ turn(1.0).T + 0.3, broken, points - 0.2):
+            whole = triangles[np.isfinite(after[triangles]).all(axis=(1, 2))]
+            found, _ = kept.passages(points, after, start=x[0], end=x[1])
+            np.testing.assert_array_equal(found, through((points, whole), x[0], x[1], after=after))
+            assert found.any()

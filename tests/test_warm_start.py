@@ -133,9 +133,9 @@ class TestTangledStart:
     def test_of_a_shot_jumps_less_than_one_that_starts_anew(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         """Ten frames of the skirt whose cage crosses itself; as few of its crossings are left."""
         shot = open_shot(str(write_sample("skirt", tmp_path)))
-        ours = run(shot, 34, 10, level=1, settings=ContactSettings())
+        ours = run(shot, 35, 10, level=1, settings=ContactSettings())
         monkeypatch.setattr(attempts, "TANGLED", 0.0)
         monkeypatch.setattr(attempts, "BETTER", np.inf)
-        anew = run(shot, 34, 10, level=1, settings=ContactSettings())
+        anew = run(shot, 35, 10, level=1, settings=ContactSettings())
         assert 0 < ours.jumps < 0.75 * anew.jumps
         assert ours.cloth[1] < 0.1 * ours.cloth[0]

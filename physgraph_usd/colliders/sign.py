@@ -94,27 +94,34 @@ def _sides(
     Taken from the closest points where they tell. Where that contradicts a neighbour that no surface divides it from,
     as it does where a face is buried in part only, and where they do not tell, the winding number does.
     """
-    ends, length = edges.long(), EdgeLengths(edges.to(torch.int32), x)(x)
-    clear = ends[is_clear(distance[ends[:, 0]] + distance[ends[:, 1]], length)]
     side = torch.ones(len(x), dtype=x.dtype, device=x.device)
     side[near] = told
     settled = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-    unsure = (side == 0) | _contradicted(side, clear)
+    unsure = (side == 0) | _contradicted(side, x, distance, edges=edges)
     while bool(unsure.any()):
         which = torch.nonzero(unsure).squeeze(1)
-        group, one = _joined(which, clear[unsure[clear].all(dim=1)], len(x))
+        joining = _clear_of(unsure[edges[:, 0]] & unsure[edges[:, 1]], x, distance, edges=edges)
+        group, one = _joined(which, joining, len(x))
         inside = surface.inside(x[which[one]])
         side[which] = 1.0 - 2.0 * inside.to(x.dtype)[group]
         settled |= unsure
-        unsure = _contradicted(side, clear) & ~settled
+        unsure = _contradicted(side, x, distance, edges=edges) & ~settled
     return side[near]
 
 
-def _contradicted(side: Tensor, clear: Tensor) -> Bool[Tensor, " vertices"]:
+def _contradicted(side: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Bool[Tensor, " vertices"]:
     """Vertices told to be on the other side of a neighbour that no surface divides them from."""
     out = torch.zeros(len(side), dtype=torch.bool, device=side.device)
-    out[clear[side[clear[:, 0]] * side[clear[:, 1]] < 0].ravel()] = True
+    sign = side.to(torch.int8)
+    out[_clear_of(sign[edges[:, 0]] * sign[edges[:, 1]] < 0, x, distance, edges=edges).ravel()] = True
     return out
+
+
+def _clear_of(which: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Int[Tensor, "edges 2"]:
+    """Those of some edges that no surface divides."""
+    some = edges[which]
+    ends, length = some.long(), EdgeLengths(some.to(torch.int32), x)(x)
+    return ends[is_clear(distance[ends[:, 0]] + distance[ends[:, 1]], length)]
 
 
 def _joined(which: Tensor, pairs: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 import warp as wp
+from jaxtyping import Bool, Float, Int
 
 from ..mesh.lanes import Launch
 from .pose import ShapePose
@@ -95,52 +96,71 @@ def _count(
     total[i] = normals
 
 
-def passages(
-    triangles: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-    *,
-    start: np.ndarray,
-    end: np.ndarray,
-    device: str = "cpu",
-    lanes: int = 1,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Count passages of points through a moving mesh.
+class Sweep:
+    """Counts passages of points through one mesh in motion; its hierarchy is built once and refitted."""
 
-    Args:
-        triangles: Corners, shape (T, 3).
-        before: Mesh positions at the first pose [m], shape (V, 3).
-        after: At the second, shape (V, 3).
-        start: Points at the first [m], shape (N, 3).
-        end: At the second, shape (N, 3).
-        device: "cpu" or a CUDA device.
-        lanes: Most threads that it uses on the CPU.
+    def __init__(self, triangles: Int[np.ndarray, "triangles 3"], *, device: str = "cpu", lanes: int = 1) -> None:
+        """Take a topology.
 
-    Returns:
-        How often, shape (N,), int32: odd where a point ends on the other side of the surface; and whether the faces
-        that it passes look away from one another, shape (N,), bool: it comes out at the other side of a body.
-    """
-    nowhere = np.zeros(len(start), np.int32), np.zeros(len(start), bool)
-    if not len(triangles) or not len(start):
-        return nowhere
-    corners = before[triangles]
-    middle, nudge = corners.mean(axis=(0, 1)), NUDGE * np.ptp(corners, axis=(0, 1)).max()
-    poses = [np.ascontiguousarray(each - middle, np.float32) for each in (before, after, start + nudge, end + nudge)]
-    both = np.concatenate([poses[0][triangles], poses[1][triangles]], axis=1)
-    low, high = both.min(axis=1), both.max(axis=1)
-    ways = np.concatenate(poses[2:])
-    near = ((low <= ways.max(axis=0)) & (high >= ways.min(axis=0))).all(axis=1)
-    if not near.any():
-        return nowhere
-    tree = wp.Bvh(*(wp.array(corner[near], dtype=wp.vec3f, device=device) for corner in (low, high)))
-    faces = wp.array(np.ascontiguousarray(triangles[near], np.int32), dtype=wp.vec3i, device=device)
-    count = wp.zeros(len(start), dtype=wp.int32, device=device)
-    arrays = [wp.array(each, dtype=wp.vec3f, device=device) for each in poses]
-    total = wp.zeros(len(start), dtype=wp.vec3f, device=device)
-    Launch(_count, len(start), [tree.id, faces, *arrays, count, total], device=device, lanes=lanes)({})
-    # Of two unit normals the sum's square is 2 + 2 cos.
-    found, length = count.numpy(), np.square(total.numpy()).sum(axis=1)
-    return found, length < (1.0 - OPPOSED) * found
+        Args:
+            triangles: Corners.
+            device: "cpu" or a CUDA device.
+            lanes: Most threads that it uses on the CPU.
+        """
+        self._triangles, self._device, self._lanes = triangles, device, lanes
+        self._boxes: tuple[wp.array, ...] = ()
+
+    def passages(
+        self,
+        before: Float[np.ndarray, "vertices 3"],
+        after: Float[np.ndarray, "vertices 3"],
+        *,
+        start: Float[np.ndarray, "points 3"],
+        end: Float[np.ndarray, "points 3"],
+    ) -> tuple[Int[np.ndarray, " points"], Bool[np.ndarray, " points"]]:
+        """Count passages of points through the mesh, both moving from one pose to the next.
+
+        Args:
+            before: Mesh positions at the first pose [m].
+            after: At the second.
+            start: Points at the first [m].
+            end: At the second.
+
+        Returns:
+            How often: odd where a point ends on the other side of the surface; and whether the faces that it passes
+            look away from one another: it comes out at the other side of a body.
+        """
+        if not len(self._triangles) or not len(start):
+            return np.zeros(len(start), np.int32), np.zeros(len(start), bool)
+        corners = before[self._triangles].reshape(-1, 3)
+        middle, nudge = corners.mean(axis=0), NUDGE * np.ptp(corners, axis=0).max()
+        poses = [
+            np.ascontiguousarray(each - middle, np.float32) for each in (before, after, start + nudge, end + nudge)
+        ]
+        self._take(*poses[:2])
+        count = wp.zeros(len(start), dtype=wp.int32, device=self._device)
+        arrays = [wp.array(each, dtype=wp.vec3f, device=self._device) for each in poses]
+        total = wp.zeros(len(start), dtype=wp.vec3f, device=self._device)
+        inputs = [self._tree.id, self._faces, *arrays, count, total]
+        Launch(_count, len(start), inputs, device=self._device, lanes=self._lanes)({})
+        # Of two unit normals the sum's square is 2 + 2 cos.
+        found, length = count.numpy(), np.square(total.numpy()).sum(axis=1)
+        return found, length < (1.0 - OPPOSED) * found
+
+    def _take(self, before: np.ndarray, after: np.ndarray) -> None:
+        """Put each face between both poses into the hierarchy; those that are not finite pass nothing."""
+        corners = [pose[self._triangles[:, corner]] for pose in (before, after) for corner in range(3)]
+        boxes = [each.reduce(corners) for each in (np.minimum, np.maximum)]
+        whole = np.isfinite(boxes[0] + boxes[1])
+        arrays = [wp.array(np.where(whole, box, 0.0), dtype=wp.vec3f, device=self._device) for box in boxes]
+        if not self._boxes:
+            self._faces = wp.array(np.ascontiguousarray(self._triangles, np.int32), dtype=wp.vec3i, device=self._device)
+            self._boxes = tuple(arrays)
+            self._tree = wp.Bvh(*self._boxes)
+            return
+        for box, array in zip(self._boxes, arrays, strict=True):
+            wp.copy(box, array)
+        self._tree.refit()
 
 
 def through_shape(before: ShapePose, after: ShapePose, *, start: np.ndarray, end: np.ndarray) -> np.ndarray:

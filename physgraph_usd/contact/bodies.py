@@ -312,10 +312,11 @@ class FrameBodies:
             known, closest = signed_and_closest(each.surface, base + shift, finest.edges, reach=reach)
             feels = offset.isfinite()
             known = torch.where(feels, known, torch.full_like(known, float("inf")))
-            inside.append(closest if bool(feels.all()) else None)
+            closest = closest if bool(feels.all()) else None
+            inside.append(closest)
             side = _start_sides(each.surface, coarse + shift, finest)
             longest = settings.way_out * float(levels[0].spacing.mean())
-            tracks.append(Track(each.surface, shift, offset, side, base, known, longest))
+            tracks.append(Track(each.surface, shift, offset, side, base, known, longest, inside=closest))
         return FrameBodies(tuple(touching), [track.known.clone() for track in tracks], inside, tracks, settings)
 
     def measure(
@@ -360,7 +361,11 @@ class FrameBodies:
         places = [torch.arange(fine.start, fine.start + own.stop - own.start) for own, fine in pairs]
         which = torch.cat(places).to(level.rest.device)
         tracks = [
-            replace(t, **{name: getattr(t, name)[which].clone() for name in ("offset", "side", "at", "known")})
+            replace(
+                t,
+                inside=t.inside if level is finest else None,
+                **{name: getattr(t, name)[which].clone() for name in ("offset", "side", "at", "known")},
+            )
             for t in self._tracks
         ]
         self._views[level.index] = LevelBodies(level, tracks, self._settings)

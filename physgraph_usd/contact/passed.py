@@ -13,7 +13,7 @@ import numpy as np
 
 from ..colliders.orient import pieces_of
 from ..colliders.pose import Collider, MeshPose, ShapePose
-from ..colliders.sweep import passages, through_shape
+from ..colliders.sweep import Sweep, through_shape
 from ..scene import Frame, Garment
 
 
@@ -27,7 +27,7 @@ class Passed:
         self._garments, self._colliders = tuple(garments), tuple(colliders)
         self._place = {"device": device, "lanes": lanes}
         self._last: Frame | None = None
-        self._parts: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self._parts: dict[int, tuple[np.ndarray, Sweep, Sweep]] = {}
 
     def forget(self) -> None:
         """Compare the next frame with none."""
@@ -63,20 +63,18 @@ class Passed:
             return 0
         closed, opened = self._pieces(body, after)
         start, end = ways
-        through = [
-            passages(faces, before.points, after.points, start=start, end=end, **self._place)
-            for faces in (closed, opened)
-        ]
+        through = [each.passages(before.points, after.points, start=start, end=end) for each in (closed, opened)]
         (closings, opposed), (openings, _) = through
         came_out = (closings > 0) & (closings % 2 == 0) & opposed
         return int((came_out | (openings % 2 == 1)).sum())
 
-    def _pieces(self, body: int, pose: MeshPose) -> tuple[np.ndarray, np.ndarray]:
-        """Closed and open triangles, kept while the topology stays the same."""
+    def _pieces(self, body: int, pose: MeshPose) -> tuple[Sweep, Sweep]:
+        """The closed and the open part, kept while the topology stays the same."""
         known = self._parts.get(body)
         if known is None or not np.array_equal(known[0], pose.triangles):
             pieces = pieces_of(pose.points, pose.triangles, side=self._colliders[body].side)
-            known = self._parts[body] = pose.triangles, pieces.closed, pieces.open
+            sweeps = [Sweep(each, **self._place) for each in (pieces.closed, pieces.open)]
+            known = self._parts[body] = (pose.triangles, sweeps[0], sweeps[1])
         return known[1], known[2]
 
 

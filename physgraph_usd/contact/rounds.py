@@ -32,9 +32,12 @@ UNSETTLED = 0.2
 pinched between bodies cannot settle and holds up the steps of all the rest."""
 LAST_UNTANGLINGS, LAST_TRIES = 4, 3
 """Rounds that draw out what still crosses at the end, and how often while they help."""
-RELAXATIONS, RELAXING = 4, 8
-"""Rounds of half the steps, at most so many, after the last mending: mended cloth is where no force would put it."""
-CROWDED = 5e-3
+RELAXATIONS, WARM_RELAXATIONS, RELAXING = 8, 4, 8
+"""Rounds after the last mending, from cold and in a warm frame, and most steps of each, half of those that there are:
+mended cloth is where no force would put it."""
+WARM_ROUNDS = 2
+"""Rounds of a warm frame that is neither crowded nor held, at most: it starts near where it ends."""
+CROWDED = 2.5e-3
 """Part of the vertices that cloth must push for a level to get a budget's steps a round: a few are left to mending."""
 
 
@@ -87,18 +90,27 @@ def solve_touching(
     whole = much or (finest and still and outward is None)
     x = view.uncrossed(x, start) if whole else x
     x, more, touched = solve_rounds(
-        make_system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, whole=whole
+        make_system,
+        integrator,
+        x,
+        terms=touched,
+        view=view,
+        level=level.index,
+        budget=budget,
+        rounds=view.rounds if whole or outward is not None else min(WARM_ROUNDS, view.rounds),
+        whole=whole,
     )
     made = made + more
     if finest:
         # From cold the rounds did not see sharp folds, which the next frame will.
-        relaxing = much and (outward is not None or view.mended or view.crosses(x))
+        relaxing = (much or crowded(touched, x)) and (outward is not None or view.mended or view.crosses(x))
         x, more = finish_rounds(
             make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
         )
         made += more
         if relaxing:
-            x, more = relax(make_system, integrator, x, view=view, level=level.index, budget=budget)
+            most = RELAXATIONS if outward is not None else WARM_RELAXATIONS
+            x, more = relax(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
             made += more
     return x, made, touched
 
@@ -169,6 +181,7 @@ def solve_rounds(
     view: LevelContact,
     level: int,
     budget: Budget,
+    rounds: int,
     whole: bool = False,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
     """Solve one level in rounds; in one where nothing can touch.
@@ -181,6 +194,7 @@ def solve_rounds(
         view: The level's view of what it may touch.
         level: Index for the reports.
         budget: When to stop; its steps are shared by the rounds. What first touches at the end gets a round's more.
+        rounds: How many there are.
         whole: Whether each round gets all of the steps instead. In so many cloth gets far: what then crosses is taken
             back towards the round's start, so that the next one finds everything on its side.
 
@@ -191,8 +205,8 @@ def solve_rounds(
         SolveError: The energy is not finite.
     """
     reports: list[LevelReport] = []
-    share, last = budget.steps if whole else -(-budget.steps // view.rounds), None
-    left = max(budget.steps, share * view.rounds) if terms else budget.steps
+    share, last = budget.steps if whole else -(-budget.steps // rounds), None
+    left = max(budget.steps, share * rounds) if terms else budget.steps
     kept: list[Carry] = []
     going: Carry | None = None
     while True:
@@ -272,6 +286,7 @@ def relax(
     view: LevelContact,
     level: int,
     budget: Budget,
+    most: int = RELAXATIONS,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
     """Rounds of fewer steps after mending, after none of which anything crosses; none where the input or x does.
 
@@ -282,7 +297,7 @@ def relax(
         return x, reports
     view.look_in_folds(True)
     short = replace(budget, steps=min(-(-budget.steps // 2), RELAXING), tolerance=0.0)
-    while len(reports) < RELAXATIONS and (not reports or reports[-1].stopped != "budget"):
+    while len(reports) < most and (not reports or reports[-1].stopped != "budget"):
         out, report = solve_level(make_system(view.terms(x), x), integrator, x, level=level, budget=short)
         x = view.uncrossed(view.closed(out), x)
         reports.append(report)

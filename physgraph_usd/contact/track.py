@@ -30,6 +30,7 @@ class Track:
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
         held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
         lost: Vertices that lay between overlapping parts in the input, and stay while inside, shape (V,), or None.
+        inside: Closest points of the vertices with negative distances, as they were found first; or None.
         looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
     """
 
@@ -42,6 +43,7 @@ class Track:
     longest: float
     held: Tensor | None = None
     lost: Tensor | None = None
+    inside: Nearest | None = None
     looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
 
     def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
@@ -88,8 +90,9 @@ class Track:
         which = torch.nonzero((self.known - moved < 0) & self.offset.isfinite()).squeeze(1)
         if not len(which) or not self.surface.closed:
             return which[:0], moved[:0] > 0
-        asked = x[which] + self.shift
-        found = self.surface.closest(asked, torch.full_like(asked[:, 0], float("inf")))
+        asked, found = x[which] + self.shift, self.inside
+        if found is None or len(found.distance) != len(which) or bool(moved.any()):
+            found = self.surface.closest(asked, torch.full_like(asked[:, 0], float("inf")))
         within = torch.nonzero(self._signs(which, found, asked, moved[which]) < 0).squeeze(1)
         near = found.some(within)
         within = within[is_between(near, self.surface.exit(asked[within], near))]
