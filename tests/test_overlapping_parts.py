@@ -10,7 +10,7 @@ import torch
 from bodies import ball, box, surfaces, together
 from folds import EDGE, levels_of, named, square
 
-from physgraph_usd.colliders.mesh import MeshBody
+from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact.bodies import FrameBodies, LevelBodies, Touching
 from physgraph_usd.contact.cloth import ClothContact
@@ -108,6 +108,31 @@ class TestLost:
         assert not bool(lost[~lens_of(level, wider=0.01)].any())
         out = view.push_out(x)
         assert torch.equal(out[lost], x[lost])
+
+    def test_closest_points_of_the_upsampled_cage_are_not_asked_for_twice(self, monkeypatch: pytest.MonkeyPatch):
+        """Those of cloth that has moved since are; what is lost is then what is in the lens where it is now."""
+        asked: list[int] = []
+        level, view, x = self.view(together(OVER, UNDER))
+        closest = MeshSurface.closest
+        monkeypatch.setattr(MeshSurface, "closest", lambda *args: asked.append(len(args[1])) or closest(*args))
+        known = view.lost[0]
+        view.lose(x)
+        assert not asked
+        view._tracks[0].inside = None
+        view.lose(x)
+        assert asked
+        assert known is not None
+        assert view.lost[0] is not None
+        assert torch.equal(view.lost[0], known)
+        level, view, x = self.view(together(OVER, UNDER))
+        asked.clear()
+        view.lose(x + torch.tensor([0.02, 0.0, 0.0]))
+        assert asked
+        lost, away = view.lost[0], (level.rest[:, [0, 2]] + torch.tensor([0.02, 0.0])).norm(dim=1)
+        lens = np.sqrt(0.15**2 - 0.13**2)
+        assert lost is not None
+        assert bool(lost[away < lens - 0.01].all())
+        assert not bool(lost[away > lens + 0.01].any())
 
     def test_two_bodies_that_overlap_lose_none(self):
         """Each has bare faces all over: cloth between them is pushed to the middle."""

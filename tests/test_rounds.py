@@ -222,6 +222,16 @@ class TestRelaxing:
             fold.touching(goal, fold.x)
             assert len(made) == wanted
 
+    @pytest.mark.parametrize("warm", [True, False])
+    def test_it_follows_where_cloth_is_crowded_at_the_end_only(self, warm: bool, monkeypatch: pytest.MonkeyPatch):
+        """And from cold takes more rounds: what folds form there is where mending left it."""
+        fold, made = Fold(), list[int]()
+        monkeypatch.setattr(rounds, "relax", lambda *args, **more: (made.append(more["most"]) or args[2], []))
+        crowds = iter([False, True])
+        monkeypatch.setattr(rounds, "crowded", lambda *_: next(crowds))
+        fold.touching(fold.goal, fold.x, warm=warm)
+        assert made == [rounds.WARM_RELAXATIONS if warm else rounds.RELAXATIONS]
+
 
 class TestPlanes:
     def test_those_of_vertices_that_stay_are_not_looked_for_again(self, monkeypatch):
