@@ -37,14 +37,15 @@ RELAXATIONS, WARM_RELAXATIONS, RELAXING = 8, 4, 8
 mended cloth is where no force would put it."""
 WARM_ROUNDS = 2
 """Rounds of a warm frame that is neither crowded nor held, at most: it starts near where it ends."""
-CROWDED = 2.5e-3
-"""Part of the vertices that cloth must push for a level to get a budget's steps a round: a few are left to mending."""
+CROWDED, PILED = 2.5e-3, 3.5e-3
+"""Part of the vertices that cloth must push for a level to get a budget's steps a round: a few are left to mending. And
+the part at its end beyond which it is relaxed all the same."""
 
 
-def crowded(terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> bool:
-    """Whether so much cloth pushes cloth at x [m] that it takes steps to settle."""
+def crowded(terms: Sequence[Touch], x: Float[Tensor, "vertices 3"], most: float = CROWDED) -> bool:
+    """Whether cloth pushes more than a part of the cloth at x [m], so that it takes steps to settle."""
     pushed = [term.diagonal(x) > 0 for term in terms if isinstance(term, SelfContact)]
-    return bool(pushed) and float(torch.stack(pushed).any(dim=0).to(x).mean()) > CROWDED
+    return bool(pushed) and float(torch.stack(pushed).any(dim=0).to(x).mean()) > most
 
 
 def solve_touching(
@@ -103,7 +104,7 @@ def solve_touching(
     made = made + more
     if finest:
         # From cold the rounds did not see sharp folds, which the next frame will.
-        relaxing = (much or crowded(touched, x)) and (outward is not None or view.mended or view.crosses(x))
+        relaxing = (much or crowded(touched, x, PILED)) and (outward is not None or view.mended or view.crosses(x))
         x, more = finish_rounds(
             make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
         )
