@@ -287,11 +287,11 @@ def relax(
     view: LevelContact,
     level: int,
     budget: Budget,
-    most: int = RELAXATIONS,
+    most: int,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport]]:
     """Rounds of fewer steps after mending, after none of which anything crosses; none where the input or x does.
 
-    Arguments and results are those of `untangle`.
+    Arguments and results are those of `untangle`; it makes ``most`` rounds, unless time is out.
     """
     reports: list[LevelReport] = []
     if view.cloth is None or view.cloth.before.crossings.count or view.crosses(x):
