@@ -32,7 +32,7 @@ from physgraph_usd.shot import prepare_device
 from physgraph_usd.solve_settings import SolveSettings
 
 REPEATS = 5
-WARM = 6
+WARM = 13
 """Frames of the sequence, the first of which is cold."""
 TRAVEL = 0.05
 """Angle by which its folds travel round the ball between frames."""

@@ -70,6 +70,20 @@ def _winding(
         side[i] = query.sign
 
 
+@wp.kernel
+def _meets(
+    first: wp.int32,
+    mesh: wp.uint64,
+    start: wp.array(dtype=wp.vec3f),
+    along: wp.array(dtype=wp.vec3f),
+    reach: wp.float32,
+    out: wp.array(dtype=wp.bool),
+):
+    i = first + wp.tid()
+    query = wp.mesh_query_ray(mesh, start[i], along[i], reach)
+    out[i] = query.result
+
+
 class MeshSurface:
     """The closed or the open pieces of one mesh.
 
@@ -256,13 +270,19 @@ class MeshSurface:
         return self._overlaps[face.long()] > 0
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
-        """Whether points just above vertices are inside."""
+        """Whether points just above vertices are inside; what sees the sky is not, and takes no winding number."""
+        out = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
         if not len(vertices):
-            return torch.zeros(0, dtype=torch.bool, device=vertices.device)
+            return out
         if self._up is None:
             self._up = self._normals()
-        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
-        return self.inside(wp.to_torch(self.mesh.points)[vertices] + lift * self._up[vertices])
+        size, up = np.ptp(self.bounds, axis=0), self._up[vertices]
+        asked = wp.to_torch(self.mesh.points)[vertices] + LIFT * float(size.max()) * up
+        far = wp.float32(2.0 * float(np.linalg.norm(size)))
+        self._run(_meets, self.mesh, len(vertices), [_vectors(asked), _vectors(up), far, wp.from_torch(out)])
+        met = torch.nonzero(out | (up == 0.0).all(dim=1)).squeeze(1)  # Flat faces have no normal to look along.
+        out[met] = self.inside(asked[met])
+        return out
 
     def _normals(self) -> Float[Tensor, "vertices 3"]:
         """Unit normals of the vertices."""

@@ -34,7 +34,12 @@ def is_clear(distance: Float[Tensor, " segments"], length: Float[Tensor, " segme
 
 
 def signed_distances(
-    surface: Surface, x: Float[Tensor, "vertices 3"], edges: Int[Tensor, "edges 2"], *, reach: float
+    surface: Surface,
+    x: Float[Tensor, "vertices 3"],
+    edges: Int[Tensor, "edges 2"],
+    *,
+    reach: float,
+    least: Float[Tensor, " vertices"] | None = None,
 ) -> Float[Tensor, " vertices"]:
     """Distances to a surface [m], negative inside closed ones and behind open ones with a fixed side.
 
@@ -45,12 +50,18 @@ def signed_distances(
         x: Points in the surface's coordinates [m].
         edges: Pairs of points that are near each other.
         reach: Distance over which only the side is told [m].
+        least: Lower bounds that are known [m]; None without. Who is farther away than reach by them is not asked.
     """
-    return signed_and_closest(surface, x, edges, reach=reach)[0]
+    return signed_and_closest(surface, x, edges, reach=reach, least=least)[0]
 
 
 def signed_and_closest(
-    surface: Surface, x: Float[Tensor, "vertices 3"], edges: Int[Tensor, "edges 2"], *, reach: float
+    surface: Surface,
+    x: Float[Tensor, "vertices 3"],
+    edges: Int[Tensor, "edges 2"],
+    *,
+    reach: float,
+    least: Float[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Nearest | None]:
     """The same, and the closest points of those with negative distances; None where one of them was out of reach.
 
@@ -58,6 +69,7 @@ def signed_and_closest(
     """
     low, high = (torch.as_tensor(corner, dtype=x.dtype, device=x.device) for corner in surface.bounds)
     away = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
+    away = away if least is None else torch.maximum(away, least)
     out = away.clone()
     near = torch.nonzero(away <= reach).squeeze(1)
     if not len(near):

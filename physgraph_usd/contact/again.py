@@ -4,8 +4,14 @@
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false
 from __future__ import annotations
 
+import torch
 import warp as wp
+from jaxtyping import Bool
+from torch import Tensor
 
+from ..level import Level
+from ..mesh.lanes import Launch
+from .nearest import Nearest
 from .proximity import closest_on_triangle, places_inside
 
 wp.set_module_options({"enable_backward": False})
@@ -51,3 +57,24 @@ def edges_again(
         g = edges[other[e][1]]
         below[e] = places_inside(a, b, x[g[0]], x[g[1]])
         slid[e] = slid[e] or below[e][0] < 0.0
+
+
+def found_again(
+    found: Nearest, x: wp.array, triangles: wp.array, edges: wp.array, *, level: Level
+) -> Bool[Tensor, " edges"]:
+    """Write the closest points of now on what is closest; tells which edges' points have slid off an end.
+
+    Args:
+        found: What is closest, whose ``weight`` and ``place`` are written to.
+        x: Positions [m].
+        triangles: Corners of the faces.
+        edges: Ends of the edges.
+        level: The level.
+    """
+    slid, given = torch.zeros_like(found.edge[:, 0], dtype=torch.bool), {"device": level.device, "lanes": level.lanes}
+    faces = [wp.from_torch(found.face, dtype=wp.vec2i), *[wp.from_torch(each, dtype=wp.vec3f) for each in found.weight]]
+    Launch(faces_again, len(found.face), [x, triangles, *faces], **given)({})
+    others = [wp.from_torch(found.edge, dtype=wp.vec2i)]
+    others += [wp.from_torch(each, dtype=wp.vec2f) for each in found.place]
+    Launch(edges_again, len(found.edge), [x, edges, *others, wp.from_torch(slid)], **given)({})
+    return slid

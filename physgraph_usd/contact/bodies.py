@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
-from ..colliders.sign import signed_and_closest, signed_distances
+from ..colliders.sign import MARGIN, ROUNDING, signed_and_closest, signed_distances
 from ..forces.contact import Contact
 from ..forces.seam import Seam
 from ..level import Level
@@ -133,7 +133,10 @@ class LevelBodies:
         inside, held = (torch.zeros_like(self._level.free[:, 0]) for _ in range(2))
         for track in self._tracks:
             at = x + track.shift
-            signed = signed_distances(track.surface, at, self._level.edges, reach=self._reach)
+            if torch.equal(x, track.at):
+                signed = track.known
+            else:
+                signed = signed_distances(track.surface, at, self._level.edges, reach=self._reach)
             signed = torch.where(track.offset.isfinite(), signed, signed.abs())
             depth, pinned = depths(track.surface, at, signed, track.longest)
             inside |= depth > 0
@@ -342,7 +345,10 @@ class FrameBodies:
         known = zip(self.touching, self._tracks, self.distances, self._inside, lost, strict=True)
         for each, track, before, inside, own in known:
             surface, shift = each.surface, track.shift
-            after = signed_distances(surface, x + shift, finest.edges, reach=float(finest.spacing.max()))
+            # Out of a closed surface nothing gets in, or from it, faster than it moves; round an open one it may.
+            least = before - MARGIN * (x - base).norm(dim=1) - ROUNDING if surface.closed else None
+            reach = float(finest.spacing.max())
+            after = signed_distances(surface, x + shift, finest.edges, reach=reach, least=least)
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
             through, longest = len(track.pierced(finest, x, after.abs())), track.longest
             first = penetration(surface, finest, base + shift, before, longest=longest, inside=inside)

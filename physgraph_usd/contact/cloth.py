@@ -204,14 +204,19 @@ class ClothView:
             return busy
         return torch.ones_like(self._level.free[:, 0])
 
-    def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | Spheres | None:
+    def term(self, x: Float[Tensor, "vertices 3"], *, keep_pairs: bool = False) -> SelfContact | Spheres | None:
         """The force between parts that are near one another, or None where no parts are.
 
         Sides are those of the first positions asked for in which nothing crosses; what crosses is drawn out.
+
+        Args:
+            x: Positions [m].
+            keep_pairs: Whether the pairs of the last positions serve, at their closest points of now, where nothing
+                crossed there and no large part of the cloth has moved since.
         """
         if self._settings.cloth == "spheres":
             return self._spheres(x)
-        pairs, crossings = self._near(x)
+        pairs, crossings = self._near(x, keep_pairs=keep_pairs)
         self.tangled = crossings.count > 0
         if self._sides is None or self.tangled:
             self._sides = x
@@ -241,7 +246,7 @@ class ClothView:
         limit = torch.full((len(pairs),), radius, dtype=x.dtype, device=x.device)
         return Spheres(level, ends, radius=limit, stiffness=self._settings.sphere_stiffness, area=area)
 
-    def _near(self, x: Tensor) -> tuple[Pairs | None, Crossings]:
+    def _near(self, x: Tensor, *, keep_pairs: bool) -> tuple[Pairs | None, Crossings]:
         """What is near what, and what crosses: where nothing did at the start or in the input, the end alone tells.
 
         Pairs found before serve again away from what has moved since.
@@ -261,8 +266,11 @@ class ClothView:
         crossings = self.look(x).crossings if again else none
         self._mesh.move(x)
         before = None if known is None or part > MOST else known.nearest
-        reach = torch.full_like(self._level.spacing, self._reach)
-        nearest = self._mesh.nearest(busy, reach, known=before, moved=moved, folds=self._in_folds)
+        if before is not None and keep_pairs and not self.tangled:
+            nearest = self._mesh.slid(before)
+        else:
+            reach = torch.full_like(self._level.spacing, self._reach)
+            nearest = self._mesh.nearest(busy, reach, known=before, moved=moved, folds=self._in_folds)
         self._found = _Found(nearest, nearest.pairs(self._level))
         return self._found.pairs, crossings
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import find_edges, joined_by
-from .again import edges_again, faces_again
+from .again import found_again
 from .beside import add_neighbours, beside_table
 from .cluster_kernels import clusters_beside, pierced
 from .clusters import ClusteredParts
@@ -109,9 +109,8 @@ class ClothMesh:
         self._edges = wp.array(edges, dtype=wp.vec2i, device=level.device)
         about.append(self._triangles)
         points = [_vectors(each) for each in (self._position, self._normal)]
-        self._find_normals = Launch(
-            vertex_normals, level.vertex_count, [*about, *points], device=level.device, lanes=level.lanes
-        )
+        given = {"device": level.device, "lanes": level.lanes}
+        self._find_normals = Launch(vertex_normals, level.vertex_count, [*about, *points], **given)
         self._has_normals = False
         self._at: tuple[Tensor, int] | None = None
 
@@ -172,8 +171,13 @@ class ClothMesh:
             return
         self._at = x, x._version
         self._position.copy_(x)
-        self._clusters.move(self._position)
         self._has_normals = False
+
+    @property
+    def _moved(self) -> ClusteredParts:
+        """The clusters where the cloth is: only queries move them."""
+        self._clusters.move(self._position)
+        return self._clusters
 
     def normals(self) -> Float[Tensor, "vertices 3"]:
         """Unit vertex normals of the authored winding."""
@@ -225,11 +229,18 @@ class ClothMesh:
         self._ask_edges(self._parted(close, sharp), limit, found)
         return found
 
+    def slid(self, known: Nearest) -> Nearest:
+        """What was closest, at its closest points of now, without edges whose closest points are past an end."""
+        found = known.copy()
+        self._slid(found)
+        found.edge[found.place[..., 0].T < 0.0] = -1
+        return found
+
     def crossings(self, busy: Bool[Tensor, " vertices"]) -> Crossings:
         """Edges with a busy end that pass through faces."""
         count = torch.zeros(len(self.level.edges), dtype=torch.int32, device=busy.device)
         faces = torch.empty((len(count), 4), dtype=torch.int32, device=busy.device)
-        clusters, inputs = self._clusters, [_vectors(self._position), _flags(busy)]
+        clusters, inputs = self._moved, [_vectors(self._position), _flags(busy)]
         inputs += [*clusters.edges, *clusters.edge_boxes, *clusters.faces, *clusters.face_boxes]
         clusters.run_shared(pierced, [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
         edge = torch.nonzero(count).squeeze(1)
@@ -301,19 +312,13 @@ class ClothMesh:
 
     def _beside(self, moved: Bool[Tensor, " vertices"], reach: float) -> Bool[Tensor, " vertices"]:
         """Given vertices, and those of all clusters that may be nearer to a cluster of one than a reach [m]."""
-        near, clusters = moved.clone(), self._clusters
+        near, clusters = moved.clone(), self._moved
         clusters.run(clusters_beside, [wp.float32(reach), _flags(moved), *clusters.faces[:2], _flags(near)])
         return near
 
     def _slid(self, found: Nearest) -> Bool[Tensor, " vertices"]:
         """Move what is closest to the closest points of now; the ends of edges whose points slide off an end."""
-        slid = torch.zeros(len(found.edge), dtype=torch.bool, device=found.edge.device)
-        x, given = _vectors(self._position), {"device": self.level.device, "lanes": self.level.lanes}
-        faces = [wp.from_torch(found.face, dtype=wp.vec2i), *[_vectors(each) for each in found.weight]]
-        Launch(faces_again, len(found.face), [x, self._triangles, *faces], **given)({})
-        edges = [wp.from_torch(found.edge, dtype=wp.vec2i)]
-        edges += [wp.from_torch(each, dtype=wp.vec2f) for each in found.place]
-        Launch(edges_again, len(found.edge), [x, self._edges, *edges, wp.from_torch(slid)], **given)({})
+        slid = found_again(found, _vectors(self._position), self._triangles, self._edges, level=self.level)
         ends = torch.zeros_like(found.face[:, 0], dtype=torch.bool)
         ends[self.level.edges[slid].long().reshape(-1)] = True
         return ends
@@ -321,7 +326,7 @@ class ClothMesh:
     def _ask_faces(self, asked: Sequence[_Asked], reach: Tensor, found: Nearest) -> None:
         """Write the closest faces of the vertices that are asked."""
         best = torch.empty((len(self.level.rest), 2), dtype=torch.float32, device=reach.device)
-        clusters = self._clusters
+        clusters = self._moved
         outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.face, dtype=wp.vec2i)]
         outputs += [_vectors(each) for each in found.weight]
         for which, own in asked:
@@ -331,7 +336,7 @@ class ClothMesh:
     def _ask_edges(self, asked: Sequence[_Asked], reach: Tensor, found: Nearest) -> None:
         """Write the closest edges of those that have an end that is asked."""
         best = torch.empty((len(found.edge), 2), dtype=torch.float32, device=reach.device)
-        clusters = self._clusters
+        clusters = self._moved
         outputs = [wp.from_torch(best, dtype=wp.vec2f), wp.from_torch(found.edge, dtype=wp.vec2i)]
         outputs += [wp.from_torch(each, dtype=wp.vec2f) for each in found.place]
         for which, own in asked:

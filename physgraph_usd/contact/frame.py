@@ -84,10 +84,11 @@ class LevelContact:
         """Whether cloth crosses cloth at positions x [m]."""
         return self.cloth is not None and self.cloth.look(x).crossings.count > 0
 
-    def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
-        """The forces of what is near positions x [m]; empty where nothing is."""
-        parts = [part.term(x) for part in (self.bodies, self.cloth) if part is not None]
-        return tuple(term for term in parts if term is not None)
+    def terms(self, x: Float[Tensor, "vertices 3"], *, keep_pairs: bool = False) -> tuple[Touch, ...]:
+        """The forces of what is near positions x [m]; empty where nothing is. Pairs are kept as by `ClothView.term`."""
+        bodies = None if self.bodies is None else self.bodies.term(x)
+        cloth = None if self.cloth is None else self.cloth.term(x, keep_pairs=keep_pairs)
+        return tuple(term for term in (bodies, cloth) if term is not None)
 
     def look_in_folds(self, wanted: bool) -> None:
         """As `ClothView.look_in_folds`, where there is cloth."""

@@ -167,17 +167,21 @@ def is_between(found: Nearest, way: Nearest) -> Bool[Tensor, " points"]:
 def _pierce(
     first: wp.int32,
     mesh: wp.uint64,
-    start: wp.array(dtype=wp.vec3f),
-    end: wp.array(dtype=wp.vec3f),
+    edges: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3f),
+    clear: wp.array(dtype=wp.float32),
+    longest: wp.array(dtype=wp.float32),
     face: wp.array(dtype=wp.int32),
 ):
     i = first + wp.tid()
-    along = end[i] - start[i]
-    length = wp.length(along)
-    if length > 0.0:
-        query = wp.mesh_query_ray(mesh, start[i], along / length, length)
-        if query.result:
-            face[i] = query.face
+    a, b = edges[i][0], edges[i][1]
+    if clear[a] + clear[b] <= longest[i]:
+        along = points[b] - points[a]
+        length = wp.length(along)
+        if length > 0.0:
+            query = wp.mesh_query_ray(mesh, points[a], along / length, length)
+            if query.result:
+                face[i] = query.face
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,17 +215,18 @@ def pierced(
         x: Positions in the surface's coordinates [m].
         distance: Unsigned distances at x, or lower bounds; infinite for cloth that does not feel the surface [m].
     """
-    first, second = level.edges.long().T.contiguous()
     length = level.lengths(x)
-    near = torch.nonzero(distance[first] + distance[second] <= length).squeeze(1)
-    none, start, end = near[:0], x[first[near]], x[second[near]]
     if not isinstance(surface, MeshSurface):
-        inside = surface.inside(x) if len(near) else none
-        return Pierced(near[inside[first[near]] != inside[second[near]]] if len(near) else none, none)
+        first, second = level.edges.long().T.contiguous()
+        near = torch.nonzero(distance[first] + distance[second] <= length).squeeze(1)
+        inside = surface.inside(x) if len(near) else near
+        return Pierced(near[inside[first[near]] != inside[second[near]]] if len(near) else near, near[:0])
     if not len(length) or float(distance.min()) > COVER * float(length.max()):
+        none = level.edges.long()[:0, 0]
         return Pierced(none, none)
-    faces = _faces_met(surface.mesh, start, end, lanes=level.lanes)
-    return Pierced(near[faces >= 0], _through_cloth(surface, level, x, distance.isfinite()))
+    points = x.to(torch.float32).contiguous()
+    faces = _faces_met(surface.mesh, level.edges, points, clear=distance, longest=length, lanes=level.lanes)
+    return Pierced(torch.nonzero(faces >= 0).squeeze(1), _through_cloth(surface, level, points, distance.isfinite()))
 
 
 def _through_cloth(
@@ -229,14 +234,11 @@ def _through_cloth(
 ) -> Int[Tensor, " triangles"]:
     """The cloth's triangles that the body's edges pass through, of the cloth that feels the body."""
     cloth = _Cloth.of(level, feels)
-    points = x.to(torch.float32).contiguous()
-    cloth.move(points)
-    body = wp.to_torch(surface.mesh.points)
+    cloth.move(x)
     edges = torch.as_tensor(surface.edges, device=x.device)
-    start, end = body[edges[:, 0]], body[edges[:, 1]]
-    low, high = points.amin(dim=0), points.amax(dim=0)
-    meets = ((torch.maximum(start, end) >= low) & (torch.minimum(start, end) <= high)).all(dim=1)
-    faces = _faces_met(cloth.mesh, start[meets], end[meets], lanes=level.lanes)
+    body = wp.to_torch(surface.mesh.points)
+    every = torch.zeros_like(body[:, 0]), torch.zeros_like(edges[:, 0])
+    faces = _faces_met(cloth.mesh, edges, body, clear=every[0], longest=every[1], lanes=level.lanes)
     return cloth.triangles[faces[faces >= 0].long()]
 
 
@@ -270,16 +272,28 @@ class _Cloth:
         return known[garments]
 
     def move(self, points: Float[Tensor, "vertices 3"]) -> None:
-        """Refit to positions [m]."""
+        """Refit to positions [m], float32."""
         self._points.copy_(points)
         self.mesh.refit()
 
 
-def _faces_met(mesh: wp.Mesh, start: Tensor, end: Tensor, *, lanes: int) -> Int[Tensor, " segments"]:
-    """The first face of a mesh that each segment meets, -1 where there is none."""
-    face = torch.full((len(start),), -1, dtype=torch.int32, device=start.device)
-    if len(start):
-        points = [wp.from_torch(each.to(torch.float32).contiguous(), dtype=wp.vec3f) for each in (start, end)]
-        inputs = [mesh.id, *points, wp.from_torch(face)]
-        Launch(_pierce, len(start), inputs, device=str(start.device), lanes=lanes, least=LEAST_QUERIES)({})
+def _faces_met(
+    mesh: wp.Mesh, edges: Tensor, points: Tensor, *, clear: Tensor, longest: Tensor, lanes: int
+) -> Int[Tensor, " edges"]:
+    """The first face of a mesh that each edge meets, -1 where there is none; only of those that are long enough.
+
+    Args:
+        mesh: The mesh.
+        edges: End vertices, int32, shape (E, 2).
+        points: Positions [m], float32, shape (V, 3).
+        clear: How far each vertex is from the mesh at least [m], shape (V,).
+        longest: Sum of its ends' from which on an edge can't meet the mesh [m], shape (E,).
+        lanes: Most threads on the CPU.
+    """
+    face = torch.full((len(edges),), -1, dtype=torch.int32, device=points.device)
+    if len(edges):
+        reach = [wp.from_torch(each.to(torch.float32).contiguous()) for each in (clear, longest)]
+        ends = wp.from_torch(edges.contiguous(), dtype=wp.vec2i)
+        inputs = [mesh.id, ends, wp.from_torch(points, dtype=wp.vec3f), *reach, wp.from_torch(face)]
+        Launch(_pierce, len(edges), inputs, device=str(points.device), lanes=lanes, least=LEAST_QUERIES)({})
     return face

@@ -230,7 +230,7 @@ def solve_rounds(
         left -= report.steps
         if report.stopped == "budget" or (left <= 0 and terms):
             return x, reports, terms
-        before, terms = terms, view.terms(x)
+        before, terms = terms, view.terms(x, keep_pairs=rounds < view.rounds)
         if not before and not terms:
             return x, reports, ()
         if left <= 0:

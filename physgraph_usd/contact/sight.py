@@ -104,6 +104,8 @@ class Sight:
         surface[vertex] = x[vertex] - normal * signed.unsqueeze(1)
         found.there[vertex], found.normal[vertex], found.offset[vertex] = True, normal, offset
         found.height[vertex] = (normal * surface[vertex]).sum(dim=1)
+        if not bool(self.closest.there.any()):
+            return Sight(x, found, Seen.none(x))
         crease = Seen.none(x) if hollow is None else self._other_side(found, surface, hollow)
         at = torch.where(still.unsqueeze(1), self.at, x)
         return Sight(at, self.closest.where(still, found), self.crease.where(still, crease))
