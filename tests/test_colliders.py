@@ -14,6 +14,7 @@ from physgraph_usd.colliders.primitives import ShapeSurface
 from physgraph_usd.colliders.sign import signed_distances
 from physgraph_usd.usd.shapes import tessellated
 
+FAR = np.array([0.25, 0.0, 0.0])
 BODIES = {
     "ball": ball(),
     "box": box(),
@@ -180,6 +181,62 @@ class TestOverlap:
         x = torch.tensor([[0.05, 0.0, 0.0]], dtype=torch.float64)
         found = surface.closest(x, endless(1))
         assert surface.exit(x, found) is found
+
+
+class TestBuried:
+    """A corner from which one sees the sky is not buried; the others take a winding number."""
+
+    def test_it_is_what_winding_numbers_say(self, monkeypatch: pytest.MonkeyPatch):
+        (surface,) = surfaces(together(ball(level=4), ball(0.15, level=4, at=(0.25, 0.0, 0.0))))
+        every = torch.arange(len(surface.mesh.points))
+        one, other = (np.linalg.norm(surface.mesh.points.numpy() + surface.origin - at, axis=1) for at in (0.0, FAR))
+        of_one = np.arange(len(every)) < len(every) // 2
+        deep, near = (np.where(of_one, other < 0.15 + by, one < 0.2 + by) for by in (-2e-3, 2e-3))
+        asked = self.asked(monkeypatch)
+        buried = surface._lifted_inside(every).numpy()
+        assert deep.sum() > 100
+        assert buried[deep].all()
+        assert not buried[~near].any()
+        assert deep.sum() <= sum(asked) < 0.5 * len(every)
+
+    def test_a_ball_takes_none(self, monkeypatch: pytest.MonkeyPatch):
+        (surface,) = surfaces(ball(level=4))
+        asked = self.asked(monkeypatch)
+        assert not surface._lifted_inside(torch.arange(len(surface.mesh.points))).any()
+        assert sum(asked) == 0
+
+    def test_corners_without_a_normal_take_one(self, monkeypatch: pytest.MonkeyPatch):
+        points, triangles = ball(level=2)
+        (surface,) = surfaces((points, triangles))
+        surface._up = torch.zeros((len(points), 3))
+        asked = self.asked(monkeypatch)
+        surface._lifted_inside(torch.arange(7))
+        assert sum(asked) == 7
+
+    @staticmethod
+    def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+        """How many points are asked for at each call from now on."""
+        counts, inside = list[int](), MeshSurface.inside
+        monkeypatch.setattr(
+            MeshSurface, "inside", lambda self, x, **more: counts.append(len(x)) or inside(self, x, **more)
+        )
+        return counts
+
+
+def test_who_is_known_to_be_far_is_not_asked(monkeypatch: pytest.MonkeyPatch):
+    soup = ball(level=4)
+    (surface,) = surfaces(soup)
+    x = torch.as_tensor(around(soup) - surface.origin)
+    pairs = torch.zeros((0, 2), dtype=torch.int32)
+    whole = signed_distances(surface, x, pairs, reach=0.02)
+    counts, closest = list[int](), MeshSurface.closest
+    monkeypatch.setattr(MeshSurface, "closest", lambda self, x, reach: counts.append(len(x)) or closest(self, x, reach))
+    least = torch.as_tensor(np.linalg.norm(x.numpy(), axis=1) - 0.2 - 1e-3)
+    found = signed_distances(surface, x, pairs, reach=0.02, least=least)
+    assert sum(counts) == int((least <= 0.02).sum()) < 0.8 * len(x)
+    near = whole < 0.02
+    assert torch.equal(found[near], whole[near])
+    assert bool((found[~near] >= 0.02).all())
 
 
 SHAPES = {

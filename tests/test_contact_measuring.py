@@ -7,11 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from bodies import ball
 from cloth import sheet
+from folds import levels_of, named
 from touching import frame, measured, mesh_pose, refiner
 
+from physgraph_usd.colliders.mesh import MeshBody
+from physgraph_usd.colliders.pose import MeshPose
+from physgraph_usd.contact.bodies import FrameBodies, Touching
 from physgraph_usd.contact.settings import ContactSettings
+from physgraph_usd.level import Level
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.scene import State
 
@@ -48,3 +54,37 @@ def test_what_is_on_is_measured_as_ever():
 def test_a_report_asks_for_it(report: Path | None):
     options = RefineOptions(report=report, contact="off", self_contact="off")
     assert options.contact_settings().measured == (report is not None)
+
+
+class TestBodies:
+    """What is known of the upsampled cage's distances saves asking for them again, and nothing else."""
+
+    def begun(self) -> tuple[FrameBodies, Level, torch.Tensor]:
+        """A sheet over a ball and just clear of it, with what is known of it."""
+        levels = levels_of(named((MESH, HANGING)))
+        surface = MeshBody(device="cpu", lanes=1).pose(MeshPose(BALL[0] - 0.13 * NORMAL, BALL[1]))[0]
+        cage = torch.as_tensor(HANGING, dtype=torch.float32)
+        body = Touching("/Ball", surface, (0.002,))
+        return (
+            FrameBodies.begin(levels, [body], cage, origin=np.zeros(3), settings=ContactSettings()),
+            levels[-1],
+            levels[-1].base.apply(cage),
+        )
+
+    def test_what_moved_into_one_is_found(self):
+        bodies, level, base = self.begun()
+        x = base - 0.05 * torch.as_tensor(NORMAL, dtype=base.dtype)
+        found = bodies.measure(level, base, x)["bodies"]
+        assert isinstance(found, dict)
+        deep = np.linalg.norm(x.numpy() + 0.13 * NORMAL, axis=1) < 0.0995
+        assert found["/Ball"]["before"]["inside"] == 0
+        assert found["/Ball"]["after"]["inside"] == pytest.approx(deep.sum(), abs=0.1 * deep.sum())
+        assert deep.sum() > 20
+
+    def test_the_cage_is_not_asked_for_twice(self, monkeypatch: pytest.MonkeyPatch):
+        bodies, level, base = self.begun()
+        view = bodies.at(level, level)
+        moved = base - 0.05 * torch.as_tensor(NORMAL, dtype=base.dtype)
+        assert int(view.within(moved)[0].sum()) > 20
+        monkeypatch.setattr("physgraph_usd.contact.bodies.signed_distances", None)
+        assert int(view.within(base)[0].sum()) == 0

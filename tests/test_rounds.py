@@ -15,6 +15,7 @@ from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact import rounds
 from physgraph_usd.contact.bodies import STALE, FrameBodies, Touching
+from physgraph_usd.contact.cloth_mesh import ClothMesh
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.integrate.base import Carry, System
 from physgraph_usd.integrate.metric import Metric
@@ -186,6 +187,43 @@ def test_rounds_share_a_budget_but_in_a_held_pose_and_where_it_is_crowded(warm, 
     )
     fold.touching(fold.x, fold.x, warm=warm, still=still, steps=12)
     assert asked[0] == each
+
+
+class TestPairs:
+    """Of a warm frame's two rounds the second keeps the first one's pairs; more rounds find them anew."""
+
+    @pytest.mark.parametrize(
+        ("warm", "still", "kept"), [(True, False, True), (True, True, False), (False, False, False)]
+    )
+    def test_in_warm_frames_that_are_not_held(self, warm: bool, still: bool, kept: bool, monkeypatch):
+        fold, asked, slid = Fold(), list[object](), list[object]()
+        nearest, slide = ClothMesh.nearest, ClothMesh.slid
+        monkeypatch.setattr(ClothMesh, "nearest", lambda *args, **more: asked.append(0) or nearest(*args, **more))
+        monkeypatch.setattr(ClothMesh, "slid", lambda *args: slid.append(0) or slide(*args))
+        goal = fold.x.clone()
+        goal[fold.away, 2] += 0.2 * EDGE
+        fold.touching(goal, fold.x, warm=warm, still=still, steps=2)
+        assert bool(slid) == kept
+        assert (len(asked) == 1) == kept
+
+    @pytest.mark.parametrize(("moved", "kept"), [(0.1, True), (0.9, False)])
+    def test_not_where_much_has_moved(self, moved: float, kept: bool, monkeypatch):
+        assert self.slides(Fold(), moved, monkeypatch) == kept
+
+    def test_not_where_something_crossed(self, monkeypatch):
+        fold = Fold()
+        fold.x = fold.goal
+        assert not self.slides(fold, 0.1, monkeypatch)
+
+    @staticmethod
+    def slides(fold: Fold, moved: float, monkeypatch: pytest.MonkeyPatch) -> bool:
+        """Whether pairs are kept after a part of the vertices has moved."""
+        slid, slide = list[object](), ClothMesh.slid
+        monkeypatch.setattr(ClothMesh, "slid", lambda *args: slid.append(0) or slide(*args))
+        fold.view.terms(fold.x)
+        some = torch.arange(len(fold.x)) < moved * len(fold.x)
+        fold.view.terms(fold.x + 0.2 * EDGE * some.unsqueeze(1), keep_pairs=True)
+        return bool(slid)
 
 
 class TestRelaxing:
