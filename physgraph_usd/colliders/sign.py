@@ -5,16 +5,22 @@ that are shorter than the distances of their ends the sign cannot change: one wi
 that such edges join.
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
 import numpy as np
 import torch
+import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.lengths import EdgeLengths
+from ..mesh.lanes import Launch
+from ..mesh.stencil import vectors
 from ..mesh.topology import joined_by
 from .base import Nearest, Surface
+
+wp.set_module_options({"enable_backward": False})
 
 LEAST_REACH = 1e-3
 """Distance within which closest points are always asked for [m]."""
@@ -31,6 +37,43 @@ def is_clear(distance: Float[Tensor, " segments"], length: Float[Tensor, " segme
         length: Their lengths [m].
     """
     return distance > MARGIN * length + ROUNDING
+
+
+@wp.func
+def _is_clear(edge: wp.vec2i, x: wp.array(dtype=wp.vec3f), distance: wp.array(dtype=wp.float32)):
+    """`is_clear` of an edge."""
+    length = wp.length(x[edge[1]] - x[edge[0]])
+    return distance[edge[0]] + distance[edge[1]] > MARGIN * length + ROUNDING
+
+
+@wp.kernel
+def _contradict(
+    first: wp.int32,
+    edges: wp.array(dtype=wp.vec2i),
+    x: wp.array(dtype=wp.vec3f),
+    distance: wp.array(dtype=wp.float32),
+    side: wp.array(dtype=wp.int8),
+    out: wp.array(dtype=wp.bool),
+):
+    i = first + wp.tid()
+    a, b = edges[i][0], edges[i][1]
+    if int(side[a]) * int(side[b]) < 0 and _is_clear(edges[i], x, distance):
+        out[a] = True
+        out[b] = True
+
+
+@wp.kernel
+def _join(
+    first: wp.int32,
+    edges: wp.array(dtype=wp.vec2i),
+    x: wp.array(dtype=wp.vec3f),
+    distance: wp.array(dtype=wp.float32),
+    some: wp.array(dtype=wp.bool),
+    out: wp.array(dtype=wp.bool),
+):
+    i = first + wp.tid()
+    if some[edges[i][0]] and some[edges[i][1]]:
+        out[i] = _is_clear(edges[i], x, distance)
 
 
 def signed_distances(
@@ -112,7 +155,7 @@ def _sides(
     unsure = (side == 0) | _contradicted(side, x, distance, edges=edges)
     while bool(unsure.any()):
         which = torch.nonzero(unsure).squeeze(1)
-        joining = _clear_of(unsure[edges[:, 0]] & unsure[edges[:, 1]], x, distance, edges=edges)
+        joining = _clear_among(unsure, x, distance, edges=edges)
         group, one = _joined(which, joining, len(x))
         inside = surface.inside(x[which[one]])
         side[which] = 1.0 - 2.0 * inside.to(x.dtype)[group]
@@ -124,16 +167,25 @@ def _sides(
 def _contradicted(side: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Bool[Tensor, " vertices"]:
     """Vertices told to be on the other side of a neighbour that no surface divides them from."""
     out = torch.zeros(len(side), dtype=torch.bool, device=side.device)
-    sign = side.to(torch.int8)
-    out[_clear_of(sign[edges[:, 0]] * sign[edges[:, 1]] < 0, x, distance, edges=edges).ravel()] = True
+    _ask_edges(_contradict, edges, x, distance, wp.from_torch(side.to(torch.int8)), wp.from_torch(out))
     return out
 
 
-def _clear_of(which: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Int[Tensor, "edges 2"]:
-    """Those of some edges that no surface divides."""
-    some = edges[which]
-    ends, length = some.long(), EdgeLengths(some.to(torch.int32), x)(x)
-    return ends[is_clear(distance[ends[:, 0]] + distance[ends[:, 1]], length)]
+def _clear_among(some: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Int[Tensor, "edges 2"]:
+    """The edges between some vertices that no surface divides."""
+    out = torch.zeros(len(edges), dtype=torch.bool, device=x.device)
+    _ask_edges(_join, edges, x, distance, wp.from_torch(some), wp.from_torch(out))
+    return edges[out].long()
+
+
+def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *more: wp.array) -> None:
+    """Launch over edges; the kernel is told first where they are and how far their ends are from the surface."""
+    if not len(edges):
+        return
+    wp.init()  # Views of tensors do not start Warp by themselves.
+    points, away = (each.to(torch.float32).contiguous() for each in (x, distance))
+    where = [wp.from_torch(edges.to(torch.int32).contiguous(), dtype=wp.vec2i), vectors(points), wp.from_torch(away)]
+    Launch(kernel, len(edges), [*where, *more], device=str(x.device))({})
 
 
 def _joined(which: Tensor, pairs: Tensor, count: int) -> tuple[Tensor, Tensor]:
