@@ -345,7 +345,7 @@ class FrameBodies:
         known = zip(self.touching, self._tracks, self.distances, self._inside, lost, strict=True)
         for each, track, before, inside, own in known:
             surface, shift = each.surface, track.shift
-            # Out of a closed surface nothing gets in, or from it, faster than it moves; round an open one it may.
+            # What was farther outside a closed surface than it has moved still is; of an open one it may be behind.
             least = before - MARGIN * (x - base).norm(dim=1) - ROUNDING if surface.closed else None
             reach = float(finest.spacing.max())
             after = signed_distances(surface, x + shift, finest.edges, reach=reach, least=least)

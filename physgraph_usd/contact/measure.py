@@ -280,14 +280,14 @@ class _Cloth:
 def _faces_met(
     mesh: wp.Mesh, edges: Tensor, points: Tensor, *, clear: Tensor, longest: Tensor, lanes: int
 ) -> Int[Tensor, " edges"]:
-    """The first face of a mesh that each edge meets, -1 where there is none; only of those that are long enough.
+    """The first face of a mesh that each edge meets, -1 where it meets none or is too short to.
 
     Args:
         mesh: The mesh.
         edges: End vertices, int32, shape (E, 2).
         points: Positions [m], float32, shape (V, 3).
         clear: How far each vertex is from the mesh at least [m], shape (V,).
-        longest: Sum of its ends' from which on an edge can't meet the mesh [m], shape (E,).
+        longest: What both ends are away together beyond which an edge cannot meet the mesh [m], shape (E,).
         lanes: Most threads on the CPU.
     """
     face = torch.full((len(edges),), -1, dtype=torch.int32, device=points.device)

@@ -195,7 +195,7 @@ def solve_rounds(
         view: The level's view of what it may touch.
         level: Index for the reports.
         budget: When to stop; its steps are shared by the rounds. What first touches at the end gets a round's more.
-        rounds: How many there are.
+        rounds: How many there are; of fewer than the view's all but the first keep its pairs.
         whole: Whether each round gets all of the steps instead. In so many cloth gets far: what then crosses is taken
             back towards the round's start, so that the next one finds everything on its side.
 
