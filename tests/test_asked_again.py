@@ -14,7 +14,7 @@ def crosswise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     along, other, way = first[:, 1] - first[:, 0], second[:, 1] - second[:, 0], first[:, 0] - second[:, 0]
     system = np.stack([along, -other], axis=2)
     places = np.stack([np.linalg.lstsq(m, -w, rcond=None)[0] for m, w in zip(system, way, strict=True)])
-    return ((places > 0.0) & (places < 1.0)).all(axis=1)
+    return np.all((places > 0.0) & (places < 1.0), axis=1)
 
 
 class TestAskedAgain:
