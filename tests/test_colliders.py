@@ -205,6 +205,15 @@ class TestBuried:
         assert not surface._lifted_inside(torch.arange(len(surface.mesh.points))).any()
         assert sum(asked) == 0
 
+    def test_through_a_hole_one_sees_the_sky_from_inside(self):
+        """Of a tube with a ball in it: the ball's corners look out at the ends, and all are buried."""
+        body = MeshBody(side="winding", device="cpu", lanes=1)
+        (surface,) = body.pose(MeshPose(*together(tube(0.1, 0.4), ball(0.05))))
+        radius = np.linalg.norm(surface.mesh.points.numpy() + surface.origin, axis=1)
+        inner = torch.as_tensor(np.flatnonzero(radius < 0.051))
+        assert len(inner) > 100
+        assert surface._lifted_inside(inner).all()
+
     def test_corners_without_a_normal_take_one(self, monkeypatch: pytest.MonkeyPatch):
         points, triangles = ball(level=2)
         (surface,) = surfaces((points, triangles))

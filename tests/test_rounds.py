@@ -15,6 +15,7 @@ from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact import rounds
 from physgraph_usd.contact.bodies import STALE, FrameBodies, Touching
+from physgraph_usd.contact.cloth import MOST
 from physgraph_usd.contact.cloth_mesh import ClothMesh
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.integrate.base import Carry, System
@@ -209,6 +210,24 @@ class TestPairs:
     @pytest.mark.parametrize(("moved", "kept"), [(0.1, True), (0.9, False)])
     def test_not_where_much_has_moved(self, moved: float, kept: bool, monkeypatch):
         assert self.slides(Fold(), moved, monkeypatch) == kept
+
+    def test_what_is_known_stays_as_it_was_found(self):
+        """Looked for again afterwards, pairs are those that were never kept."""
+        found = []
+        for keep in (False, True):
+            fold = Fold()
+            cloth, shift = fold.view.cloth, torch.tensor([0.0, 0.0, 0.3 * EDGE])
+            assert cloth is not None
+            some = (fold.x[:, 1] > 0.3 * EDGE) & (fold.x[:, 0] > 4.5 * EDGE)
+            assert float(some.double().mean()) < MOST
+            fold.view.terms(fold.x)
+            fold.view.terms(fold.x + shift * some.unsqueeze(1), keep_pairs=keep)
+            # Those that come back have not moved since what is known was found.
+            fold.view.terms(fold.x + 0.2 * EDGE * (fold.x[:, :1] < EDGE))
+            assert cloth._found is not None
+            found.append(cloth._found.nearest)
+        assert torch.equal(found[0].edge, found[1].edge)
+        assert torch.equal(found[0].face, found[1].face)
 
     def test_not_where_something_crossed(self, monkeypatch):
         fold = Fold()

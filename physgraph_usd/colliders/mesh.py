@@ -129,7 +129,7 @@ class MeshSurface:
         self._corners = torch.as_tensor(triangles, device=device).long()
         # At a hole or where more than two faces meet a pseudonormal says nothing.
         ragged = np.isin(triangles, self.edges[shared != 2]).any(axis=1)
-        self._ragged = torch.as_tensor(ragged, device=device)
+        self._ragged, self._has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
         self._asked: Tensor | None = None
         self._buried: Tensor | None = None
         self._overlaps: Tensor | None = None
@@ -270,7 +270,10 @@ class MeshSurface:
         return self._overlaps[face.long()] > 0
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
-        """Whether points just above vertices are inside; what sees the sky is not, and takes no winding number."""
+        """Whether points just above vertices are inside.
+
+        Where the surface has no hole, what sees the sky along its normal is outside, and takes no winding number.
+        """
         out = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
         if not len(vertices):
             return out
@@ -278,6 +281,8 @@ class MeshSurface:
             self._up = self._normals()
         size, up = np.ptp(self.bounds, axis=0), self._up[vertices]
         asked = wp.to_torch(self.mesh.points)[vertices] + LIFT * float(size.max()) * up
+        if self._has_holes:
+            return self.inside(asked)
         far = wp.float32(2.0 * float(np.linalg.norm(size)))
         self._run(_meets, self.mesh, len(vertices), [_vectors(asked), _vectors(up), far, wp.from_torch(out)])
         met = torch.nonzero(out | (up == 0.0).all(dim=1)).squeeze(1)  # Flat faces have no normal to look along.

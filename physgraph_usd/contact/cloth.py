@@ -267,11 +267,12 @@ class ClothView:
         self._mesh.move(x)
         before = None if known is None or part > MOST else known.nearest
         if before is not None and keep_pairs and not self.tangled:
-            nearest = self._mesh.slid(before)
+            # What is known stays as it was found, for edges that slid off may be near something else now.
+            self._found = _Found(before, self._mesh.slid(before).pairs(self._level))
         else:
             reach = torch.full_like(self._level.spacing, self._reach)
             nearest = self._mesh.nearest(busy, reach, known=before, moved=moved, folds=self._in_folds)
-        self._found = _Found(nearest, nearest.pairs(self._level))
+            self._found = _Found(nearest, nearest.pairs(self._level))
         return self._found.pairs, crossings
 
     def mend(self, x: Float[Tensor, "vertices 3"], good: ClothState | None = None) -> ClothState:

@@ -237,8 +237,9 @@ def _through_cloth(
     cloth.move(x)
     edges = torch.as_tensor(surface.edges, device=x.device)
     body = wp.to_torch(surface.mesh.points)
-    every = torch.zeros_like(body[:, 0]), torch.zeros_like(edges[:, 0])
-    faces = _faces_met(cloth.mesh, edges, body, clear=every[0], longest=every[1], lanes=level.lanes)
+    # How far the body is from the cloth nobody knows: none of its edges is left out.
+    clear, longest = (body.new_zeros(len(each)) for each in (body, edges))
+    faces = _faces_met(cloth.mesh, edges, body, clear=clear, longest=longest, lanes=level.lanes)
     return cloth.triangles[faces[faces >= 0].long()]
 
 
