@@ -13,7 +13,7 @@ from cloth import sheet
 from folds import levels_of, named
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.colliders.mesh import MeshBody
+from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact.bodies import FrameBodies, Touching
 from physgraph_usd.contact.settings import ContactSettings
@@ -80,6 +80,24 @@ class TestBodies:
         assert found["/Ball"]["before"]["inside"] == 0
         assert found["/Ball"]["after"]["inside"] == pytest.approx(deep.sum(), abs=0.1 * deep.sum())
         assert deep.sum() > 20
+
+    @pytest.mark.parametrize("depth", [0.0, 0.05, 0.08])
+    def test_what_the_solve_knows_serves(self, monkeypatch: pytest.MonkeyPatch, depth: float):
+        """What it found outside is not asked for again, where it has not moved into a body since; all else is."""
+        bodies, level, base = self.begun()
+        view, normal = bodies.at(level, level), torch.as_tensor(NORMAL, dtype=base.dtype)
+        view.term(base - 0.04 * normal)
+        out = view.project(base - 0.04 * normal)[0]
+        x = out - depth * normal * (torch.arange(len(out)) % 3 == 0).unsqueeze(1)
+        fresh = self.begun()[0].measure(level, base, x)
+        asked, closest = list[int](), MeshSurface.closest
+        monkeypatch.setattr(
+            MeshSurface, "closest", lambda self, x, reach: asked.append(len(x)) or closest(self, x, reach)
+        )
+        assert bodies.measure(level, base, x) == fresh
+        unknown = int((view._tracks[0].least(x) <= 0).sum())
+        assert unknown > 20 if depth else unknown == 0
+        assert max(asked, default=0) <= unknown < 0.5 * len(x)
 
     def test_the_cage_is_not_asked_for_twice(self, monkeypatch: pytest.MonkeyPatch):
         bodies, level, base = self.begun()

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 import physgraph_usd
-from physgraph_usd.mesh.lanes import LEAST_PER_LANE
+from physgraph_usd.mesh.lanes import LEAST_PER_LANE, LEAST_QUERIES, Launch, _tapered
 from physgraph_usd.mesh.stencil import Stencil
 
 
@@ -24,6 +24,39 @@ def test_lanes_give_the_same_bits(rows: int) -> None:
     alone, shared = (Stencil(matrix, dtype=torch.float32, device="cpu", lanes=lanes).apply(x) for lanes in (1, 3))
     assert torch.equal(alone, shared)
     assert np.allclose(alone.numpy(), matrix @ x.numpy(), atol=1e-5)
+
+
+class TestSlices:
+    @pytest.mark.parametrize("size", [500, 501, 12345, 300_200])
+    def test_each_item_is_in_one(self, size: int):
+        counts = self.counted(size, least=LEAST_QUERIES)
+        assert bool((counts == 1).all())
+
+    def test_each_is_smaller_than_the_one_before(self):
+        bounds = _tapered(10_000, 16)
+        sizes = np.diff(bounds)
+        assert bounds[0] == 0
+        assert bounds[-1] == 10_000
+        assert (np.diff(sizes) < 0).all()
+        assert sizes[-1] < 0.01 * 10_000 < 0.11 * 10_000 < sizes[0] < 0.13 * 10_000
+
+    def test_slices_of_queries_give_the_same_bits(self):
+        one, many = (self.counted(5003, least=LEAST_QUERIES, lanes=lanes) for lanes in (1, 3))
+        assert torch.equal(one, many)
+
+    @staticmethod
+    def counted(size: int, *, least: int, lanes: int = 2) -> torch.Tensor:
+        """How often each item is met."""
+        wp.init()
+        out = torch.zeros(size, dtype=torch.int32)
+        Launch(_meet, size, [wp.from_torch(out)], device="cpu", lanes=lanes, least=least)({})
+        return out
+
+
+@wp.kernel
+def _meet(first: wp.int32, out: wp.array(dtype=wp.int32)):
+    i = first + wp.tid()
+    out[i] = out[i] + 1
 
 
 def test_no_backward_pass_is_compiled() -> None:

@@ -16,7 +16,7 @@ from ..mesh.lanes import LEAST_QUERIES, Launch
 from .base import Nearest
 from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
-from .pose import MeshPose
+from .pose import MeshPose, moved_rigidly
 
 wp.set_module_options({"enable_backward": False})
 
@@ -137,14 +137,18 @@ class MeshSurface:
         self._up: Tensor | None = None
         self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
+        self._judged = pose.points[self._used]
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
 
     def repose(self, pose: MeshPose) -> None:
-        """Move the surface to another pose of the same topology."""
+        """Move the surface to another pose of the same topology; turned alone, it passes through itself as before."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
         self.mesh.refit()
-        self._buried, self._overlaps, self._mute, self._up = None, None, None, None
+        self._up = None
         self._skins.clear()
+        posed = pose.points[self._used]
+        if not moved_rigidly(self._judged, posed):
+            self._judged, self._buried, self._overlaps, self._mute = posed, None, None, None
 
     def _place(self, pose: MeshPose) -> np.ndarray:
         """Recentre a pose; vertices that no face uses are put on one that a face does."""

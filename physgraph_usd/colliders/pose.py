@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 KINDS = ("mesh", "sphere", "capsule", "cylinder", "cube", "plane")
+RIGID = 1e-6
+"""How far points may be from where a turn and a shift bring them, relative to their extent: float32's rounding."""
 
 
 @dataclass(frozen=True)
@@ -76,3 +78,16 @@ class ShapePose:
 
 
 Pose = MeshPose | ShapePose
+
+
+def moved_rigidly(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether points were turned and shifted alone, by the best such move (Kabsch 1976).
+
+    Args:
+        before: Positions [m], shape (V, 3), float64.
+        after: Positions of the same points [m].
+    """
+    a, b = (each - each.mean(axis=0) for each in (before, after))
+    u, _, vt = np.linalg.svd(b.T @ a)
+    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return bool(np.abs(a @ turn.T - b).max() <= RIGID * np.ptp(a, axis=0).max())

@@ -93,7 +93,7 @@ def signed_distances(
         x: Points in the surface's coordinates [m].
         edges: Pairs of points that are near each other.
         reach: Distance over which only the side is told [m].
-        least: Lower bounds that are known [m]; None without. Who is farther away than reach by them is not asked.
+        least: Lower bounds that are known [m]; None without. Who is outside by them is not asked, and keeps them.
     """
     return signed_and_closest(surface, x, edges, reach=reach, least=least)[0]
 
@@ -112,9 +112,9 @@ def signed_and_closest(
     """
     low, high = (torch.as_tensor(corner, dtype=x.dtype, device=x.device) for corner in surface.bounds)
     away = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
-    away = away if least is None else torch.maximum(away, least)
-    out = away.clone()
-    near = torch.nonzero(away <= reach).squeeze(1)
+    asked = away <= reach if least is None else (away <= reach) & (least <= 0.0)
+    out = away if least is None else torch.maximum(away, least)
+    near = torch.nonzero(asked).squeeze(1)
     if not len(near):
         return out, None
     # Behind an open surface cloth may be at any distance.

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
-from ..colliders.sign import MARGIN, ROUNDING, signed_and_closest, signed_distances
+from ..colliders.sign import signed_and_closest, signed_distances
 from ..forces.contact import Contact
 from ..forces.seam import Seam
 from ..level import Level
@@ -343,10 +343,10 @@ class FrameBodies:
         bodies: dict[str, object] = {}
         lost = lost or [None] * len(self._tracks)
         known = zip(self.touching, self._tracks, self.distances, self._inside, lost, strict=True)
-        for each, track, before, inside, own in known:
+        for index, (each, track, before, inside, own) in enumerate(known):
             surface, shift = each.surface, track.shift
-            # What was farther outside a closed surface than it has moved still is; of an open one it may be behind.
-            least = before - MARGIN * (x - base).norm(dim=1) - ROUNDING if surface.closed else None
+            # What was farther outside a closed surface than it moved since still is; of an open one it may be behind.
+            least = self._known_last(index, finest).least(x) if surface.closed else None
             reach = float(finest.spacing.max())
             after = signed_distances(surface, x + shift, finest.edges, reach=reach, least=least)
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
@@ -358,6 +358,11 @@ class FrameBodies:
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {"before": asdict(first), "after": asdict(last)}
         return {"bodies": bodies}
+
+    def _known_last(self, index: int, finest: Level) -> Track:
+        """What is known of a surface: what the finest level found of it last, or of the upsampled cage."""
+        view = self._views.get(finest.index)
+        return self._tracks[index] if view is None else view._tracks[index]
 
     def at(self, level: Level, finest: Level) -> LevelBodies:
         """The view of one level, the same at each call; its vertices come first among each garment's finest ones."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..colliders.base import Nearest, Surface
-from ..colliders.sign import MARGIN, behind, is_clear
+from ..colliders.sign import MARGIN, ROUNDING, behind, is_clear
 from ..level import Level
 from .measure import Pierced, is_between, pierced, pinched
 
@@ -51,6 +51,10 @@ class Track:
         if not self.looked or self.looked[0][0] is not x:
             self.looked[:] = [(x, pierced(self.surface, level, x + self.shift, distance))]
         return self.looked[0][1]
+
+    def least(self, x: Tensor) -> Tensor:
+        """Lower bounds of the signed distances at x [m]."""
+        return self.known - MARGIN * (x - self.at).norm(dim=1) - ROUNDING
 
     def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Find anew what may be nearer than a distance that each vertex has [m].

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -21,8 +20,8 @@ LEAST_PER_LANE = 4000
 LEAST_QUERIES = 250
 """The same where each item asks a hierarchy or stands for many elements."""
 SLICES, LEAST_SLICE = 8, 32
-"""Slices of a lane there, and the least of them: some items cost a hundred times as much as others, so whoever is free
-takes the next."""
+"""Slices of a lane there, and what they have at least on average: some items cost a hundred times as much as others, so
+whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
 
 
 class Launch:
@@ -51,7 +50,7 @@ class Launch:
         self._lanes = lanes = max(1, min(lanes, size // least)) if device == "cpu" else 1
         self._device = None if device == "cpu" else device
         slices = min(SLICES * lanes, size // LEAST_SLICE) if lanes > 1 and least < LEAST_PER_LANE else lanes
-        bounds = np.linspace(0, size, slices + 1).astype(int).tolist()
+        bounds = _tapered(size, slices) if slices > lanes else [size * i // slices for i in range(slices + 1)]
         whole = wp.launch(kernel, dim=size, inputs=[0, *inputs], device=device, record_cmd=True)
         self._commands: list[wp.Launch] = []
         if whole is not None and size:
@@ -76,6 +75,12 @@ class Launch:
         _run(left)
         for other in others:
             other.result()
+
+
+def _tapered(size: int, slices: int) -> list[int]:
+    """Bounds of slices of which each is smaller by as much (trapezoid self-scheduling, Tzen and Ni 1993)."""
+    weight = slices * (slices + 1)
+    return [size * i * (2 * slices + 1 - i) // weight for i in range(slices + 1)]
 
 
 def _part(whole: wp.Launch, begin: int, end: int) -> wp.Launch:
