@@ -46,16 +46,19 @@ class Carried:
         coarse: Cage positions [m], world space.
         detail: Fine positions minus the smooth base [m], shape (V, 3).
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
+        held: For how many frames the pose had been held.
     """
 
     coarse: Float[Tensor, "coarse 3"]
     detail: Float[Tensor, "vertices 3"]
     frames: Float[Tensor, "coarse 3 3"]
+    held: int = 0
 
 
 def join(parts: Sequence[Carried]) -> Carried:
     """What several garments carry, as one."""
-    return Carried(*(torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames")))
+    whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
+    return Carried(*whole, held=min(part.held for part in parts))
 
 
 def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> list[Carried]:
@@ -67,7 +70,7 @@ def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> l
         fine: Fine vertices of each garment.
     """
     pairs = zip(coarse, fine, strict=True)
-    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c]) for c, f in pairs]
+    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c], carried.held) for c, f in pairs]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +104,11 @@ class Solved:
 
 
 class MovingFrames:
-    """The frames of one level's cage and the way from them to the fine vertices."""
+    """The frames of one level's cage and the way from them to the fine vertices.
+
+    Attributes:
+        edge: Mean edge of the cage [m].
+    """
 
     def __init__(self, level: Level, cage_triangles: np.ndarray, cage_rest: np.ndarray) -> None:
         """Fix each cage vertex's tangent in the rest shape.
@@ -115,7 +122,7 @@ class MovingFrames:
         self._triangles = torch.as_tensor(cage_triangles.astype(np.int64), device=level.device)
         tangent = _tangent_operator(cage_triangles, np.asarray(cage_rest, dtype=np.float64))
         self._tangent = Stencil(tangent, dtype=level.dtype, device=level.device)
-        self._edge = _mean_edge(cage_triangles, cage_rest)
+        self.edge = _mean_edge(cage_triangles, cage_rest)
 
     def frames(self, coarse: Float[Tensor, "coarse 3"]) -> Float[Tensor, "coarse 3 3"]:
         """Orthonormal frames at the cage vertices; columns are tangent, bitangent, normal."""
@@ -138,7 +145,7 @@ class MovingFrames:
         """
         frames = self.frames(coarse)
         moved = torch.einsum("vij,vj->vi", self._turned(kept.frames, frames), kept.detail)
-        motion = float((coarse - kept.coarse).square().sum(dim=1).mean().sqrt()) / self._edge
+        motion = float((coarse - kept.coarse).square().sum(dim=1).mean().sqrt()) / self.edge
         cosine = (torch.einsum("cij,cij->c", frames, kept.frames) - 1.0) / 2.0
         turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
         return self._level.smooth_base.apply(coarse) + moved, motion, turn

@@ -17,7 +17,7 @@ from .attempts import TORN, best_of
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.rounds import solve_touching
+from .contact.rounds import solve_rounds, solve_touching
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
 from .detail import Carried, MovingFrames, Solved
@@ -95,6 +95,7 @@ class Group:
         *,
         at: float | None,
         touching: Sequence[Touching] = (),
+        moved: float = 0.0,
     ) -> Solved:
         """Solve one frame.
 
@@ -103,11 +104,12 @@ class Group:
             kept: The previous frame's result, or None for a cold start.
             at: The time code, for errors.
             touching: Surfaces that the garments may touch.
+            moved: As `start_of` takes it.
 
         Raises:
             SolveError: A term of the potential is not finite.
         """
-        settings, attempt = self._settings, partial(self._attempt, frames, at, touching)
+        settings, attempt = self._settings, partial(self._attempt, frames, at, touching, moved)
         return best_of(attempt, kept, counts=settings.contact.cloth != "off", again=settings.budget_ms is None)
 
     def _attempt(
@@ -115,6 +117,7 @@ class Group:
         frames: Sequence[GarmentFrame],
         at: float | None,
         touching: Sequence[Touching],
+        moved: float,
         kept: Carried | None,
         *,
         anew: bool = False,
@@ -123,7 +126,7 @@ class Group:
         clock = time.perf_counter()
         forces = self._forces_for(frames)
         world, origin, coarse = self._placed(frames)
-        start = self._start(kept, coarse, world)
+        start = self._start(kept, coarse, world, moved=moved, again=anew)
         contact = self._contact(touching, coarse, origin, frames)
         aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
@@ -133,19 +136,19 @@ class Group:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
         result = self._frames.scaled(aim, x, gain)
-        moved: dict[str, object] = {}
+        finished: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
-            result, start_next, moved = contact.finish(result)
+            result, start_next, finished = contact.finish(result)
             x = x if scaled else start_next
         solved = time.perf_counter()
-        carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world))
+        carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world), held=start.held)
         strain = edge_strain(self.levels[-1], result)
         telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start.why} | told
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
         measured, crossing = ({}, None) if judge is None else judge.measure(result)
         if measured:
-            telemetry["contact"] = measured | moved
+            telemetry["contact"] = measured | finished
         telemetry["milliseconds"] = {
             "prepare": round(1e3 * (prepared - clock), 3),
             "solve": round(1e3 * (solved - prepared), 3),
@@ -219,26 +222,21 @@ class Group:
         """The lasting terms, rebuilt with their metrics when a material changes."""
         material = tuple((frame.fabric, frame.guide) for frame in frames)
         if material != self._material:
-            self._forces = [
-                build_forces(
-                    level,
-                    guide_map,
-                    self.garments,
-                    frames=frames,
-                    gravity=self._gravity,
-                    potential=self._settings.potential,
-                )
-                for level, guide_map in zip(self.levels, self._guide_maps, strict=True)
-            ]
+            given = {"frames": frames, "gravity": self._gravity, "potential": self._settings.potential}
+            pairs = zip(self.levels, self._guide_maps, strict=True)
+            self._forces = [build_forces(level, guide_map, self.garments, **given) for level, guide_map in pairs]
             self._material = material
             self._stretch = max(frame.fabric.stretch for frame in frames)
         return self._forces
 
-    def _start(self, kept: Carried | None, coarse: Tensor, world: np.ndarray) -> Start:
+    def _start(
+        self, kept: Carried | None, coarse: Tensor, world: np.ndarray, *, moved: float = 0.0, again: bool = False
+    ) -> Start:
         """Where a frame starts."""
         kept = None if self._settings.temporal == "off" else kept
-        frames, reset = self._frames, self._settings.reset
-        return start_of(kept, coarse, torch.as_tensor(world), frames=frames, finest=self.levels[-1], reset=reset)
+        moved = moved if self._settings.temporal == "tether" else np.inf  # Nothing else slows it down.
+        given = {"frames": self._frames, "finest": self.levels[-1], "reset": self._settings.reset}
+        return start_of(kept, coarse, torch.as_tensor(world), **given, moved=moved, again=again)
 
     def _contact(
         self,
@@ -307,12 +305,13 @@ class Group:
                 predicted = x = contact.mixed(predicted, x)
             module = lasting.module(coarse)
             warm = predicted if index == last else None
-            tie = None if warm is None or self._settings.temporal != "tether" else (self._settings.tether, warm)
+            pull = start.slowed * self._settings.tether
+            tie = None if warm is None or self._settings.temporal != "tether" else (pull, warm)
             budget = self._settings.budget(last - index, clock, more=choice.steps, warm=warm is not None)
             view = None if contact is None else contact.at(level)
             alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
             x, made, touched = self._solve_level(
-                alone, level, x=x, cold=warm is None, still=start.still, view=view, budget=budget
+                alone, level, x=x, cold=warm is None, start=start, view=view, budget=budget
             )
             if index < last:
                 made[-1].energies = module.energies(x)
@@ -354,12 +353,13 @@ class Group:
         *,
         x: Tensor,
         cold: bool,
-        still: bool,
+        start: Start,
         view: LevelContact | None,
         budget: Budget,
     ) -> tuple[Tensor, list[LevelReport], tuple[Touch, ...]]:
         """Solve one level, in rounds where something is near; returns the contact terms too."""
         integrator = self._integrator
+        budget = replace(budget, steps=0) if start.rests else budget
         if view is None:
             x = leave_saddle(alone, level, x, outward=self._outward) if cold else x
             x, report = solve_level(alone, integrator, x, level=level.index, budget=budget)
@@ -375,10 +375,13 @@ class Group:
             held = view.metric(alone.metric, touched, at)
             return System(field, held, free=level.free, spacing=level.spacing, level=level)
 
-        finest, outward = level is self.levels[-1], self._outward if cold else None
-        return solve_touching(
-            system, integrator, x, view=view, level=level, finest=finest, outward=outward, still=still, budget=budget
-        )
+        if start.rests:
+            touched = view.terms(x)
+            return solve_rounds(
+                system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, rounds=1
+            )
+        given = {"finest": level is self.levels[-1], "outward": self._outward if cold else None, "still": start.still}
+        return solve_touching(system, integrator, x, view=view, level=level, **given, budget=budget)
 
     def _telemetry(
         self, module: ForceModule, x: Tensor, coarse: Tensor, reports: list[LevelReport]
@@ -386,9 +389,6 @@ class Group:
         finest = self.levels[-1]
         return {
             "levels": [asdict(report) for report in reports],
-            "energy_joules": {
-                "input": module.energies(finest.base.apply(coarse)),
-                "output": module.energies(x),
-            },
+            "energy_joules": {"input": module.energies(finest.base.apply(coarse)), "output": module.energies(x)},
             "sharp_folds": sharp_folds(finest, x),
         }

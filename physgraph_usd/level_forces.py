@@ -63,13 +63,14 @@ class LevelForces:
             coarse: Recentred coarse positions [m].
             tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
         """
-        stiffness = None if tie is None else tie[0]
-        if stiffness not in self._lasting:
-            self._lasting[stiffness] = self._made(coarse, tie)
-        system, guide, tether = self._lasting[stiffness]
+        tied = tie is not None
+        if tied not in self._lasting:
+            self._lasting[tied] = self._made(coarse, tie)
+        system, guide, tether = self._lasting[tied]
         guide.aim(coarse)
         if tie is not None and tether is not None:
-            tether.aim(tie[1])
+            stiffness, predicted = tie
+            tether.aim(predicted, stiffness)
         return system
 
     def _made(self, coarse: Tensor, tie: tuple[float, Tensor] | None) -> tuple[System, Guide, Tether | None]:
@@ -81,8 +82,8 @@ class LevelForces:
         return system, guide, tether
 
     @cached_property
-    def _lasting(self) -> dict[float | None, tuple[System, Guide, Tether | None]]:
-        """What `lasting_system` gave, by the tether's stiffness."""
+    def _lasting(self) -> dict[bool, tuple[System, Guide, Tether | None]]:
+        """What `lasting_system` gave, by whether it is tied."""
         return {}
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:

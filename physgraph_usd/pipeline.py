@@ -199,7 +199,8 @@ class Refiner:
         group, near = self.group_of(part), self._near(part, frames)
         while True:
             touching = self._touching(part, frames, near)
-            solved = group.solve(frames, kept, at=frame.time, touching=touching)
+            moved = self._moved(part, frames, near)
+            solved = group.solve(frames, kept, at=frame.time, touching=touching, moved=moved)
             more = self._reached(part, frames, solved.points)
             if more <= set(near):
                 break
@@ -264,6 +265,18 @@ class Refiner:
                 return False
         return True
 
+    def _moved(self, part: tuple[int, ...], frames: Sequence[GarmentFrame], near: Sequence[int]) -> float:
+        """How far any body that garments may touch has moved since their last frame [m]; infinite if more changed."""
+        farthest = 0.0
+        for index, now in zip(part, frames, strict=True):
+            last = self._last[index]
+            if last is None or last.part != part or not _set_alike(now, last.frame) or set(near) != set(last.near):
+                return np.inf
+            for body in near:
+                before, after = last.near[body], self._bodies.pose_of(body)
+                farthest = max(farthest, np.inf if before is None or after is None else after.moved(before))
+        return farthest
+
     def _is_gap(self, time: float | None) -> bool:
         if time is None or self._time is None or not self._spacing:
             return False
@@ -272,8 +285,12 @@ class Refiner:
 
 def _same(a: GarmentFrame, b: GarmentFrame) -> bool:
     """Whether two frames would give the same answer, to the bit."""
-    settings = (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
-    return settings and a.points.shape == b.points.shape and bool(np.array_equal(a.points, b.points))
+    return _set_alike(a, b) and a.points.shape == b.points.shape and bool(np.array_equal(a.points, b.points))
+
+
+def _set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
+    """Whether an artist's settings are the same in two frames."""
+    return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 
 def _require_solvable(path: str, indices: np.ndarray, counts: np.ndarray, rest: np.ndarray) -> None:

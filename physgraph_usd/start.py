@@ -18,6 +18,9 @@ WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
 STILL = 0.02
 """RMS motion of the cage between samples, in mean cage edges, below which a pose is held: there slow settling shows."""
+SLOWER, SLOWEST = 2.0, 2.0**8
+"""How many times as stiffly as in the frame before the tether holds cloth in a held pose, and how many times as ever when
+it then stays where it is: there is a third of a second to settle in, and what still moves after that is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,14 +28,23 @@ class Start:
     """Where a frame's solve starts.
 
     Attributes:
-        why: "warm", or "cold" with the reason.
+        why: "warm", or "at rest" or "cold" with the reason.
         detailed: The finest vertices with the last frame's detail [m], shape (V, 3); None in a cold start.
-        still: Whether the pose is held.
+        still: Whether the cage's pose is held.
+        held: For how many frames that of all that the cloth feels has been.
+        slowed: How many times as stiffly as ever the tether holds it therefore; from `SLOWEST` on it rests.
     """
 
     why: str
     detailed: Float[Tensor, "vertices 3"] | None = None
     still: bool = False
+    held: int = 0
+    slowed: float = 1.0
+
+    @property
+    def rests(self) -> bool:
+        """Whether the cloth stays where it is."""
+        return self.slowed >= SLOWEST
 
 
 def start_of(
@@ -43,6 +55,8 @@ def start_of(
     frames: MovingFrames,
     finest: Level,
     reset: Reset,
+    moved: float = 0.0,
+    again: bool = False,
 ) -> Start:
     """Carry the last frame's detail along, unless the cage jumped or it would tear the cloth.
 
@@ -53,6 +67,8 @@ def start_of(
         frames: Of the cage.
         finest: The finest level.
         reset: When a frame starts cold.
+        moved: How far what the cloth may touch has moved since [m]; infinite where more than poses has changed.
+        again: Whether what is kept is of this frame.
     """
     if kept is None:
         return Start("cold")
@@ -65,4 +81,22 @@ def start_of(
     carried, plain = (edge_strain(finest, x)["p99"] for x in (detailed, base))
     if carried > min(max(WORTH * plain, LEAST_STRAIN), MOST_STRAIN):
         return Start(f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}")
-    return Start("warm", detailed, motion < STILL)
+    held, slowed = slowing(kept.held, max(motion, moved / frames.edge), again=again)
+    why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
+    return Start(why, detailed, motion < STILL, held, slowed)
+
+
+def slowing(held: int, motion: float, *, again: bool = False) -> tuple[int, float]:
+    """For how many frames a pose has now been held, and how many times as stiffly the tether holds cloth in it.
+
+    Never so stiffly that the cloth would be slower than what moves slowly: the cage, or what touches it.
+
+    Args:
+        held: For how many frames it had been before.
+        motion: How far cage or bodies have moved since, in mean cage edges.
+        again: Whether this frame was counted before.
+    """
+    if motion >= STILL:
+        return 0, 1.0
+    held += not again
+    return held, min(SLOWER ** min(held, 64), SLOWEST, (STILL / max(motion, 1e-9)) ** 2)

@@ -49,6 +49,12 @@ class MeshPose:
             and np.array_equal(self.points, other.points)
         )
 
+    def moved(self, since: Pose) -> float:
+        """How far any point has moved since another pose [m]; infinite where the two cannot be compared."""
+        if not isinstance(since, MeshPose) or not np.array_equal(self.triangles, since.triangles):
+            return np.inf
+        return _farthest(self.points, since.points)
+
 
 @dataclass(frozen=True, eq=False)
 class ShapePose:
@@ -76,8 +82,23 @@ class ShapePose:
             and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("turn", "centre", "size"))
         )
 
+    def moved(self, since: Pose) -> float:
+        """How far its axes' ends have moved since another pose [m], a plane's at a metre; infinite for other kinds."""
+        if not isinstance(since, ShapePose) or self.kind != since.kind:
+            return np.inf
+        ends = [each.centre + (each.turn * (each.size if each.size.any() else 1.0)).T for each in (self, since)]
+        return _farthest(*ends)
+
 
 Pose = MeshPose | ShapePose
+
+
+def _farthest(points: np.ndarray, others: np.ndarray) -> float:
+    """How far any point is from its other place [m], 0 without points; infinite where they are no places."""
+    if points.shape != others.shape:
+        return np.inf
+    far = float(np.linalg.norm(points - others, axis=1).max(initial=0.0))
+    return far if np.isfinite(far) else np.inf
 
 
 def moved_rigidly(before: np.ndarray, after: np.ndarray) -> bool:

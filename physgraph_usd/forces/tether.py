@@ -39,13 +39,14 @@ class Tether:
             stiffness: k_t [1/s^2].
             predicted: Positions [m].
         """
-        owner = level.vertex_garment.long()
-        self._weight = stiffness * density.to(level.rest)[owner] * level.vertex_area
+        self._density, self._area = density.to(level.rest)[level.vertex_garment.long()], level.vertex_area
+        self._weight = stiffness * self._density * self._area
         self._predicted = predicted
 
-    def aim(self, predicted: Float[Tensor, "vertices 3"]) -> None:
-        """Tie to other positions [m] in place."""
+    def aim(self, predicted: Float[Tensor, "vertices 3"], stiffness: float) -> None:
+        """Tie to other positions [m], as stiffly as told [1/s^2], in place."""
         self._predicted.copy_(predicted)
+        self._weight.copy_(stiffness * self._density * self._area)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
