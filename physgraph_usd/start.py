@@ -19,8 +19,8 @@ upsampled cage's and over the second, or over the third: a crumpled cage tears t
 STILL = 0.02
 """RMS motion of the cage between samples, in mean cage edges, below which a pose is held: there slow settling shows."""
 SLOWER, SLOWEST = 2.0, 2.0**8
-"""How many times as stiffly as in the frame before the tether holds cloth in a held pose, and how many times as ever once
-the cloth stays where it is: it has a third of a second to settle, and one sees what still moves after that."""
+"""In a held pose the tether holds cloth so many times as stiffly as in the frame before; where that is so many times as
+stiffly as ever, cloth stays where it is: it has a third of a second to settle, and one sees what moves after that."""
 
 
 @dataclass(frozen=True, eq=False)
