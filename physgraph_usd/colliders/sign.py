@@ -110,6 +110,8 @@ def signed_and_closest(
 
     Arguments are those of `signed_distances`.
     """
+    if least is not None and bool((least > 0.0).all()):
+        return least, None
     low, high = (torch.as_tensor(corner, dtype=x.dtype, device=x.device) for corner in surface.bounds)
     away = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
     asked = away <= reach if least is None else (away <= reach) & (least <= 0.0)

@@ -90,17 +90,19 @@ class Track:
 
     def between(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Numbers of the vertices that are between overlapping parts of a closed surface at x [m]; which are in two."""
-        moved = (x - self.at).norm(dim=1)
+        still = torch.equal(x, self.at)
+        moved = torch.zeros_like(self.known) if still else (x - self.at).norm(dim=1)
         which = torch.nonzero((self.known - moved < 0) & self.offset.isfinite()).squeeze(1)
         if not len(which) or not self.surface.closed:
             return which[:0], moved[:0] > 0
-        asked, found = x[which] + self.shift, self.inside
-        if found is None or len(found.distance) != len(which) or bool(moved.any()):
+        asked, found = x[which] + self.shift, self.inside if still else None
+        if found is None or len(found.distance) != len(which):
             found = self.surface.closest(asked, torch.full_like(asked[:, 0], float("inf")))
-        within = torch.nonzero(self._signs(which, found, asked, moved[which]) < 0).squeeze(1)
-        near = found.some(within)
-        within = within[is_between(near, self.surface.exit(asked[within], near))]
-        return which[within], self.surface.inside(asked[within], parts=2)
+        if not still:
+            within = torch.nonzero(self._signs(which, found, asked, moved[which]) < 0).squeeze(1)
+            which, asked, found = which[within], asked[within], found.some(within)
+        between = torch.nonzero(is_between(found, self.surface.exit(asked, found))).squeeze(1)
+        return which[between], self.surface.inside(asked[between], parts=2)
 
     def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
         """How far to look for the surface: what is farther away outside is known well enough by that bound."""
