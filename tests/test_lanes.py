@@ -1,5 +1,8 @@
 """Prepared launches: the number of lanes changes no bit, and no kernel is compiled for what nobody asks."""
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false
+
 from __future__ import annotations
 
 from importlib import import_module
