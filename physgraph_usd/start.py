@@ -81,7 +81,9 @@ def start_of(
     carried, plain = (edge_strain(finest, x)["p99"] for x in (detailed, base))
     if carried > min(max(WORTH * plain, LEAST_STRAIN), MOST_STRAIN):
         return Start(f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}")
-    held, slowed = slowing(kept.held, max(motion, moved / frames.edge), again=again)
+    moves = (coarse - shifted.coarse).norm(dim=1)
+    farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
+    held, slowed = slowing(kept.held, farthest, again=again)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
     return Start(why, detailed, motion < STILL, held, slowed)
 
@@ -93,7 +95,7 @@ def slowing(held: int, motion: float, *, again: bool = False) -> tuple[int, floa
 
     Args:
         held: For how many frames it had been before.
-        motion: How far cage or bodies have moved since, in mean cage edges.
+        motion: How far any point of cage or bodies has moved since, in mean cage edges.
         again: Whether this frame was counted before.
     """
     if motion >= STILL:

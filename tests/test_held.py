@@ -99,6 +99,20 @@ class TestHeldPose:
         monkeypatch.setattr(start, "slowing", never)
         assert bool((slow == solved(frames)).all())
 
+    def test_where_one_corner_moves_nothing_changes(self, monkeypatch: pytest.MonkeyPatch):
+        """However little that is of the cage."""
+
+        def bent(count: int) -> Frame:
+            whole = at(count)
+            (garment,) = whole.garments
+            points = garment.points.copy()
+            points[0] += 0.002 * count * NORMAL
+            return replace(whole, garments=(replace(garment, points=points),))
+
+        slow = solved([bent(count) for count in range(5)])
+        monkeypatch.setattr(start, "slowing", never)
+        assert bool((slow == solved([bent(count) for count in range(5)])).all())
+
     def test_where_a_body_stops_cloth_slows_down(self, monkeypatch: pytest.MonkeyPatch):
         frames = [at(count, ball_moves=0.003 * min(count, 2)) for count in range(6)]
         slow = solved(frames)
