@@ -157,9 +157,7 @@ def test_a_group_tries_what_its_settings_say(
     kept = group.solve(frames, None, at=None).carried
     group.use(replace(group._settings, contact=ContactSettings(cloth=cloth), budget_ms=budget_ms))
     tries = Tries({"warm": 120, "anew": 110, "cold": 80})
-    monkeypatch.setattr(
-        group, "_attempt", lambda _f, _at, _on, _moved, kept, *, anew=False: tries(kept, anew=anew)
-    )
+    monkeypatch.setattr(group, "_attempt", lambda _f, _at, _on, _moved, kept, *, anew=False: tries(kept, anew=anew))
     told = group.solve(frames, kept, at=None).telemetry
     assert tries.made == made
     assert told["start"] == (
