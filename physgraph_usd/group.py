@@ -95,7 +95,7 @@ class Group:
         *,
         at: float | None,
         touching: Sequence[Touching] = (),
-        moved: float = 0.0,
+        moved: float = np.inf,
     ) -> Solved:
         """Solve one frame.
 
@@ -230,7 +230,7 @@ class Group:
         return self._forces
 
     def _start(
-        self, kept: Carried | None, coarse: Tensor, world: np.ndarray, *, moved: float = 0.0, again: bool = False
+        self, kept: Carried | None, coarse: Tensor, world: np.ndarray, *, moved: float = np.inf, again: bool = False
     ) -> Start:
         """Where a frame starts."""
         kept = None if self._settings.temporal == "off" else kept

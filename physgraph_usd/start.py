@@ -17,7 +17,8 @@ WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
 STILL = 0.02
-"""RMS motion of the cage between samples, in mean cage edges, below which a pose is held: there slow settling shows."""
+"""RMS motion of the cage between samples, in mean cage edges, below which a pose is held: there slow settling shows.
+Below so much motion of the farthest point of cage and bodies, cloth slows down."""
 SLOWER, SLOWEST = 2.0, 2.0**8
 """In a held pose the tether holds cloth so many times as stiffly as in the frame before; where that is so many times as
 stiffly as ever, cloth stays where it is: it has a third of a second to settle, and one sees what moves after that."""
@@ -55,7 +56,7 @@ def start_of(
     frames: MovingFrames,
     finest: Level,
     reset: Reset,
-    moved: float = 0.0,
+    moved: float = np.inf,
     again: bool = False,
 ) -> Start:
     """Carry the last frame's detail along, unless the cage jumped or it would tear the cloth.
