@@ -13,9 +13,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "physgraph_usd"
 CODE_FOLDERS = (PACKAGE, "plugins", "samples", "tests", "benchmarks")
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".yaml", ".yml", ".json", ".usda", ".cfg", ".txt", ""}
-MAX_FILE_LINES = 400
+MAX_CLASS_LINES = 200
 MAX_BODY_LINES = 40
 MAX_POSITIONAL = 3
+LONG_CLASSES = {"MeshSurface", "ClothView", "ClothMesh", "FrameContact", "Group", "Refiner"}
+"""Classes that are longer than the rule and go with the rebuilding of contact; none may be added."""
 MACHINE_PATH = re.compile(r"(?<![\w.}])/(?:home|Users|work|farm|tmp|opt|mnt|scratch)/\w|\b[A-Z]:[\\/]+Users")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -109,10 +111,15 @@ def test_code_keeps_rule(rule: str) -> None:
     assert not complaints, "\n".join(complaints)
 
 
-def test_files_are_short() -> None:
-    lengths = {file.relative_to(ROOT): len(file.read_text(encoding="utf-8").splitlines()) for file in code_files()}
-    assert lengths
-    assert not {str(file): lines for file, lines in lengths.items() if lines >= MAX_FILE_LINES}
+def test_classes_are_short() -> None:
+    long = {
+        node.name: (node.end_lineno or 0) - node.lineno + 1
+        for file in code_files()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef) and (node.end_lineno or 0) - node.lineno + 1 >= MAX_CLASS_LINES
+    }
+    assert not {name: lines for name, lines in long.items() if name not in LONG_CLASSES}
+    assert long.keys() == LONG_CLASSES, "a class that is short now needs no exception"
 
 
 def test_no_paths_of_one_machine() -> None:
