@@ -42,6 +42,7 @@ REAL = {
     "06_torus_pull.usda": (["/shot/cloth"], ["/shot/torus"], 36),
     "08_sphere_spin_xformcollider.usdc": (["/shot/set/cloth"], ["/shot/set/rig/sphere"], 30),
     "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], ["/shot/CesiumMan"], 30),
+    "10_style3d_skirt_twist.usdc": (["/shot/skirt"], ["/shot/avatar"], 20),
 }
 """Real shots: garments, bodies and the number of the first frame here."""
 LANES = 2

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .mesh.defects import FLAT
 from .mesh.diagonals import quad_edges
-from .mesh.lengths import EdgeLengths
+from .mesh.lengths import EdgeLengths, TriangleNormals
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, smooth, subdivide_times
 from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, hinges_of
@@ -123,6 +123,14 @@ class Level:
     def lengths(self) -> EdgeLengths:
         """Gives the edges' lengths at positions [m]."""
         return EdgeLengths(self.edges, self.rest, lanes=self.lanes)
+
+    def normals(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
+        """The triangles' normals at x [m], twice their areas long [m^2]."""
+        return self._normals(x)
+
+    @cached_property
+    def _normals(self) -> TriangleNormals:
+        return TriangleNormals(self.triangles, self.rest, lanes=self.lanes)
 
     @cached_property
     def base(self) -> Stencil:

@@ -104,8 +104,9 @@ class Refiner:
         return self._groups[part]
 
     def forget(self) -> None:
-        """Start the next frame cold."""
+        """Start the next frame cold, as if it were the first."""
         self._passed.forget()
+        self._bodies.forget()
         self._last = [None] * len(self._last)
         self._time = None
 
@@ -146,6 +147,8 @@ class Refiner:
         gap = self._is_gap(frame.time)
         if gap:
             self._passed.forget()
+        if self._settings.temporal == "off":  # A frame by itself is a function of that frame alone, to the bit.
+            self._bodies.forget()
         self._bodies.pose(frame.colliders)
         count = len(frame.garments)
         asked = [True] * count if wanted is None else list(wanted)

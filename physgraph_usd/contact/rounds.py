@@ -219,7 +219,7 @@ def solve_rounds(
             level=level,
             budget=_round_of(budget, system, min(left, share) if terms else left, first=not reports),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
-            resume=going if last is not None and system.shares_metric(last) else None,
+            resume=going if last is not None and system.shares_metric(last) and not reports[-1].stiffened else None,
         )
         held = system.metric.held(kept[-1].force) if isinstance(system.metric, HeldMetric) else None
         report.remaining_move = report.remaining_move if held is None else system.remaining_move(held)

@@ -78,6 +78,15 @@ class Surface(Protocol):
         ...
 
     @property
+    def triangle_area(self) -> Float[Tensor, " triangles"]:
+        """Rest area of the triangles [m^2]."""
+        ...
+
+    def normals(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
+        """The triangles' normals at x [m], twice their areas long [m^2]."""
+        ...
+
+    @property
     def vertex_garment(self) -> Int[Tensor, " vertices"]:
         """Garment number of each vertex."""
         ...
@@ -121,6 +130,16 @@ class System:
         self._kept = free.to(spacing.dtype)  # A factor of the vectors' own type saves a conversion at each product.
         self.evaluations = 0
         self.metric_solves = 0
+
+    def with_metric(self, metric: Preconditioner) -> System:
+        """The same forces under another metric; what it counts is its own."""
+        return System(self.field, metric, free=self.free, spacing=self.spacing, level=self.level)
+
+    def counts(self, other: System) -> None:
+        """Count what was asked of another system as asked of this one."""
+        if other is not self:
+            self.evaluations += other.evaluations
+            self.metric_solves += other.metric_solves
 
     def shares_metric(self, other: System) -> bool:
         """Whether what was learned of the curvature under another system holds under this one."""
@@ -184,7 +203,8 @@ class Carry:
         energy: Energy at x [J].
         force: Force at x [N].
         preconditioned: H0^-1 F at x [m] where the integrator knows it.
-        mover: Who made the last step: the integrator's name, "halved", "quartered", "fallback" or "stayed".
+        mover: Who made the last step: the integrator's name, "truncated", "halved", "quartered", "fallback" or
+            "stayed".
         memory: The integrator's own state.
         setbacks: Corrections of the guard in a row, up to this step.
         remaining: `System.remaining_move` at x, where the integrator knows it.

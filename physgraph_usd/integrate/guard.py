@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, Integrator, System, followed, resumed
+from .collapsed import truncated
 from .quasi_newton import backtrack
 
 PATIENCE = 4
@@ -18,7 +19,8 @@ PATIENCE = 4
 class Guard:
     """Wraps any integrator; with it no result is worse than the input, whatever the integrator proposes.
 
-    A step that raises the energy is halved, then quartered, then replaced by a step along H0^-1 F with a line search.
+    A step that raises the energy is truncated where it turns triangles (`collapsed`), then halved, quartered, and
+    replaced by a step along H0^-1 F with a line search.
     From a shortened step the integrator goes on with what it has learned, if it can follow another's step. From one
     that was replaced it starts anew: what it had learned misled it. After `PATIENCE` corrections in a row the spare
     integrator, where there is one, makes the level's other steps. ``Carry.mover`` says who moved.
@@ -64,8 +66,10 @@ class Guard:
         """Where a step that raised the energy is cut back or replaced."""
         move = proposed.x - carry.x
         if bool(move.isfinite().all()):
-            for fraction, mover in ((0.5, "halved"), (0.25, "quartered")):
-                shorter = followed(self._inner, system, carry, carry.x + fraction * move)
+            cut = truncated(system, carry.x, move)
+            tries = [(0.5, "halved"), (0.25, "quartered")] if cut is None else [(1.0, "truncated"), (0.25, "quartered")]
+            for fraction, mover in tries:
+                shorter = followed(self._inner, system, carry, carry.x + fraction * (move if cut is None else cut))
                 if shorter.energy <= carry.energy:
                     return shorter.moved_by(mover)
         direction = system.apply_metric_inverse(carry.force)

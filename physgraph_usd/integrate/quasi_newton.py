@@ -20,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, System
+from .collapsed import truncated
 
 ARMIJO = 1e-4
 MAX_BACKTRACKS = 12
@@ -123,7 +124,9 @@ class _Memory:
 def backtrack(
     system: System, carry: Carry, direction: Float[Tensor, "vertices 3"], slope: float, *, by_force: bool = False
 ) -> tuple[Tensor, float, Tensor] | None:
-    """Shorten a step until the energy falls enough (Armijo), by quadratic interpolation.
+    """Shorten a step until the energy falls enough (Armijo): first where it turns triangles, then everywhere.
+
+    Everywhere by quadratic interpolation.
 
     Near rest what it falls by is lost in its rounding, but not in the force's: there, by the force, a step also serves
     that does not go past the least energy by farther than it started before it (Hager and Zhang 2005, the approximate
@@ -142,13 +145,17 @@ def backtrack(
     if not slope > 0:
         return None
     length, level = 1.0, carry.energy + torch.finfo(carry.x.dtype).eps * abs(carry.energy)
-    for _ in range(MAX_BACKTRACKS):
+    for trial in range(MAX_BACKTRACKS):
         x = carry.x + length * direction
         energy, force = system.energy_and_force(x)
         if energy <= carry.energy - ARMIJO * length * slope:
             return x, energy, force
         if by_force and energy <= level and _dot(force, direction) >= (2.0 * ARMIJO - 1.0) * slope:
             return x, energy, force
+        cut = truncated(system, carry.x, direction) if trial == 0 else None
+        if cut is not None and (less := _dot(carry.force, cut)) > 0:
+            direction, slope = cut, less
+            continue
         rise = energy - carry.energy + length * slope
         guess = 0.5 * length * slope * length / rise if rise > 0 else 0.5 * length
         length = min(max(guess, 0.1 * length), 0.5 * length)

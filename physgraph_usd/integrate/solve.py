@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..errors import SolveError
 from .base import Carry, Integrator, System, resumed
+from .collapsed import stiffened
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class LevelReport:
         stopped: "tolerance", "steps", "budget" or "stalled".
         movers: How many steps each mover made.
         energies: Energy of each term at the end [J], where the solver's caller asked for them.
+        stiffened: Whether the metric was held back where triangles had collapsed.
+        rejected: Evaluations at positions that no step took.
     """
 
     level: int
@@ -62,6 +65,8 @@ class LevelReport:
     stopped: str = "steps"
     movers: dict[str, int] = field(default_factory=dict)
     energies: dict[str, float] = field(default_factory=dict)
+    stiffened: bool = False
+    rejected: int = 0
 
 
 def solve_level(
@@ -93,9 +98,13 @@ def solve_level(
     """
     began = time.perf_counter()
     report = LevelReport(level, x.shape[0])
-    before = (system.evaluations, system.metric_solves)
+    plain, before = system, (system.evaluations, system.metric_solves)
+    system = stiffened(plain, x)
+    report.stiffened = system is not plain
     system.expected = budget.steps
-    carry = integrator.start(system, x) if resume is None else resumed(integrator, system, resume)
+    # What was learned under another metric is of no use.
+    goes_on = resume is not None and not report.stiffened
+    carry = resumed(integrator, system, resume) if goes_on else integrator.start(system, x)
     _require_finite(carry, level)
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()
@@ -105,17 +114,17 @@ def solve_level(
         stopped = _reason_to_stop(system, carry, report.steps, budget)
         if stopped:
             break
+        spent = system.evaluations
         carry = integrator.step(system, carry)
         movers[carry.mover] += 1
         report.steps += 1
+        report.rejected += system.evaluations - spent - (carry.mover != "stayed")
     _require_finite(carry, level)
     report.stopped, report.movers = stopped, dict(movers)
     report.energy_after = carry.energy
     report.remaining_move = _remaining_move(system, carry)
-    report.evaluations, report.metric_solves = (
-        system.evaluations - before[0],
-        system.metric_solves - before[1],
-    )
+    plain.counts(system)
+    report.evaluations, report.metric_solves = (plain.evaluations - before[0], plain.metric_solves - before[1])
     report.milliseconds = 1e3 * (time.perf_counter() - began)
     return carry.x, report
 

@@ -1,11 +1,13 @@
-"""Lengths of edges, by one kernel: in torch each would be gathered, subtracted and squared in passes of their own."""
+"""Lengths of edges and normals of triangles, one kernel each: torch would take many passes."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -27,13 +29,25 @@ def _lengths(
     length[e] = wp.length(x[edges[e][1]] - x[edges[e][0]])
 
 
-_LENGTHS = {
-    dtype: wp.overload(
-        _lengths,
-        [wp.int32, wp.array(dtype=wp.vec2i), wp.array(dtype=VECTOR[dtype]), wp.array(dtype=SCALAR[dtype])],
-    )
-    for dtype in VECTOR
-}
+@wp.kernel
+def _normals(
+    first: wp.int32,
+    triangles: wp.array(dtype=wp.vec3i),
+    x: wp.array(dtype=Any),
+    normal: wp.array(dtype=Any),
+):
+    t = first + wp.tid()
+    a = x[triangles[t][0]]
+    normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)
+
+
+def _overloads(kernel: wp.Kernel, corners: type, out: Mapping[torch.dtype, type]) -> dict[torch.dtype, wp.Kernel]:
+    """A kernel of (first, corners, x, out) for float32 and float64."""
+    types = {dtype: [wp.int32, wp.array(dtype=corners), wp.array(dtype=VECTOR[dtype])] for dtype in VECTOR}
+    return {dtype: wp.overload(kernel, [*given, wp.array(dtype=out[dtype])]) for dtype, given in types.items()}
+
+
+_LENGTHS, _NORMALS = _overloads(_lengths, wp.vec2i, SCALAR), _overloads(_normals, wp.vec3i, VECTOR)
 
 
 class EdgeLengths:
@@ -47,20 +61,45 @@ class EdgeLengths:
             like: Any positions, for their type and device.
             lanes: Most threads on the CPU.
         """
-        wp.init()  # Views of tensors do not start Warp by themselves.
-        self._ends = edges.contiguous()
-        self._launch = None
-        if len(edges):  # Empty tensors keep strides that Warp refuses.
-            inputs = [
-                wp.from_torch(self._ends, dtype=wp.vec2i),
-                vectors(like),
-                wp.from_torch(like.new_empty(len(edges))),
-            ]
-            self._launch = Launch(_LENGTHS[like.dtype], len(edges), inputs, device=str(like.device), lanes=lanes)
+        self._launch = _Measure(_LENGTHS, edges, like, corners=wp.vec2i, lanes=lanes)
 
     def __call__(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:
         """The lengths at x [m]."""
-        out = x.new_empty(len(self._ends))
+        return self._launch(x, x.new_empty(self._launch.count))
+
+
+class TriangleNormals:
+    """The normals of some triangles, twice their areas long, wherever their vertices are."""
+
+    def __init__(
+        self, triangles: Int[Tensor, "triangles 3"], like: Float[Tensor, "vertices 3"], *, lanes: int = 1
+    ) -> None:
+        """Prepare the launch; arguments are those of `EdgeLengths`, with corners for ends."""
+        self._launch = _Measure(_NORMALS, triangles, like, corners=wp.vec3i, lanes=lanes)
+
+    def __call__(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
+        """The normals at x [m^2]."""
+        return self._launch(x, x.new_empty(self._launch.count, 3))
+
+
+class _Measure:
+    """One kernel over elements, launched anew for other positions and another result."""
+
+    def __init__(
+        self, kernels: Mapping[torch.dtype, wp.Kernel], elements: Tensor, like: Tensor, *, corners: type, lanes: int
+    ) -> None:
+        wp.init()  # Views of tensors do not start Warp by themselves.
+        self.count, self._elements, self._launch = len(elements), elements.contiguous(), None
+        if len(elements):  # Empty tensors keep strides that Warp refuses.
+            out = like.new_empty(len(elements), *([3] if kernels is _NORMALS else []))
+            inputs = [wp.from_torch(self._elements, dtype=corners), vectors(like), _packed(out)]
+            self._launch = Launch(kernels[like.dtype], len(elements), inputs, device=str(like.device), lanes=lanes)
+
+    def __call__(self, x: Tensor, out: Tensor) -> Tensor:
         if self._launch is not None:
-            self._launch({1: vectors(x.contiguous()), 2: wp.from_torch(out)})
+            self._launch({1: vectors(x.contiguous()), 2: _packed(out)})
         return out
+
+
+def _packed(out: Tensor) -> wp.array:
+    return vectors(out) if out.ndim == 2 else wp.from_torch(out)

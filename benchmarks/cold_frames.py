@@ -1,0 +1,177 @@
+"""Whether cold frames settle, and whether the cage's triangles show in them.
+
+    python -m benchmarks.cold_frames [--count 12] [--level 2] [--steps 12] [--integrator auto] [--stiffer 3]
+        [--shot NAME] [--whole] [FOLDER]
+
+Solves frames spread over each sample and, where FOLDER holds real shots, over those, each by itself. Prints a row a
+shot: frames that did not settle (`physgraph_usd.settled`) and those that ended with no step that lowers the energy, the
+largest remaining move in tolerances, evaluations at positions that no step took over all of them, the RMS angle between
+triangles at the cage's edges over that elsewhere (median and largest; of the smooth upsampled cage in brackets), and
+the median time. With --whole each frame has a row: its energy in place of the time.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import click
+import numpy as np
+import scipy.sparse as sp
+
+import physgraph_usd.integrate.collapsed as collapsed
+from physgraph_usd.group import Group
+from physgraph_usd.level import hinge_geometry
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.samples import write_sample
+from physgraph_usd.settled import unsettled
+from physgraph_usd.shot import prepare_device
+from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.usd.reader import Shot, open_shot
+
+from .contact_shots import LANES, REAL, SAMPLES, groups_of
+
+MORE_SAMPLES = ("sleeve", "flag", "swatch")
+FREE = {"07_flag_quads_nocollider.usda": (["/shot/flag"], [])}
+"""Real shots without bodies."""
+
+
+@dataclass
+class Row:
+    """Figures of some cold frames.
+
+    Attributes:
+        open: Frames that did not settle.
+        stalled: Frames that ended with no step that lowers the energy.
+        remaining: Remaining move of each at its finest level, in tolerances.
+        evaluations: All of them.
+        rejected: Those at positions that no step took.
+        folds: Fold angle at the cage's edges over that elsewhere, of each.
+        plain: The same of the smooth upsampled cage.
+        energy: Of each frame [mJ].
+        seconds: Of each frame.
+    """
+
+    open: int = 0
+    stalled: int = 0
+    remaining: list[float] = field(default_factory=list)
+    evaluations: int = 0
+    rejected: int = 0
+    folds: list[float] = field(default_factory=list)
+    plain: list[float] = field(default_factory=list)
+    energy: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+    def told(self, name: str) -> str:
+        """As a row of the table."""
+        rejected = 100.0 * self.rejected / max(self.evaluations, 1)
+        folds = f"{np.median(self.folds):.2f} | {max(self.folds):.2f} ({max(self.plain):.2f})"
+        last = f"{np.median(self.seconds):.2f}"
+        counts = f"{len(self.folds)} | {self.open} | {self.stalled} | {max(self.remaining):.1f}"
+        return f"| {name} | {counts} | {self.evaluations} | {rejected:.1f} | {folds} | {last} |"
+
+
+@click.command()
+@click.argument("folder", required=False, type=click.Path(path_type=Path))
+@click.option("--count", default=12, show_default=True, help="Frames of each shot.")
+@click.option("--level", default=2, show_default=True)
+@click.option("--steps", default=12, show_default=True)
+@click.option("--integrator", default="auto", show_default=True)
+@click.option("--stiffer", default=collapsed.STIFFER, show_default=True, help="c of `integrate.collapsed`.")
+@click.option("--shot", "shots", multiple=True, help="Only these.")
+@click.option("--whole", is_flag=True, help="A row a frame.")
+def main(
+    folder: Path | None,
+    count: int,
+    level: int,
+    steps: int,
+    integrator: str,
+    stiffer: float,
+    shots: Sequence[str],
+    whole: bool,
+) -> None:
+    """Print the table."""
+    prepare_device("cpu")
+    collapsed.STIFFER = stiffer
+    settings = replace(RefineOptions(integrator=integrator, steps=steps).solve_settings(), temporal="off")
+    click.echo("| shot | frames | unsettled | stalled | remaining | evaluations | rejected % | folds | most | s |")
+    click.echo("|---|---|---|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as place:
+        for name in [*SAMPLES, *MORE_SAMPLES, *([*REAL, *FREE] if folder else ())]:
+            if shots and not any(each in name for each in shots):
+                continue
+            shot, short = _opened(name, Path(place), folder), Path(name).parts[0].split(".")[0]
+            times = shot.scene.times
+            picks = np.unique(np.linspace(0, len(times) - 1, min(count, len(times))).round().astype(int))
+            refiner = Refiner(shot.scene, settings, levels=[level] * len(shot.scene.garments), lanes=LANES)
+            row = Row()
+            for pick in picks:
+                own = Row() if whole else row
+                _add(own, refiner, shot, times[pick], settings)
+                if whole:
+                    click.echo(f"{own.told(f'{short} {times[pick]:g}')} {own.energy[0]:.4g} mJ |")
+            if not whole:
+                click.echo(row.told(short))
+
+
+def _opened(name: str, place: Path, folder: Path | None) -> Shot:
+    if name in (*SAMPLES, *MORE_SAMPLES):
+        return open_shot(str(write_sample(name, place)))
+    garments, colliders, *_ = (REAL | FREE)[name]
+    return open_shot(str(Path(folder or "") / name), garments=garments, colliders=colliders)
+
+
+def _add(row: Row, refiner: Refiner, shot: Shot, at: float, settings: SolveSettings) -> None:
+    """Solve one frame and take its figures."""
+    frame = shot.frame(at)
+    began = time.perf_counter()
+    state = refiner.solve(frame)
+    row.seconds.append(time.perf_counter() - began)
+    entries = groups_of(state.telemetry)
+    verdicts = [unsettled(entry, settings.tolerance) for entry in entries]
+    levels = [level for entry in entries for level in entry["levels"]]
+    row.open += any(verdicts)
+    row.stalled += any(each.stopped == "stalled" for each in verdicts if each)
+    row.remaining.append(max(entry["levels"][-1]["remaining_move"] for entry in entries) / settings.tolerance)
+    row.evaluations += sum(level["evaluations"] for level in levels)
+    row.rejected += sum(level["rejected"] for level in levels)
+    row.energy.append(1e3 * sum(sum(entry["energy_joules"]["output"].values()) for entry in entries))
+    parts = refiner.parts_of(frame)
+    solved = {part: np.concatenate([_there(state.points[index]) for index in part]) for part in parts}
+    smooth = {
+        part: refiner.group_of(part).levels[-1].smooth_from_coarse
+        @ np.concatenate([frame.garments[index].points for index in part])
+        for part in parts
+    }
+    for points, found in ((solved, row.folds), (smooth, row.plain)):
+        found.append(max(folds_on_cage(refiner.group_of(part), x) for part, x in points.items()))
+
+
+def _there(points: np.ndarray | None) -> np.ndarray:
+    assert points is not None
+    return points
+
+
+def folds_on_cage(group: Group, x: np.ndarray) -> float:
+    """RMS angle between triangles at fine edges that lie on edges of the cage, over that at all others.
+
+    Args:
+        group: The garments.
+        x: Their finest vertices [m], shape (V, 3).
+    """
+    level = group.levels[-1]
+    hinges = level.hinges.cpu().numpy()
+    support = sp.csr_matrix(level.from_coarse != 0).astype(np.int64)
+    ends = support[hinges[:, 0]] + support[hinges[:, 1]]
+    on_cage = np.diff(sp.csr_matrix(ends).indptr) <= 2
+    bent = hinge_geometry(x, hinges)[0] - level.rest_angle.double().cpu().numpy()
+    there, elsewhere = (float(np.sqrt((bent[each] ** 2).mean())) for each in (on_cage, ~on_cage))
+    return there / max(elsewhere, 1e-9)
+
+
+if __name__ == "__main__":
+    main()
