@@ -103,6 +103,7 @@ layer_options = _together(
         help="Write what was done; DIR: as a page.",
     ),
     click.option("--progress", is_flag=True, help="Say each frame in a line of its own, into files and pipes too."),
+    click.option("--strict", is_flag=True, help="Exit with 3 where a frame did not settle."),
     overwrite_option,
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )

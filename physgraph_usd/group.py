@@ -28,7 +28,7 @@ from .forces.seam import SewnForces
 from .integrate.base import Integrator, System
 from .integrate.choice import Choice, choose
 from .integrate.metric import Metric
-from .integrate.saddle import leave_saddle
+from .integrate.saddle import facets, leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .level_forces import LevelForces, blame, build_forces
@@ -295,12 +295,13 @@ class Group:
         anew = anew and predicted is not None and contact is not None and contact.crossed
         first = 0 if choice.nested or anew else last
         x = predicted if predicted is not None and not anew else self.levels[first].base.apply(coarse)
+        smooth = self.levels[first].smooth_base.apply(coarse)
         reports: list[LevelReport] = []
         module = ForceModule(())
         for index in range(first, last + 1):
             level, lasting = self.levels[index], forces[index]
-            if index > first and level.from_below is not None:
-                x = level.from_below.apply(x)
+            if index > first and level.from_below is not None and level.smooth_from_below is not None:
+                x, smooth = level.from_below.apply(x), level.smooth_from_below.apply(x)
             if index == last and anew and predicted is not None and contact is not None:
                 predicted = x = contact.mixed(predicted, x)
             module = lasting.module(coarse)
@@ -311,7 +312,13 @@ class Group:
             view = None if contact is None else contact.at(level)
             alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
             x, made, touched = self._solve_level(
-                alone, level, x=x, cold=warm is None, start=start, view=view, budget=budget
+                alone,
+                level,
+                x=x,
+                smoothing=None if warm is not None else facets(level, x, smooth),
+                start=start,
+                view=view,
+                budget=budget,
             )
             if index < last:
                 made[-1].energies = module.energies(x)
@@ -352,16 +359,20 @@ class Group:
         level: Level,
         *,
         x: Tensor,
-        cold: bool,
+        smoothing: Tensor | None,
         start: Start,
         view: LevelContact | None,
         budget: Budget,
     ) -> tuple[Tensor, list[LevelReport], tuple[Touch, ...]]:
-        """Solve one level, in rounds where something is near; returns the contact terms too."""
+        """Solve one level, in rounds where something is near; returns the contact terms too.
+
+        The smoothing is the move that takes a coarser mesh's facets out of x (`facets`), and None in a warm frame.
+        """
         integrator = self._integrator
         budget = replace(budget, steps=0) if start.rests else budget
         if view is None:
-            x = leave_saddle(alone, level, x, outward=self._outward) if cold else x
+            if smoothing is not None:
+                x = leave_saddle(alone, level, x + smoothing, outward=self._outward)
             x, report = solve_level(alone, integrator, x, level=level.index, budget=budget)
             return x, [report], ()
 
@@ -380,8 +391,8 @@ class Group:
             return solve_rounds(
                 system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, rounds=1
             )
-        given = {"finest": level is self.levels[-1], "outward": self._outward if cold else None, "still": start.still}
-        return solve_touching(system, integrator, x, view=view, level=level, **given, budget=budget)
+        given = {"finest": level is self.levels[-1], "smoothing": smoothing, "outward": self._outward}
+        return solve_touching(system, integrator, x, view=view, level=level, **given, still=start.still, budget=budget)
 
     def _telemetry(
         self, module: ForceModule, x: Tensor, coarse: Tensor, reports: list[LevelReport]

@@ -18,7 +18,7 @@ from .mesh.diagonals import quad_edges
 from .mesh.lengths import EdgeLengths, TriangleNormals
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, smooth, subdivide_times
-from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, hinges_of
+from .mesh.topology import TriangleSplit, edges_of, find_edges, hinges_of
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
@@ -66,6 +66,7 @@ class Level:
         from_coarse: Linear map from the cage, shape (V, C).
         smooth_from_coarse: Smooth map from the cage, shape (V, C).
         from_below: Linear map from the level below, None at the first level.
+        smooth_from_below: Smooth map from there, None at the first level.
         lanes: Most threads that a kernel over the level uses on the CPU.
     """
 
@@ -97,6 +98,7 @@ class Level:
     from_coarse: sp.csr_matrix
     smooth_from_coarse: sp.csr_matrix
     from_below: Stencil | None
+    smooth_from_below: Stencil | None
     lanes: int = 1
 
     @property
@@ -181,14 +183,12 @@ def build_levels(
     depth = max((len(chain) for chain in refinements), default=0)
     levels: list[Level] = []
     for index in range(depth + 1):
-        parts = [_garment_level(g, chain[:index]) for g, chain in zip(garments, refinements, strict=True)]
-        below = None
+        parts = [_garment_level(g, chain, index) for g, chain in zip(garments, refinements, strict=True)]
+        below: list[Stencil | None] = [None, None]
         if index:
-            maps = [
-                chain[index - 1].linear if index <= len(chain) else sp.identity(part.vertex_count, format="csr")
-                for chain, part in zip(refinements, parts, strict=True)
-            ]
-            below = Stencil(sp.csr_matrix(sp.block_diag(maps)), dtype=dtype, device=device, lanes=lanes)
+            maps = zip(*((part.linear_step, part.smooth_step) for part in parts), strict=True)
+            whole = [sp.csr_matrix(sp.block_diag(each)) for each in maps] or [sp.csr_matrix((0, 0))] * 2
+            below = [Stencil(each, dtype=dtype, device=device, lanes=lanes) for each in whole]
         levels.append(_join(index, parts, below, dtype=dtype, device=device, lanes=lanes))
     return tuple(levels)
 
@@ -208,17 +208,20 @@ class _GarmentLevel:
     vertex_values: dict[str, np.ndarray]
     linear: sp.csr_matrix
     smooth: sp.csr_matrix
+    linear_step: sp.csr_matrix
+    smooth_step: sp.csr_matrix
 
 
-def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLevel:
-    """Carry one garment to the level at the end of a chain of refinements."""
-    mesh: PolygonMesh = garment.mesh
-    linear = sp.identity(mesh.vertex_count, format="csr")
-    smoothing = linear
+def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
+    """Carry one garment to a level, or to the end of its chain of refinements, at which it stays."""
+    mesh, chain = garment.mesh, whole[:index]
+    linear = smoothing = linear_step = smooth_step = sp.identity(mesh.vertex_count, format="csr")
     for refinement in chain:
-        smoothing = sp.csr_matrix(smooth(mesh, refinement) @ smoothing)
-        linear = sp.csr_matrix(refinement.linear @ linear)
+        linear_step, smooth_step = refinement.linear, sp.csr_matrix(smooth(mesh, refinement))
+        smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
         mesh = refinement.mesh
+    if index > len(chain):
+        linear_step = smooth_step = sp.identity(mesh.vertex_count, format="csr")
     rest = np.asarray(linear @ np.asarray(garment.rest, dtype=np.float64))
     split = _sound(mesh.triangulate(rest if not chain else None), rest)
     triangles, hinges = split.triangles, hinges_of(split.triangles)
@@ -238,6 +241,8 @@ def _garment_level(garment: Garment, chain: Sequence[Refinement]) -> _GarmentLev
         vertex_values={name: np.asarray(linear @ getattr(garment, name).astype(np.float64)) for name in names},
         linear=linear,
         smooth=smoothing,
+        linear_step=linear_step,
+        smooth_step=smooth_step,
     )
 
 
@@ -253,7 +258,13 @@ def _sound(split: TriangleSplit, rest: np.ndarray) -> TriangleSplit:
 
 
 def _join(
-    index: int, parts: Sequence[_GarmentLevel], below: Stencil | None, *, dtype: torch.dtype, device: str, lanes: int
+    index: int,
+    parts: Sequence[_GarmentLevel],
+    below: Sequence[Stencil | None],
+    *,
+    dtype: torch.dtype,
+    device: str,
+    lanes: int,
 ) -> Level:
     """Concatenate garments into one level and measure its rest shape."""
     counts = [part.vertex_count for part in parts]
@@ -273,7 +284,8 @@ def _join(
         **{n: torch.as_tensor(np.ascontiguousarray(a, dtype=np.int32), device=device) for n, a in whole.items()},
         from_coarse=sp.csr_matrix(sp.block_diag([part.linear for part in parts])),
         smooth_from_coarse=sp.csr_matrix(sp.block_diag([part.smooth for part in parts])),
-        from_below=below,
+        from_below=below[0],
+        smooth_from_below=below[1],
         lanes=lanes,
     )
 

@@ -23,7 +23,7 @@ REPORT_NAME = "report.json"
 """Name of the report in a folder of its own."""
 SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
-_NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
+_NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root", "strict"}
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class RefineOptions:
         heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
         rest_frame: Time code whose points are the rest shape, or None.
         root: A .usda to write that lays the new layer over the shot, or None.
+        strict: Count a shot with frames that did not settle as done in part.
         progress: Called with (frames done, frames in all), or None.
     """
 
@@ -82,6 +83,7 @@ class RefineOptions:
     heat_map: bool = False
     rest_frame: float | None = None
     root: Path | None = None
+    strict: bool = False
     progress: Callable[[int, int], None] | None = None
 
     def plain(self) -> dict[str, Any]:

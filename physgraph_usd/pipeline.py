@@ -3,37 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
 import torch
 
-from .colliders.pose import Pose
 from .contact.bodies import Touching
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
-from .detail import Carried, join, split
+from .detail import join, split
 from .errors import GarmentError
 from .group import Group
+from .history import Known, bodies_moved, came_back
 from .level import refine_garments
 from .mesh.subdivide import Refinement
 from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State
 from .solve_settings import SolveSettings
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """One garment's last solved frame, what crosses in it, with whom it was solved, and the bodies it could touch."""
-
-    frame: GarmentFrame
-    points: np.ndarray
-    carried: Carried
-    crossing: np.ndarray
-    part: tuple[int, ...]
-    near: dict[int, Pose | None]
 
 
 class Refiner:
@@ -82,7 +69,8 @@ class Refiner:
         self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
         self._passed = Passed(scene.garments, scene.colliders, device=device, lanes=lanes)
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
-        self._last: list[_Known | None] = [None] * len(scene.garments)
+        self._last: list[Known | None] = [None] * len(scene.garments)
+        self._before: list[Known | None] = [None] * len(scene.garments)
         self._time: float | None = None
 
     @staticmethod
@@ -107,7 +95,7 @@ class Refiner:
         """Start the next frame cold, as if it were the first."""
         self._passed.forget()
         self._bodies.forget()
-        self._last = [None] * len(self._last)
+        self._last, self._before = [None] * len(self._last), [None] * len(self._last)
         self._time = None
 
     def use(self, settings: SolveSettings) -> None:
@@ -194,15 +182,19 @@ class Refiner:
 
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
-    ) -> tuple[list[_Known | None], list[dict[str, object]]]:
+    ) -> tuple[list[Known | None], list[dict[str, object]]]:
         """Solve garments together and keep what their next frame needs; returns that and their telemetry."""
         frames = [frame.garments[index] for index in part]
-        last = [self._last[index] for index in part]
-        kept = None if gap or any(each is None for each in last) else join([each.carried for each in last if each])
         group, near = self.group_of(part), self._near(part, frames)
+        last = [self._last[index] for index in part]
+        broken = self._broken(part, frame, near)
+        if broken is not None:
+            last = [self._before[index] for index in part]
+        known = [each for each in last if each is not None]
+        kept = None if gap or len(known) < len(part) else join([each.carried for each in known])
         while True:
             touching = self._touching(part, frames, near)
-            moved = self._moved(part, frames, near)
+            moved = self._moved(part, frame, near, known)
             solved = group.solve(frames, kept, at=frame.time, touching=touching, moved=moved)
             more = self._reached(part, frames, solved.points)
             if more <= set(near):
@@ -215,11 +207,26 @@ class Refiner:
             entry["together"] = [self._scene.garments[index].path for index in part]
         if gap:
             entry["start"] = "cold: the time between samples is too long"
-        poses = {each: self._bodies.pose_of(each) for each in near}
+        if broken is not None:
+            entry["broken_before"] = broken
         own = split(solved.carried, group.levels[0].spans, group.levels[-1].spans)
-        for index, each, xs, detail, crossing in zip(part, frames, solved.points, own, solved.crossing, strict=True):
-            self._last[index] = _Known(each, xs, detail, crossing, part, poses)
+        for place, (index, each) in enumerate(zip(part, frames, strict=True)):
+            self._before[index] = last[place]
+            self._last[index] = Known(
+                frame.time, each, frame.colliders, near, part, solved.points[place], own[place], solved.crossing[place]
+            )
         return [self._last[index] for index in part], [entry] * len(part)
+
+    def _broken(self, part: tuple[int, ...], frame: Frame, near: Sequence[int]) -> float | None:
+        """Time code of the last frame, if garments' input left its place in it alone."""
+        pairs = [(self._last[index], self._before[index]) for index in part]
+        edge = float(self.group_of(part).levels[0].spacing.mean())
+        for index, (last, before) in zip(part, pairs, strict=True):
+            if last is None or before is None or any(each is None for pair in pairs for each in pair):
+                return None
+            if came_back(last, before, frame.garments[index], frame.colliders, near=near, edge=edge):
+                return last.time
+        return None
 
     def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
         """Where a garment is inside bodies whose bounds it meets, pushed by them or not, and where cloth crosses."""
@@ -255,29 +262,24 @@ class Refiner:
                 found |= set(self._bodies.near(garment, bounds_of(solved), frame.offset))
         return found
 
-    def _same(self, part: tuple[int, ...], frame: Frame, known: Sequence[_Known | None]) -> bool:
+    def _same(self, part: tuple[int, ...], frame: Frame, known: Sequence[Known | None]) -> bool:
         """Whether garments and the bodies that they may touch are what they were, and solved together."""
         near = self._near(part, [frame.garments[index] for index in part])
         for index, each in zip(part, known, strict=True):
-            if each is None or each.part != part or not _same(frame.garments[index], each.frame):
+            if each is None or each.part != part or near != each.near or not _same(frame.garments[index], each.frame):
                 return False
-            poses = [(each.near.get(body), self._bodies.pose_of(body)) for body in near]
-            if set(near) != set(each.near) or not all(
-                a is not None and b is not None and a.equals(b) for a, b in poses
-            ):
+            poses = [(each.colliders[body], frame.colliders[body]) for body in near]
+            if not all(a is not None and b is not None and a.equals(b) for a, b in poses):
                 return False
         return True
 
-    def _moved(self, part: tuple[int, ...], frames: Sequence[GarmentFrame], near: Sequence[int]) -> float:
-        """How far any body that garments may touch has moved since their last frame [m]; infinite if more changed."""
-        farthest = 0.0
-        for index, now in zip(part, frames, strict=True):
-            last = self._last[index]
-            if last is None or last.part != part or not _set_alike(now, last.frame) or set(near) != set(last.near):
+    def _moved(self, part: tuple[int, ...], frame: Frame, near: Sequence[int], known: Sequence[Known]) -> float:
+        """How far any body that garments may touch has moved since known frames [m]; infinite if more changed."""
+        farthest = 0.0 if len(known) == len(part) else np.inf
+        for index, last in zip(part, known, strict=False):
+            if last.part != part or not _set_alike(frame.garments[index], last.frame) or set(near) != set(last.near):
                 return np.inf
-            for body in near:
-                before, after = last.near[body], self._bodies.pose_of(body)
-                farthest = max(farthest, np.inf if before is None or after is None else after.moved(before))
+            farthest = max(farthest, bodies_moved(last, frame.colliders, near))
         return farthest
 
     def _is_gap(self, time: float | None) -> bool:

@@ -23,6 +23,8 @@ class RefineReport:
         left_out: What was left out, with the reason.
         frames: Telemetry, one entry a time code.
         failed: Time codes that have no sample in the layer, with the error.
+        unsettled: Frames that were written though the solver left them unsettled: path, time and in what way.
+        strict: Whether a run with unsettled frames counts as done in part.
         warnings: What the user should know.
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB].
@@ -36,15 +38,17 @@ class RefineReport:
     left_out: dict[str, str] = field(default_factory=dict)
     frames: list[dict[str, Any]] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
+    unsettled: list[dict[str, Any]] = field(default_factory=list)
+    strict: bool = False
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float = 0.0
 
     @property
     def exit_code(self) -> int:
-        """0 done, 1 every frame failed, 3 done in part."""
+        """0 done, 1 every frame failed, 3 done in part: some failed, or where that is strict some did not settle."""
         if not self.failed:
-            return DONE
+            return IN_PART if self.unsettled and self.strict else DONE
         return FAILED if len(self.failed) == len(self.frames) else IN_PART
 
     def to_dict(self) -> dict[str, Any]:

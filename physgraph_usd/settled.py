@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import groupby
 from typing import Any
 
-FAR = 50.0
-"""Remaining moves, in tolerances, above which a frame did not settle: at the default tolerance a tenth of a fine edge,
-which shows."""
+from .integrate.solve import FAR
 
 
 @dataclass(frozen=True)
@@ -49,3 +48,42 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
         if far or (stopped == "stalled" and remaining > tolerance):
             return Unsettled(level, remaining, stopped)
     return None
+
+
+def unsettled_frames(
+    garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]], *, tolerance: float
+) -> list[dict[str, Any]]:
+    """Every frame of every garment that did not settle, garment by garment.
+
+    Args:
+        garments: Of a report: with their paths.
+        frames: Of the same report.
+        tolerance: Of the solve, in local edge lengths.
+
+    Returns:
+        Plain values: path, time and the fields of `Unsettled`.
+    """
+    return [
+        {"path": garment["path"], "time": frame["time"], **asdict(found)}
+        for index, garment in enumerate(garments)
+        for frame in frames
+        if "garments" in frame and (found := unsettled(frame["garments"][index], tolerance))
+    ]
+
+
+def told_unsettled(found: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A warning a garment: the frame that is farthest from rest, and the time codes of all others."""
+    said = []
+    for path, each in groupby(found, key=lambda entry: str(entry["path"])):
+        worst, *others = sorted(each, key=lambda entry: -entry["remaining_move"])
+        at, codes = _code(worst["time"]), ", ".join(_code(entry["time"]) for entry in others)
+        how = Unsettled(worst["level"], worst["remaining_move"], worst["stopped"])
+        said.append(
+            f"<{path}> at time code {at}: the frame did not settle: {how}; more --steps may help"
+            + (f"; nor did time code {codes}" if codes else "")
+        )
+    return said
+
+
+def _code(time: float | None) -> str:
+    return "default" if time is None else f"{time:g}"

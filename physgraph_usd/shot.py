@@ -21,11 +21,13 @@ from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
 from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
+from .history import told_broken
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .report import RefineReport
 from .resolution import choose_levels, too_coarse
+from .settled import told_unsettled, unsettled_frames
 from .usd.provenance import file_hashes, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
@@ -165,7 +167,7 @@ class _ShotSolver:
         self._opened = opened
 
     def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
-        """Solve time codes in order; one that fails yields its error and the next starts cold."""
+        """Solve time codes in order; one that fails yields its error, and the next starts from the last good one."""
         device = self._options.device
         prepare_device(device)
         shot = self._opened or _open(self._shot, self._options)
@@ -179,7 +181,6 @@ class _ShotSolver:
                 read_ms = round(1e3 * (clock.perf_counter() - began), 3)
                 state = refiner.solve(frame, sampled_at(shot, time))
             except (SolveError, StageError) as error:
-                refiner.forget()
                 yield Outcome(time, (), (), {"time": time, "error": str(error)})
                 continue
             record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
@@ -230,6 +231,10 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
         writer.close()
         report.seconds["close"] = clock.perf_counter() - start
         report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report) + _passed(report)
+        report.warnings += _broken(report)
+        report.strict = options.strict
+        report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
+        report.warnings += told_unsettled(report.unsettled)
         say_what_was(report)
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
@@ -272,6 +277,17 @@ def _passed(report: RefineReport) -> list[str]:
     for index, garment in enumerate(report.garments):
         entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
         said += told(garment["path"], {t: e["passed_through"] for t, e in entries.items() if "passed_through" in e})
+    return said
+
+
+def _broken(report: RefineReport) -> list[str]:
+    """A warning for each frame in which the input left its place for that frame alone."""
+    said = []
+    for index, garment in enumerate(report.garments):
+        entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
+        said += told_broken(
+            garment["path"], {t: e["broken_before"] for t, e in entries.items() if "broken_before" in e}
+        )
     return said
 
 

@@ -11,6 +11,8 @@ from .integrate.solve import Budget
 
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
 """Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
+EXTRA = 3
+"""Steps of the finest level of a cold frame beyond its own, over those, while it is far from rest."""
 REST = 2.0
 """Tolerances by which cloth at rest may stray before a frame that starts from it moves it."""
 
@@ -54,5 +56,6 @@ class SolveSettings:
         if self.budget_ms is not None:
             deadline = clock + 1e-3 * self.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
         if not below:
-            return Budget(more * self.steps, self.tolerance, deadline, REST if warm else 1.0)
+            rest, extra = (REST, 0) if warm else (1.0, EXTRA * more * self.steps)
+            return Budget(more * self.steps, self.tolerance, deadline, rest, extra)
         return Budget(COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance, deadline)

@@ -117,7 +117,8 @@ class Fold:
             view=self.view,
             level=self.level,
             finest=finest,
-            outward=None if warm else torch.ones(1),
+            outward=torch.ones(1),
+            smoothing=None if warm else torch.zeros_like(x),
             still=still,
             budget=Budget(steps),
         )[0]

@@ -40,10 +40,14 @@ class TestFramesThatFail:
         assert json.loads(told.read_text())["failed"].keys() == {"3"}
         assert faults(out, shot) == []
 
-    def test_the_frame_after_it_is_a_cold_start(self, tmp_path: Path):
+    def test_the_frame_after_it_starts_from_the_last_good_one(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
         report = refine(shot, tmp_path / "fine.usdc")
-        assert str(report.frames[3]["garments"][0]["start"]).startswith("cold")
+        assert report.frames[3]["garments"][0]["start"] == "warm"
+        whole = refine(cloth_shot(tmp_path / "whole.usdc"), tmp_path / "fine_whole.usdc")
+        assert whole.exit_code == 0
+        pairs = [fine(shot, tmp_path / name, 6.0) for name in ("fine.usdc", "fine_whole.usdc")]
+        assert np.abs(pairs[0] - pairs[1]).max() < 1e-3
 
     def test_several_workers_name_the_same(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})

@@ -56,7 +56,8 @@ def solve_touching(
     view: LevelContact,
     level: Level,
     finest: bool,
-    outward: Float[Tensor, " garments"] | None,
+    outward: Float[Tensor, " garments"],
+    smoothing: Float[Tensor, "vertices 3"] | None,
     still: bool = False,
     budget: Budget,
 ) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
@@ -71,24 +72,27 @@ def solve_touching(
         view: The level's view of what it may touch.
         level: The level.
         finest: Whether it is the last.
-        outward: As `leave_saddle` takes it, or None in a warm frame.
+        outward: As `leave_saddle` takes it.
+        smoothing: The move that takes a coarser mesh's facets out [m], itself taken back where it makes cloth cross;
+            None in a warm frame.
         still: Whether the pose is held in a warm frame.
         budget: When to stop.
     """
-    most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS * (outward is None)
+    most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS * (smoothing is None)
     x = view.closed(x)
-    if view.cloth is not None and level.index and (outward is not None or not view.cloth.before.crossings.count):
+    if view.cloth is not None and level.index and (smoothing is not None or not view.cloth.before.crossings.count):
         # What a coarser level or the last frame made cross; where a warm frame's input crosses too, it is drawn out.
         x = view.cloth.mend(x).x
     # From cold, where folds form, pairs in them would take more steps than there are.
-    view.look_in_folds(finest and outward is None)
+    view.look_in_folds(finest and smoothing is None)
     x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
     start = x
-    if outward is not None:
+    if smoothing is not None:
+        x = view.uncrossed(view.closed(x + smoothing), x) if level.index else x
         x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
     # Much cloth on cloth settles slowly, and in a held pose one sees it settle.
     much = finest and crowded(touched, x)
-    whole = much or (finest and still and outward is None)
+    whole = much or (finest and still and smoothing is None)
     x = view.uncrossed(x, start) if whole else x
     x, more, touched = solve_rounds(
         make_system,
@@ -98,19 +102,19 @@ def solve_touching(
         view=view,
         level=level.index,
         budget=budget,
-        rounds=view.rounds if whole or outward is not None else min(WARM_ROUNDS, view.rounds),
+        rounds=view.rounds if whole or smoothing is not None else min(WARM_ROUNDS, view.rounds),
         whole=whole,
     )
     made = made + more
     if finest:
         # From cold the rounds did not see sharp folds, which the next frame will.
-        relaxing = (much or crowded(touched, x, PILED)) and (outward is not None or view.mended or view.crosses(x))
+        relaxing = (much or crowded(touched, x, PILED)) and (smoothing is not None or view.mended or view.crosses(x))
         x, more = finish_rounds(
             make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
         )
         made += more
         if relaxing:
-            most = RELAXATIONS if outward is not None else WARM_RELAXATIONS
+            most = RELAXATIONS if smoothing is not None else WARM_RELAXATIONS
             x, more = relax(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
             made += more
     return x, made, touched
@@ -194,7 +198,8 @@ def solve_rounds(
         terms: The contact terms that ``view`` gave for x.
         view: The level's view of what it may touch.
         level: Index for the reports.
-        budget: When to stop; its steps are shared by the rounds. What first touches at the end gets a round's more.
+        budget: When to stop; its steps are shared by the rounds. What first touches at the end gets a round's more,
+            and what is far from rest then as many rounds as its extra steps make.
         rounds: How many there are; of fewer than the view's all but the first keep its pairs.
         whole: Whether each round gets all of the steps instead. In so many cloth gets far: what then crosses is taken
             back towards the round's start, so that the next one finds everything on its side.
@@ -208,18 +213,19 @@ def solve_rounds(
     reports: list[LevelReport] = []
     share, last = budget.steps if whole else -(-budget.steps // rounds), None
     left = max(budget.steps, share * rounds) if terms else budget.steps
+    extra = budget.extra if terms else 0
     kept: list[Carry] = []
     going: Carry | None = None
     while True:
-        system, start = make_system(terms, x), x
+        system, start, steps = make_system(terms, x), x, min(left, share) if terms else left
         x, report = solve_level(
             system,
             integrator,
             start,
             level=level,
-            budget=_round_of(budget, system, min(left, share) if terms else left, first=not reports),
+            budget=_round_of(budget, system, steps, first=not reports, touches=bool(terms)),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
-            resume=going if last is not None and system.shares_metric(last) and not reports[-1].stiffened else None,
+            resume=going if last is not None and system.shares_metric(last) else None,
         )
         held = system.metric.held(kept[-1].force) if isinstance(system.metric, HeldMetric) else None
         report.remaining_move = report.remaining_move if held is None else system.remaining_move(held)
@@ -228,6 +234,8 @@ def solve_rounds(
             x, going = _uncrossed(view, x, start=start, carry=going)
         reports.append(report)
         left -= report.steps
+        if left <= 0 < extra and report.steps and budget.is_far(report.remaining_move):
+            left, extra = share, extra - share
         if report.stopped == "budget" or (left <= 0 and terms):
             return x, reports, terms
         before, terms = terms, view.terms(x, keep_pairs=rounds < view.rounds)
@@ -250,10 +258,11 @@ def _uncrossed(view: LevelContact, x: Tensor, *, start: Tensor, carry: Carry) ->
     return out, None if carry.setbacks else replace(carry, x=out)
 
 
-def _round_of(budget: Budget, system: System, steps: int, *, first: bool) -> Budget:
-    """The budget of a round: what a held metric calls a small move is that much smaller."""
+def _round_of(budget: Budget, system: System, steps: int, *, first: bool, touches: bool) -> Budget:
+    """The budget of a round: what a held metric calls a small move is that much smaller; extra steps are rounds."""
     shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
-    return replace(budget, steps=steps, tolerance=shrunk * budget.tolerance, rest=budget.rest if first else 1.0)
+    rest, extra = budget.rest if first else 1.0, 0 if touches else budget.extra
+    return replace(budget, steps=steps, tolerance=shrunk * budget.tolerance, rest=rest, extra=extra)
 
 
 def finish_rounds(

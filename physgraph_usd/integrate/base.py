@@ -77,11 +77,6 @@ class Surface(Protocol):
         """Rest length of the edges [m]."""
         ...
 
-    @property
-    def triangle_area(self) -> Float[Tensor, " triangles"]:
-        """Rest area of the triangles [m^2]."""
-        ...
-
     def normals(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
         """The triangles' normals at x [m], twice their areas long [m^2]."""
         ...
@@ -110,6 +105,7 @@ class System:
         metric: H0.
         evaluations: Number of force evaluations so far.
         metric_solves: Number of metric solves so far.
+        failed: Number of those evaluations that line searches spent that found no step.
     """
 
     def __init__(
@@ -128,18 +124,12 @@ class System:
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
         self._kept = free.to(spacing.dtype)  # A factor of the vectors' own type saves a conversion at each product.
-        self.evaluations = 0
-        self.metric_solves = 0
+        self.evaluations = self.metric_solves = self.failed = 0
 
-    def with_metric(self, metric: Preconditioner) -> System:
-        """The same forces under another metric; what it counts is its own."""
-        return System(self.field, metric, free=self.free, spacing=self.spacing, level=self.level)
-
-    def counts(self, other: System) -> None:
-        """Count what was asked of another system as asked of this one."""
-        if other is not self:
-            self.evaluations += other.evaluations
-            self.metric_solves += other.metric_solves
+    @property
+    def counted(self) -> tuple[int, int, int]:
+        """Evaluations, metric solves and failed evaluations so far."""
+        return self.evaluations, self.metric_solves, self.failed
 
     def shares_metric(self, other: System) -> bool:
         """Whether what was learned of the curvature under another system holds under this one."""

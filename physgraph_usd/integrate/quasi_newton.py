@@ -159,6 +159,7 @@ def backtrack(
         rise = energy - carry.energy + length * slope
         guess = 0.5 * length * slope * length / rise if rise > 0 else 0.5 * length
         length = min(max(guess, 0.1 * length), 0.5 * length)
+    system.failed += MAX_BACKTRACKS
     return None
 
 

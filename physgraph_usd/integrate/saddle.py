@@ -1,4 +1,10 @@
-"""Leaves the saddle: flat compressed cloth has no force out of its plane, and no integrator would ever buckle it.
+"""Where a descent from a coarser mesh starts: without its facets, and off the saddle.
+
+A linear map from a coarser mesh leaves its triangles flat and its edges sharp. Bending is weak beside stretch at the
+size of an edge, so the metric hardly sees such facets and a descent ends before they are gone. A smooth map takes them
+out; only across the surface, for in its plane the linear one is right.
+
+Flat compressed cloth has no force out of its plane, and no integrator would ever buckle it.
 
 Where edges are shorter than at rest and the cloth is still flat, vertices start a little off the surface, up and down
 by a fixed pattern. The amplitude is a part of what takes the compression up: an edge of strain s does so with a slope
@@ -21,6 +27,20 @@ AMPLITUDE = 0.3
 LEAST_COMPRESSION = 1e-3
 """Compression that cloth takes in its plane."""
 TRIES = 4
+
+
+def facets(
+    level: Level, x: Float[Tensor, "vertices 3"], smooth: Float[Tensor, "vertices 3"]
+) -> Float[Tensor, "vertices 3"]:
+    """The move across the surface that takes a coarser mesh's facets out [m]; 0 where a vertex may not move.
+
+    Args:
+        level: The level.
+        x: Where a linear map put its vertices [m].
+        smooth: Where a smooth one does [m].
+    """
+    normal = _normals(level, x)
+    return ((smooth - x) * normal).sum(dim=1, keepdim=True) * normal * level.free
 
 
 def leave_saddle(
@@ -54,10 +74,7 @@ def _lacking_slope(
     level: Level, x: Float[Tensor, "vertices 3"]
 ) -> tuple[Float[Tensor, " vertices"], Float[Tensor, "vertices 3"]]:
     """How much steeper each vertex's edges would have to be, over sqrt(2), and the normals."""
-    corner = x[level.triangles.long()]
-    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = add_at(torch.zeros_like(x), level.triangles.long().T.reshape(-1), area.repeat(3, 1))
-    normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+    normal = _normals(level, x)
     ends = level.edges.long()
     span = x[ends[:, 1]] - x[ends[:, 0]]
     length = span.norm(dim=1)
@@ -70,6 +87,13 @@ def _lacking_slope(
         add_at(degree, side, torch.ones_like(length))
     degree = degree.clamp_min(1.0)
     return ((strain / degree).sqrt() - (slope / degree).sqrt()).clamp_min(0.0), normal
+
+
+def _normals(level: Level, x: Tensor) -> Float[Tensor, "vertices 3"]:
+    """Unit normals of the vertices, by the areas round them; 0 where there are none."""
+    places = level.triangles.long().T.reshape(-1)
+    normal = add_at(torch.zeros_like(x), places, level.normals(x).repeat(3, 1))
+    return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
 
 def _pattern(count: int) -> Float[Tensor, " vertices"]:

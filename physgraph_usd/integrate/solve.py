@@ -12,7 +12,10 @@ from torch import Tensor
 
 from ..errors import SolveError
 from .base import Carry, Integrator, System, resumed
-from .collapsed import stiffened
+
+FAR = 50.0
+"""Remaining moves, in tolerances, above which a level is not solved: at the default tolerance a tenth of a fine edge,
+which shows."""
 
 
 @dataclass(frozen=True)
@@ -24,12 +27,18 @@ class Budget:
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
         deadline: `time.perf_counter` value after which no step begins, or None.
         rest: Tolerances under which no step is made from the start: what rests but for a little stays where it is.
+        extra: Steps beyond those, while the remaining move is over `FAR` tolerances.
     """
 
     steps: int
     tolerance: float = 0.0
     deadline: float | None = None
     rest: float = 1.0
+    extra: int = 0
+
+    def is_far(self, remaining_move: float) -> bool:
+        """Whether so much remaining move takes extra steps; never where the tolerance is 0."""
+        return self.tolerance > 0 and not remaining_move <= FAR * self.tolerance
 
 
 @dataclass(eq=False)
@@ -49,8 +58,7 @@ class LevelReport:
         stopped: "tolerance", "steps", "budget" or "stalled".
         movers: How many steps each mover made.
         energies: Energy of each term at the end [J], where the solver's caller asked for them.
-        stiffened: Whether the metric was held back where triangles had collapsed.
-        rejected: Evaluations at positions that no step took.
+        failed: Evaluations of line searches that found no step.
     """
 
     level: int
@@ -65,8 +73,7 @@ class LevelReport:
     stopped: str = "steps"
     movers: dict[str, int] = field(default_factory=dict)
     energies: dict[str, float] = field(default_factory=dict)
-    stiffened: bool = False
-    rejected: int = 0
+    failed: int = 0
 
 
 def solve_level(
@@ -98,13 +105,9 @@ def solve_level(
     """
     began = time.perf_counter()
     report = LevelReport(level, x.shape[0])
-    plain, before = system, (system.evaluations, system.metric_solves)
-    system = stiffened(plain, x)
-    report.stiffened = system is not plain
+    before = system.counted
     system.expected = budget.steps
-    # What was learned under another metric is of no use.
-    goes_on = resume is not None and not report.stiffened
-    carry = resumed(integrator, system, resume) if goes_on else integrator.start(system, x)
+    carry = integrator.start(system, x) if resume is None else resumed(integrator, system, resume)
     _require_finite(carry, level)
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()
@@ -114,17 +117,16 @@ def solve_level(
         stopped = _reason_to_stop(system, carry, report.steps, budget)
         if stopped:
             break
-        spent = system.evaluations
         carry = integrator.step(system, carry)
         movers[carry.mover] += 1
         report.steps += 1
-        report.rejected += system.evaluations - spent - (carry.mover != "stayed")
     _require_finite(carry, level)
     report.stopped, report.movers = stopped, dict(movers)
     report.energy_after = carry.energy
     report.remaining_move = _remaining_move(system, carry)
-    plain.counts(system)
-    report.evaluations, report.metric_solves = (plain.evaluations - before[0], plain.metric_solves - before[1])
+    report.evaluations, report.metric_solves, report.failed = (
+        now - then for now, then in zip(system.counted, before, strict=True)
+    )
     report.milliseconds = 1e3 * (time.perf_counter() - began)
     return carry.x, report
 
@@ -134,7 +136,9 @@ def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) ->
         return "stalled"
     if budget.tolerance > 0 and _remaining_move(system, carry) < budget.tolerance * (1.0 if steps else budget.rest):
         return "tolerance"
-    if steps >= budget.steps:
+    if steps >= budget.steps and (
+        steps >= budget.steps + budget.extra or not budget.is_far(_remaining_move(system, carry))
+    ):
         return "steps"
     if budget.deadline is not None and time.perf_counter() >= budget.deadline:
         return "budget"

@@ -1,0 +1,155 @@
+"""What one broken frame leaves behind: how far cloth is from a run without it, in the frames that follow.
+
+    python -m benchmarks.glitches [--level 2] [--after 6] [--only NAME]
+
+A sheet of 0.6 m lies over a ball, held or with folds that travel round it. In one frame the ball is scaled or shifted,
+or the cage turned inside out, put into one point or made a hundred times its size. Prints a row a glitch: the largest
+distance of a vertex from the run without it in each frame after the broken one [mm], the energy in the last of them
+over that of the clean run, and how the frame after the broken one started.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import click
+import numpy as np
+import trimesh
+
+from physgraph_usd.colliders.pose import Collider, MeshPose
+from physgraph_usd.errors import PhysGraphError
+from physgraph_usd.fabric import PRESETS
+from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.pipeline import Refiner
+from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
+from physgraph_usd.shot import prepare_device
+
+BEFORE = 5
+"""Clean frames before the broken one."""
+SIDE, EDGE, RADIUS = 24, 0.025, 0.15
+DRIFT = np.array([1e-6, 0.0, 0.0])
+"""Of a held cage, a frame [m]: equal frames would be taken over as they are."""
+Glitch = Callable[[Frame], Frame]
+
+
+def _cage(change: Callable[[np.ndarray], np.ndarray]) -> Glitch:
+    def broken(frame: Frame) -> Frame:
+        return replace(frame, garments=tuple(replace(each, points=change(each.points)) for each in frame.garments))
+
+    return broken
+
+
+def _ball(change: Callable[[np.ndarray], np.ndarray]) -> Glitch:
+    def broken(frame: Frame) -> Frame:
+        poses = [MeshPose(change(p.points), p.triangles) for p in frame.colliders if isinstance(p, MeshPose)]
+        return replace(frame, colliders=tuple(poses))
+
+    return broken
+
+
+def _scaled(factor: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda points: points.mean(axis=0) + factor * (points - points.mean(axis=0))
+
+
+GLITCHES: dict[str, Glitch] = {
+    "ball eight times its size": _ball(_scaled(8.0)),
+    "ball four times its size": _ball(_scaled(4.0)),
+    "ball 10 cm higher": _ball(lambda points: points + np.array([0.0, 0.1, 0.0])),
+    "ball gone to one point": _ball(_scaled(0.0)),
+    "cage inside out": _cage(lambda points: points * np.array([1.0, -1.0, 1.0])),
+    "cage in one point": _cage(_scaled(0.0)),
+    "cage a hundred times its size": _cage(_scaled(100.0)),
+    "cage 10 cm aside": _cage(lambda points: points + np.array([0.1, 0.0, 0.0])),
+}
+"""What happens to the broken frame."""
+
+
+@click.command()
+@click.option("--level", default=2, show_default=True)
+@click.option("--after", default=6, show_default=True, help="Frames after the broken one.")
+@click.option("--only", "names", multiple=True, help="Only these glitches.")
+def main(level: int, after: int, names: Sequence[str]) -> None:
+    """Print the tables."""
+    prepare_device("cpu")
+    for travel, what in ((0.0, "held"), (0.03, "folds travel")):
+        clean = [*run(level, after, travel=travel)]
+        click.echo(
+            f"\n{what}: {len(clean[-1][0])} fine vertices\n\n| glitch | mm after 1, 2, ... frames | energy | start |"
+        )
+        click.echo("|---|---|---|---|")
+        for name, glitch in GLITCHES.items():
+            if names and not any(each in name for each in names):
+                continue
+            told = [*run(level, after, travel=travel, glitch=glitch)]
+            pairs = zip(told[BEFORE + 1 :], clean[BEFORE + 1 :], strict=True)
+            off = [1e3 * np.linalg.norm(a[0] - b[0], axis=1).max() for a, b in pairs]
+            energies = [sum(each[-1][1]["energy_joules"]["output"].values()) for each in (told, clean)]
+            far = ", ".join(f"{each:.2g}" for each in off)
+            click.echo(f"| {name} | {far} | {energies[0] / energies[1]:.3f} | {told[BEFORE + 1][1]['start']} |")
+
+
+def run(
+    level: int, after: int, *, travel: float, glitch: Glitch | None = None
+) -> list[tuple[np.ndarray, dict[str, Any]]]:
+    """Refine all frames in order.
+
+    Args:
+        level: Subdivisions.
+        after: Frames after the broken one.
+        travel: Angle by which folds travel in a frame [rad].
+        glitch: What breaks one frame, or None.
+
+    Returns:
+        Fine positions [m], shape (V, 3), and telemetry of each frame; where it failed those of the frame before.
+    """
+    scene, ball = _scene()
+    refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[level], lanes=2)
+    told: list[tuple[np.ndarray, dict[str, Any]]] = []
+    for index in range(BEFORE + 1 + after):
+        points = _draped(travel * index) + index * DRIFT
+        frame = Frame(float(index), (GarmentFrame(points, PRESETS["jersey"]),), (ball,))
+        frame = glitch(frame) if glitch is not None and index == BEFORE else frame
+        try:
+            state = refiner.solve(frame)
+        except PhysGraphError:
+            refiner.forget()
+            told.append(told[-1])
+            continue
+        assert state.points[0] is not None
+        told.append((state.points[0], dict(state.telemetry[0])))
+    return told
+
+
+def _scene() -> tuple[Scene, MeshPose]:
+    """A square sheet that feels one ball."""
+    ids = np.arange((SIDE + 1) ** 2).reshape(SIDE + 1, SIDE + 1)
+    quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
+    one = np.ones(ids.size)
+    mesh = PolygonMesh(np.full(len(quads), 4), quads.ravel(), ids.size)
+    garment = Garment("/Sheet", mesh, _flat(), 2, False, False, one, one, one, one, 0.0 * one, colliders=(0,))
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    pose = MeshPose(np.asarray(sphere.vertices) - np.array([0.0, RADIUS, 0.0]), np.asarray(sphere.faces, np.int32))
+    return Scene((garment,), np.array([0.0, -9.81, 0.0]), (), (Collider("/Ball", "mesh"),)), pose
+
+
+def _flat() -> np.ndarray:
+    axis = EDGE * (np.arange(SIDE + 1) - 0.5 * SIDE)
+    x, z = np.meshgrid(axis, axis)
+    return np.stack([x, 0.0 * x, -z], axis=-1).reshape(-1, 3)
+
+
+def _draped(phase: float) -> np.ndarray:
+    """The sheet bent over the ball and flared with folds outside it, turned by a phase [rad]."""
+    flat, rim = _flat(), 1.2 * RADIUS
+    radius, angle = np.hypot(flat[:, 0], flat[:, 2]), np.arctan2(flat[:, 2], flat[:, 0])
+    bend, beyond = np.minimum(radius / RADIUS, 1.2), np.maximum(radius - rim, 0.0)
+    out = RADIUS * np.sin(bend) + 0.3 * beyond * (1.0 + 0.2 * np.cos(9 * (angle - phase)))
+    down = RADIUS * (np.cos(bend) - 1.0) - 0.9 * beyond
+    return np.stack([out * np.cos(angle), down + 0.002, out * np.sin(angle)], axis=1)
+
+
+if __name__ == "__main__":
+    main()

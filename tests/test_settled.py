@@ -1,0 +1,66 @@
+"""Frames that the solver leaves unsettled: each is told of, and with --strict the run counts as done in part."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from shots import CLOTH, cloth_shot, command, refine
+
+from physgraph_usd.settled import unsettled
+
+
+def told(level: int, remaining: float, stopped: str = "steps") -> dict[str, Any]:
+    return {"level": level, "remaining_move": remaining, "stopped": stopped}
+
+
+class TestVerdict:
+    def test_the_finest_level_far_from_rest(self):
+        found = unsettled({"levels": [told(0, 0.0), told(1, 0.37)]}, 2e-3)
+        assert found is not None
+        assert "level 1 would still move by 0.37 edges" in str(found)
+        assert unsettled({"levels": [told(0, 0.37), told(1, 0.09)]}, 2e-3) is None
+
+    def test_a_level_that_no_step_lowers(self):
+        assert unsettled({"levels": [told(0, 0.01, "stalled"), told(1, 1e-3, "tolerance")]}, 2e-3)
+        assert unsettled({"levels": [told(0, 1e-3, "stalled"), told(1, 1e-3, "tolerance")]}, 2e-3) is None
+
+    def test_only_the_last_descent_of_a_level_counts(self):
+        assert unsettled({"levels": [told(1, 0.5, "stalled"), told(1, 1e-3, "tolerance")]}, 2e-3) is None
+
+    def test_not_a_number_is_not_at_rest(self):
+        assert unsettled({"levels": [told(1, float("nan"))]}, 2e-3)
+
+    def test_frames_that_were_taken_over(self):
+        assert unsettled({"start": "reused"}, 2e-3) is None
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    """One frame crumples the sheet to a tenth of its size."""
+    return cloth_shot(tmp_path / "shot.usdc", broken={3.0: 0.1})
+
+
+def test_a_warning_names_prim_time_code_and_figure(shot: Path, tmp_path: Path):
+    report = refine(shot, tmp_path / "fine.usdc", steps=0)
+    assert {entry["path"] for entry in report.unsettled} == {CLOTH}
+    warning = next(each for each in report.warnings if "did not settle" in each)
+    worst = max(report.unsettled, key=lambda entry: entry["remaining_move"])
+    assert warning.startswith(f"<{CLOTH}> at time code {worst['time']:g}")
+    assert f"{worst['remaining_move']:.2g} edges" in warning
+    assert report.exit_code == 0
+
+
+def test_a_frame_that_settles_is_not_told_of(shot: Path, tmp_path: Path):
+    report = refine(shot, tmp_path / "fine.usdc", steps=96)
+    assert report.unsettled == []
+    assert not [each for each in report.warnings if "settle" in each]
+
+
+@pytest.mark.parametrize(("steps", "code"), [(0, 3), (96, 0)])
+def test_strict_counts_in_the_exit_code(shot: Path, tmp_path: Path, steps: int, code: int):
+    out = tmp_path / "fine.usdc"
+    done = command("refine", shot, "-o", out, "--level", 1, "--steps", steps, "--strict")
+    assert (done.returncode, out.is_file()) == (code, True)
+    assert ("did not settle" in done.stderr) == (code == 3)
