@@ -23,7 +23,6 @@ import click
 import numpy as np
 
 from physgraph_usd.group import Group
-from physgraph_usd.integrate import collapsed
 from physgraph_usd.level import hinge_geometry
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, Integrator, System, followed, resumed
-from .collapsed import truncated
 from .quasi_newton import backtrack
+from .truncation import truncated
 
 PATIENCE = 4
 """Corrections in a row after which an integrator gives way to its spare."""
@@ -19,7 +19,7 @@ PATIENCE = 4
 class Guard:
     """Wraps any integrator; with it no result is worse than the input, whatever the integrator proposes.
 
-    A step that raises the energy is truncated where it turns triangles (`collapsed`), then halved, quartered, and
+    A step that raises the energy is truncated where it turns triangles (`truncation`), then halved, quartered, and
     replaced by a step along H0^-1 F with a line search.
     From a shortened step the integrator goes on with what it has learned, if it can follow another's step. From one
     that was replaced it starts anew: what it had learned misled it. After `PATIENCE` corrections in a row the spare

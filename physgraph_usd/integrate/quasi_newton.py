@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, System
-from .collapsed import truncated
+from .truncation import truncated
 
 ARMIJO = 1e-4
 MAX_BACKTRACKS = 12

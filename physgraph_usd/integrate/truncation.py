@@ -17,7 +17,7 @@ from torch import Tensor
 from .base import System
 
 TURN = math.cos(math.radians(45.0))
-"""Cosine of the angle by which a triangle's normal may turn in a step that failed: the angle between two neighbours then
+"""Cosine of the angle by which a triangle may turn in a step that failed: the angle between two neighbours then
 changes by a quarter turn at most, so that none is turned over."""
 CUTS = 8
 """Most times that a vertex's move is halved; what is left of it then is under half a percent."""
