@@ -79,11 +79,16 @@ class ColliderReader:
         if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
             return None, (self._out(time, "its points and faces do not fit together"),)
         flip = self.collider.side in FIXED and is_flipped(self.prim, matrix)
-        triangles = self._triangles(points, counts, indices, flip=flip)
+        first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
+        split_at = first if first.shape == points.shape else points
+        triangles = self._triangles(split_at, counts, indices, flip=flip)
         return MeshPose(place(points.astype(np.float64), matrix), triangles), ()
 
     def _triangles(self, points: np.ndarray, counts: np.ndarray, indices: np.ndarray, *, flip: bool) -> np.ndarray:
-        """Triangles of the faces; the same array as last time while the topology is the same."""
+        """Triangles of the faces; the same array as last time while the topology is the same.
+
+        Quads are split as they lie in the collider's first sample, whichever frame is read first.
+        """
         known = self._topology
         if known is None or not known.equals(counts, indices, flip):
             triangles = PolygonMesh(counts, indices, len(points)).triangulate(np.nan_to_num(points)).triangles
