@@ -58,6 +58,12 @@ def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
     return dict(record) if isinstance(record, Mapping) else None
 
 
+def recorded_shot(layer: Sdf.Layer) -> str | None:
+    """The shot that a layer's record names, seen from where the layer is; None where it names none."""
+    named = (read_record(layer) or {}).get("shot")
+    return layer.ComputeAbsolutePath(str(named)) if named else None
+
+
 def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
     """Layers of a stage that hold refined garments: mute them to find the coarse shot below."""
     found = (layer for layer in stage.GetUsedLayers() if (read_record(layer) or {}).get("garments"))

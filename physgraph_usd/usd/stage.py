@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
@@ -209,6 +210,21 @@ def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
         delegate.TakeUncoalescedDiagnostics()
 
 
+def is_there(path: str | Path) -> bool:
+    """Whether the resolver of assets finds a file."""
+    return bool(Ar.GetResolver().Resolve(str(path)))
+
+
+def check_there(path: str | Path, kind: type[PhysGraphError] = StageError) -> None:
+    """Refuse a file that is not there; what USD says of one tells neither what nor where.
+
+    Raises:
+        PhysGraphError: Of that kind.
+    """
+    if not is_there(path):
+        raise kind(f"no such file: {path}")
+
+
 def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     """Open a stage with all payloads, for reading.
 
@@ -221,6 +237,7 @@ def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     Raises:
         StageError: When the file or a layer that it needs cannot be read, or references run in a circle.
     """
+    check_there(path)
     with pxr_errors(f"cannot open {path}"), quiet() as diagnostics:
         stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
         if not stage:
