@@ -154,12 +154,16 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 @scene_options
 @json_option
 def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
-    """Print what would be refined, with what, from where, and every defect found in SHOT."""
+    """Print what would be refined, with what, from where, and every defect found in SHOT.
+
+    Exits with 1 when SHOT cannot be refined as asked.
+    """
     from .shot import inspect_shot
 
     given = {name: value for name, value in options.items() if value is not None}
     found = inspect_shot(shot, **given)
     click.echo(json.dumps(found, indent=2) if as_json else "\n".join(_outline(found)))
+    sys.exit(FAILED if "problem" in found else DONE)
 
 
 @main.command()

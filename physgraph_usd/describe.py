@@ -156,7 +156,7 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     modelled = {
         **_in_plane(report),
         "bending": f"dihedral angles, {angles}",
-        "gravity": f"{np.linalg.norm(opened.scene.gravity):.3g} m/s^2",
+        "gravity": _pull(opened.scene.gravity),
         "guide": "ties the local average to the coarse animation",
     }
     if _touching(opened) and options.contact != "off":
@@ -168,6 +168,18 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
+
+
+def _pull(gravity: np.ndarray) -> str:
+    """Strength and direction of gravity [m/s^2], shape (3,), by axis where it follows one."""
+    strength = float(np.linalg.norm(gravity))
+    if not strength:
+        return "0 m/s^2"
+    direction = gravity / strength
+    axis = int(np.abs(direction).argmax())
+    if np.abs(np.delete(direction, axis)).max() < 1e-6:
+        return f"{strength:.3g} m/s^2 towards {'-' if direction[axis] < 0 else '+'}{'XYZ'[axis]}"
+    return f"{strength:.3g} m/s^2 towards ({', '.join(f'{part:.3g}' for part in direction)})"
 
 
 def _in_plane(report: RefineReport) -> dict[str, str]:
