@@ -34,7 +34,8 @@ class Property:
         schema: API schema that has it.
         name: Full attribute name.
         type: Sdf type name; "rel" is a relationship.
-        fallback: Value when nothing authors it; None when that means something else, told in ``doc``.
+        fallback: Value that refining takes where nothing gives one; None when that means something else, told in
+            ``doc``. The schema files have none: an ancestor, a material or ``--set`` may give what the prim does not.
         unit: SI unit, "" when it has none.
         minimum: Least value allowed, or None.
         maximum: Greatest value allowed, or None.
@@ -63,7 +64,7 @@ class Property:
 
 
 def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
-    """Rows of the fabric values; a material has no fallbacks, so that only what it authors counts."""
+    """Rows of the fabric values; what a material leaves out is the garment's to take from elsewhere."""
 
     def row(name: str, fallback: float | None, unit: str, minimum: float, doc: str) -> Property:
         return Property(
