@@ -40,6 +40,7 @@ from .stage import (
     root_metadata,
 )
 from .times import merge, snap, within
+from .unread import unread
 
 
 class Shot:
@@ -179,6 +180,7 @@ def open_shot(
         found = find_colliders(stage, prims, colliders)
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
+        notices += unread([*prims, *found])
         units, odd = read_units(stage)
         assumed = root_metadata(stage, "metersPerUnit") is None
         prims = [
