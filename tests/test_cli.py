@@ -94,6 +94,23 @@ class TestRefine:
         assert root.is_file()
         assert run("validate", out, "--shot", sample("swatch")).exit_code == 0
 
+    @pytest.mark.parametrize(("paths", "code"), [("relative", 1), ("absolute", 0)])
+    def test_a_moved_layer_finds_its_shot_by_absolute_paths(
+        self, sample: Sample, tmp_path: Path, paths: str, code: int
+    ) -> None:
+        written, moved = tmp_path / "written", tmp_path / "some" / "where" / "else"
+        written.mkdir()
+        out, root = written / "fine.usdc", written / "fine.usda"
+        args = ("--asset-paths", paths, "--root", root, *SMALL)
+        assert run("refine", sample("swatch"), "-o", out, *args).exit_code == 0
+        assert run("validate", out).exit_code == 0
+        moved.parent.mkdir(parents=True)
+        written.rename(moved)
+        result = run("validate", moved / "fine.usdc")
+        assert result.exit_code == code
+        assert ("the shot that its record names is not at" in result.stdout) == bool(code)
+        assert str(sample("swatch")) in (moved / "fine.usda").read_text() if paths == "absolute" else True
+
     def test_quiet_when_not_a_terminal(self, sample: Sample, tmp_path: Path) -> None:
         result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", *SMALL)
         assert "%" not in result.stderr

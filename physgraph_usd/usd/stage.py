@@ -64,6 +64,8 @@ class GarmentSource:
         sources: Which source won, by short name of the value.
         animated: Short names of the values whose source has time samples.
         apart_from: What it never touches though it would, by path: colliders and garments, and what says so.
+        left_out: Its own authored times outside the range, where the layer holds it still.
+        velocities: Whether the shot has velocities for it.
     """
 
     path: Sdf.Path
@@ -74,6 +76,15 @@ class GarmentSource:
     sources: dict[str, str]
     animated: frozenset[str] = field(default=frozenset())
     apart_from: dict[str, str] = field(default_factory=dict)
+    left_out: tuple[float, ...] = ()
+    velocities: bool = False
+
+    @property
+    def left_out_said(self) -> str:
+        """How many of its samples are outside the range, and where; "" when none is."""
+        before, after = ([f"{t:g}" for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
+        spans = " and ".join(" to ".join(dict.fromkeys([span[0], span[-1]])) for span in (before, after) if span)
+        return f"{len(self.left_out)} of {len(self.left_out) + len(self.times)} samples, {spans}" if spans else ""
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ from . import layer_rules
 from .provenance import read_record, recorded_shot, root_over
 from .rules import RULES, Fine, Problem, subsets
 from .stage import check_there, is_there, pxr_errors, reason_of
+from .variants import same_variants
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
 _COUNTS = "InvalidSubsetFamily"
@@ -61,7 +62,7 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
     """
     problems = [
         replace(problem, rule=rule.__name__)
-        for rule in (layer_rules.record, layer_rules.time_scale, layer_rules.self_contained)
+        for rule in (layer_rules.record, layer_rules.time_scale, layer_rules.whole_range, layer_rules.self_contained)
         for problem in rule(layer)
     ]
     if shot is None:
@@ -69,6 +70,7 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
     paths = _garments(layer)
     # Only the garments are composed: a set around them may be large.
     mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
+    problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
     composed = Usd.Stage.OpenMasked(root_over(shot, [layer.identifier, shot.identifier]), mask)
     alone = Usd.Stage.OpenMasked(shot, mask)
     problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
