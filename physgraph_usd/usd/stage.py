@@ -222,8 +222,8 @@ def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
 
 
 def is_there(path: str | Path) -> bool:
-    """Whether the resolver of assets finds a file."""
-    return bool(Ar.GetResolver().Resolve(str(path)))
+    """Whether the resolver of assets finds a file; layers in memory are there."""
+    return Sdf.Layer.IsAnonymousLayerIdentifier(str(path)) or bool(Ar.GetResolver().Resolve(str(path)))
 
 
 def check_there(path: str | Path, kind: type[PhysGraphError] = StageError) -> None:
