@@ -91,11 +91,15 @@ solve_options = _together(
     click.option("--temporal", type=click.Choice(["tether", "warm", "off"]), help="How a frame uses the last one."),
     click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes that share the frames."),
 )
+asset_paths_option = click.option(
+    "--asset-paths", type=click.Choice(["relative", "absolute"]), help="How files written name other files."
+)
 layer_options = _together(
     click.option("--mode", type=click.Choice(["over", "sibling"]), help="Refine in place, or beside the coarse mesh."),
-    click.option("--velocities", is_flag=True, help="Also write point velocities."),
+    click.option("--velocities", is_flag=True, help="Write point velocities even where the shot has none."),
     click.option("--heat-map", is_flag=True, help="Also write depth inside bodies and crossings as primvars."),
     click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),
+    asset_paths_option,
     click.option(
         "--report",
         type=click.Path(path_type=Path),
@@ -154,12 +158,16 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 @scene_options
 @json_option
 def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
-    """Print what would be refined, with what, from where, and every defect found in SHOT."""
+    """Print what would be refined, with what, from where, and every defect found in SHOT.
+
+    Exits with 1 when SHOT cannot be refined as asked.
+    """
     from .shot import inspect_shot
 
     given = {name: value for name, value in options.items() if value is not None}
     found = inspect_shot(shot, **given)
     click.echo(json.dumps(found, indent=2) if as_json else "\n".join(_outline(found)))
+    sys.exit(FAILED if "problem" in found else DONE)
 
 
 @main.command()
@@ -170,12 +178,14 @@ def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
 @click.option("--preset", metavar="FABRIC", help="Fabric of the garments, such as denim; see docs/fabrics.md.")
 @click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
 @click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
+@asset_paths_option
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
     """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
     from .usd.tag import tag as tag_shot
 
-    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **options))
+    given = {name: value for name, value in options.items() if value is not None}
+    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **given))
 
 
 @main.command()

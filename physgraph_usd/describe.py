@@ -35,9 +35,16 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
     report = RefineReport(opened.path, None, options.plain())
     first = _first_frame(opened)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
-    report.garments = [_garment(*part) | {"colliders": _felt(opened, part[0])} for part in parts]
+    written = "--velocities" if options.velocities else "none"
+    report.garments = [
+        _garment(*part)
+        | {"colliders": _felt(opened, part[0])}
+        | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
+        for part in parts
+    ]
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
+    report.variants = list(opened.selections)
     report.warnings = [str(notice) for notice in opened.warnings]
     return report
 
@@ -79,6 +86,7 @@ def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOption
         "colliders": list(opened.colliders),
         "modelled": report.modelled,
         "left_out": report.left_out,
+        "variants": report.variants,
         "defects": {
             garment.path: [defect.message for defect in defects(garment.mesh, garment.rest)]
             for garment in opened.scene.garments
@@ -137,6 +145,7 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "faces": len(garment.mesh.counts),
         "size_m": [round(float(length), 4) for length in size],
         "samples": len(source.times),
+        "samples_left_out": len(source.left_out),
         "level": choice.level,
         "level_reason": choice.reason,
         "fine_edge_mm": round(1e3 * choice.edge, 2),
@@ -156,7 +165,7 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     modelled = {
         **_in_plane(report),
         "bending": f"dihedral angles, {angles}",
-        "gravity": f"{np.linalg.norm(opened.scene.gravity):.3g} m/s^2",
+        "gravity": _pull(opened.scene.gravity),
         "guide": "ties the local average to the coarse animation",
     }
     if _touching(opened) and options.contact != "off":
@@ -168,6 +177,18 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
+
+
+def _pull(gravity: np.ndarray) -> str:
+    """Strength and direction of gravity [m/s^2], shape (3,), by axis where it follows one."""
+    strength = float(np.linalg.norm(gravity))
+    if not strength:
+        return "0 m/s^2"
+    direction = gravity / strength
+    axis = int(np.abs(direction).argmax())
+    if np.abs(np.delete(direction, axis)).max() < 1e-6:
+        return f"{strength:.3g} m/s^2 towards {'-' if direction[axis] < 0 else '+'}{'XYZ'[axis]}"
+    return f"{strength:.3g} m/s^2 towards ({', '.join(f'{part:.3g}' for part in direction)})"
 
 
 def _in_plane(report: RefineReport) -> dict[str, str]:
@@ -205,6 +226,9 @@ def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
         "friction": "out of scope: shapes at rest under pressure alone; the guide and the tether hold cloth in place",
     }
+    held = [f"{source.path}: {source.left_out_said}" for source in opened.sources if source.left_out]
+    if held:
+        left_out["samples"] = f"outside the frame range, where the layer holds the cloth still: {'; '.join(held)}"
     if "self contact" not in report.modelled:
         left_out["self contact"] = "switched off by --self-contact"
     if "contact" not in report.modelled:

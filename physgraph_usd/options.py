@@ -13,6 +13,7 @@ from .errors import UsageError
 from .integrate import method_named
 from .integrate.weights import weights_hash
 from .solve_settings import SolveSettings
+from .usd.atomic import ASSET_PATHS
 
 TEMPORAL = ("tether", "warm", "off")
 POTENTIALS = ("continuum", "paper")
@@ -23,7 +24,7 @@ REPORT_NAME = "report.json"
 """Name of the report in a folder of its own."""
 SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
-_NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root"}
+_NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root", "asset_paths"}
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,11 @@ class RefineOptions:
         report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
-        velocities: Also write point velocities.
+        velocities: Also write point velocities of garments that have none in the shot.
         heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
         rest_frame: Time code whose points are the rest shape, or None.
         root: A .usda to write that lays the new layer over the shot, or None.
+        asset_paths: "relative" or "absolute": how the layer and the root name other files.
         progress: Called with (frames done, frames in all), or None.
     """
 
@@ -82,6 +84,7 @@ class RefineOptions:
     heat_map: bool = False
     rest_frame: float | None = None
     root: Path | None = None
+    asset_paths: str = "relative"
     progress: Callable[[int, int], None] | None = None
 
     def plain(self) -> dict[str, Any]:
@@ -125,6 +128,7 @@ class RefineOptions:
             ("mode", self.mode, MODES),
             ("contact", self.contact, tuple(CONTACTS)),
             ("self contact", self.self_contact, tuple(SELF_CONTACTS)),
+            ("asset paths", self.asset_paths, ASSET_PATHS),
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")

@@ -23,6 +23,7 @@ class RefineReport:
         left_out: What was left out, with the reason.
         frames: Telemetry, one entry a time code.
         failed: Time codes that have no sample in the layer, with the error.
+        variants: Variant selections in force on what the garments depend on, as paths ``/World/coat{fit=loose}``.
         warnings: What the user should know.
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB].
@@ -36,6 +37,7 @@ class RefineReport:
     left_out: dict[str, str] = field(default_factory=dict)
     frames: list[dict[str, Any]] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
+    variants: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float = 0.0

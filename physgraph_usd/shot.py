@@ -26,7 +26,7 @@ from .page.report import write_folder
 from .pipeline import Refiner
 from .report import RefineReport
 from .resolution import choose_levels, too_coarse
-from .usd.provenance import file_hashes, write_root
+from .usd.provenance import asset_path, file_hashes, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
 
@@ -71,7 +71,8 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         report.peak_memory_mb = _peak_memory_mb()
         report.out = out
         if options.root is not None:
-            write_root(Path(options.root), layer=out, shot=Path(shot), overwrite=options.overwrite)
+            files = {"layer": out, "shot": Path(shot), "absolute": options.asset_paths == "absolute"}
+            write_root(Path(options.root), **files, overwrite=options.overwrite)
         if options.report is not None:
             _write_report(report, Path(options.report), opened)
     finally:
@@ -276,8 +277,13 @@ def _passed(report: RefineReport) -> list[str]:
 
 
 def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:
-    inputs = file_hashes(opened.stage, out.resolve().parent)
-    return {"version": __version__, "options": options.plain(), "inputs": inputs}
+    folder, absolute = out.resolve().parent, options.asset_paths == "absolute"
+    return {
+        "version": __version__,
+        "options": options.plain(),
+        "shot": asset_path(opened.path, folder, absolute=absolute),
+        "inputs": file_hashes(opened.stage, folder, absolute=absolute),
+    }
 
 
 def _peak_memory_mb() -> float:

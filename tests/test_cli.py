@@ -94,6 +94,23 @@ class TestRefine:
         assert root.is_file()
         assert run("validate", out, "--shot", sample("swatch")).exit_code == 0
 
+    @pytest.mark.parametrize(("paths", "code"), [("relative", 1), ("absolute", 0)])
+    def test_a_moved_layer_finds_its_shot_by_absolute_paths(
+        self, sample: Sample, tmp_path: Path, paths: str, code: int
+    ) -> None:
+        written, moved = tmp_path / "written", tmp_path / "some" / "where" / "else"
+        written.mkdir()
+        out, root = written / "fine.usdc", written / "fine.usda"
+        args = ("--asset-paths", paths, "--root", root, *SMALL)
+        assert run("refine", sample("swatch"), "-o", out, *args).exit_code == 0
+        assert run("validate", out).exit_code == 0
+        moved.parent.mkdir(parents=True)
+        written.rename(moved)
+        result = run("validate", moved / "fine.usdc")
+        assert result.exit_code == code
+        assert ("the shot that its record names is not at" in result.stdout) == bool(code)
+        assert str(sample("swatch")) in (moved / "fine.usda").read_text() if paths == "absolute" else True
+
     def test_quiet_when_not_a_terminal(self, sample: Sample, tmp_path: Path) -> None:
         result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", *SMALL)
         assert "%" not in result.stderr
@@ -208,15 +225,15 @@ class TestErrors:
         assert (result.exit_code, result.stdout) == (2, "")
         assert "rror: " in result.stderr
 
-    @pytest.mark.parametrize("command", ["refine", "inspect", "tag", "validate", "preview"])
+    @pytest.mark.parametrize("command", ["refine", "inspect", "tag", "validate", "preview", "chart"])
     def test_missing_file_is_1(self, command: str, tmp_path: Path) -> None:
         out = {"inspect": (), "validate": (), "preview": ("-o", tmp_path / "x.png")}.get(
             command, ("-o", tmp_path / "x.usdc")
         )
         garment = ("--garment", "/A") if command == "tag" else ()
         result = run(command, tmp_path / "missing.usda", *out, *garment)
-        assert result.exit_code == 1
-        assert "missing.usda" in result.stderr + result.stdout
+        assert (result.exit_code, result.stdout) == (1, "")
+        assert result.stderr == f"error: no such file: {tmp_path / 'missing.usda'}\n"
         assert not list(tmp_path.iterdir())
 
     def test_done_in_part_is_3(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -244,6 +261,17 @@ class TestOtherCommands:
         assert json.loads(data.stdout)
         assert "swatch" in text.stdout
         assert "times: 1, 2, 3, ..., 24 (24 in all)" in text.stdout
+
+    def test_inspect_of_what_cannot_be_refined_is_1(self, sample: Sample) -> None:
+        result = run("inspect", sample("swatch"), "--garment", "/trousers", "--json")
+        assert result.exit_code == 1
+        found = json.loads(result.stdout)
+        assert "no prim at </trousers>" in found["problem"]
+        assert found["meshes"]
+
+    @pytest.mark.parametrize(("name", "down"), [("swatch", "-Y"), ("swatch_zup", "-Z")])
+    def test_inspect_says_where_gravity_pulls(self, sample: Sample, name: str, down: str) -> None:
+        assert f"gravity: 9.81 m/s^2 towards {down}\n" in run("inspect", sample(name)).stdout
 
     def test_tag_then_refine(self, sample: Sample, tmp_path: Path) -> None:
         found = json.loads(run("inspect", sample("swatch"), "--json").stdout)

@@ -60,7 +60,6 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
     parse_peers(options.peers)
     prepare_device(options.device)
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     opened = open_shot(
         str(shot),
         garments=options.garments,
@@ -71,6 +70,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
         rest_frame=options.rest_frame,
     )
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         journal = _measure(opened, folder, options)
     finally:
         opened.close()

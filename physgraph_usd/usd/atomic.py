@@ -17,6 +17,9 @@ from types import FrameType
 
 from ..errors import LayerError, UsageError
 
+ASSET_PATHS = ("relative", "absolute")
+"""How one file may name another: from its own folder, or from the root of the file system."""
+
 
 def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
     """Name a temporary file beside its target.

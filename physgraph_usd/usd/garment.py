@@ -127,13 +127,20 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         **_painted(prim, points.count, notices),
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
-    skinned = prim.GetPath() in request.bake.skinned
     named = {"contact:selfCollision": own_source, "contact:layer": layer_source, "rest": rest.source}
     named |= values.sources | {"refine:level": level_source}
-    place_on_stage = (prim.GetPath(), cage.kept_faces, skinned, tuple(roots), times)
-    return GarmentReader(
-        garment, GarmentSource(*place_on_stage, named, values.animated), values, points, edges, notices
+    source = GarmentSource(
+        path=prim.GetPath(),
+        kept_faces=cage.kept_faces,
+        skinned=prim.GetPath() in request.bake.skinned,
+        instance_roots=tuple(roots),
+        times=times,
+        sources=named,
+        animated=values.animated,
+        left_out=tuple(time for time in every if time not in times),
+        velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
     )
+    return GarmentReader(garment, source, values, points, edges, notices + _range_notices(source))
 
 
 def _rest_at(prim: Usd.Prim, points: PointReader, request: Request, *, edges: np.ndarray, start: np.ndarray) -> Rest:
@@ -182,6 +189,12 @@ def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, Any
         arrays[name], odd = read_painted(prim, short, count)
         notices.extend(odd)
     return arrays
+
+
+def _range_notices(source: GarmentSource) -> list[Notice]:
+    """Tell of samples that the frame range leaves out."""
+    said = f"the frame range leaves out {source.left_out_said}: there the layer holds it still"
+    return [Notice(str(source.path), None, said)] if source.left_out else []
 
 
 def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:

@@ -40,6 +40,8 @@ from .stage import (
     root_metadata,
 )
 from .times import merge, snap, within
+from .unread import unread
+from .variants import selections
 
 
 class Shot:
@@ -51,6 +53,7 @@ class Shot:
         scene: What stays the same over the shot.
         sources: How each garment sits on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
+        selections: Variant selections in force on what the garments depend on, as paths `/World/coat{fit=loose}`.
         warnings: What the user should know; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
     """
@@ -59,6 +62,7 @@ class Shot:
         """Put together what ``open_shot`` read."""
         self.path, self.stage = path, stage
         self.colliders: tuple[str, ...] = ()
+        self.selections: tuple[str, ...] = ()
         self.warnings: list[Notice] = []
         self.metres_per_unit = request.units.metres
         times = merge(time for reader in readers for time in reader.source.times)
@@ -179,16 +183,21 @@ def open_shot(
         found = find_colliders(stage, prims, colliders)
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
+        notices += unread([*prims, *found])
         units, odd = read_units(stage)
         assumed = root_metadata(stage, "metersPerUnit") is None
         prims = [
             prim for prim in prims if is_on(prim, ENABLED, asked) or notices.append(_left_out(prim, "is disabled"))
         ]
-        request = Request(units, Bake(stage), frames, level, asked, rest_frame, assumed)
+        bake = Bake(stage)
+        request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
         shot = Shot(str(path), stage, request, readers=readers)
         _add_colliders(shot, bodies, colliders, notices=notices)
+        shot.selections = selections(
+            map(stage.GetPrimAtPath, [*(s.path for s in shot.sources), *bodies, *bake.prims()])
+        )
     shot.colliders = tuple(str(path) for path in bodies)
     read_notices = [notice for reader in readers for notice in reader.notices]
     shot.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
@@ -263,6 +272,9 @@ def _read(
             notices.append(_left_out(prim, "is invisible"))
         else:
             readers.append(read_garment(prim, held, request))
+    if request.frames and every and not within(every, request.frames):
+        said = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
+        raise StageError(f"{said}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")

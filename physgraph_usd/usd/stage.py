@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
@@ -63,6 +64,8 @@ class GarmentSource:
         sources: Which source won, by short name of the value.
         animated: Short names of the values whose source has time samples.
         apart_from: What it never touches though it would, by path: colliders and garments, and what says so.
+        left_out: Its own authored times outside the range, where the layer holds it still.
+        velocities: Whether the shot has velocities for it.
     """
 
     path: Sdf.Path
@@ -73,6 +76,15 @@ class GarmentSource:
     sources: dict[str, str]
     animated: frozenset[str] = field(default=frozenset())
     apart_from: dict[str, str] = field(default_factory=dict)
+    left_out: tuple[float, ...] = ()
+    velocities: bool = False
+
+    @property
+    def left_out_said(self) -> str:
+        """How many of its samples are outside the range, and where; "" when none is."""
+        before, after = ([f"{t:g}" for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
+        spans = " and ".join(" to ".join(dict.fromkeys([span[0], span[-1]])) for span in (before, after) if span)
+        return f"{len(self.left_out)} of {len(self.left_out) + len(self.times)} samples, {spans}" if spans else ""
 
 
 @contextlib.contextmanager
@@ -209,6 +221,21 @@ def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
         delegate.TakeUncoalescedDiagnostics()
 
 
+def is_there(path: str | Path) -> bool:
+    """Whether the resolver of assets finds a file; layers in memory are there."""
+    return Sdf.Layer.IsAnonymousLayerIdentifier(str(path)) or bool(Ar.GetResolver().Resolve(str(path)))
+
+
+def check_there(path: str | Path, kind: type[PhysGraphError] = StageError) -> None:
+    """Refuse a file that is not there; what USD says of one tells neither what nor where.
+
+    Raises:
+        PhysGraphError: Of that kind.
+    """
+    if not is_there(path):
+        raise kind(f"no such file: {path}")
+
+
 def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     """Open a stage with all payloads, for reading.
 
@@ -221,6 +248,7 @@ def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     Raises:
         StageError: When the file or a layer that it needs cannot be read, or references run in a circle.
     """
+    check_there(path)
     with pxr_errors(f"cannot open {path}"), quiet() as diagnostics:
         stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
         if not stage:
