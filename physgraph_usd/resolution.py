@@ -8,7 +8,7 @@ Afterwards the folds tell: on too coarse a mesh wrinkles of its own size appear,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,19 +51,28 @@ class LevelChoice:
     edge: float
 
 
-def choose_levels(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[LevelChoice]:
+def sample_frames(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[Frame]:
+    """Read a few frames spread over the shot, the first and the last among them; unreadable ones are left out.
+
+    Args:
+        scene: The scene.
+        frame_at: Reads a frame.
+    """
+    picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
+    times: list[float | None] = [scene.times[i] for i in picks] or [None]
+    return [frame for time in times if (frame := _readable(frame_at, time)) is not None]
+
+
+def choose_levels(scene: Scene, frames: Sequence[Frame]) -> list[LevelChoice]:
     """Take each garment's own level, or for `AUTO` the least that resolves its wrinkles.
 
     Args:
         scene: The scene.
-        frame_at: Reads a frame; asked for a few frames.
+        frames: A few of its frames.
 
     Returns:
         One choice per garment.
     """
-    picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
-    times: list[float | None] = [scene.times[i] for i in picks] or [None]
-    frames = [frame for time in times if (frame := _readable(frame_at, time)) is not None]
     return [
         _choose(garment, [frame.garments[index] for frame in frames]) for index, garment in enumerate(scene.garments)
     ]

@@ -22,6 +22,7 @@ from physgraph_usd.resolution import (
     SHARP_SHARE,
     LevelChoice,
     choose_levels,
+    sample_frames,
     sharp_folds,
     too_coarse,
 )
@@ -43,7 +44,7 @@ def choose(
         return frame_of((1.0 - squeeze) * rest, time, fabric=fabric)
 
     scene = Scene((replace(garment_of(MESH, rest), level=level),), DOWN, times)
-    return choose_levels(scene, frame_at)[0], read
+    return choose_levels(scene, sample_frames(scene, frame_at))[0], read
 
 
 @pytest.mark.parametrize("squeeze", [0.02, 0.1, 0.3])
@@ -117,7 +118,7 @@ def test_few_frames_are_read_first_and_last_among_them():
 @pytest.mark.parametrize("level", [AUTO, 0, 2])
 def test_a_garment_without_faces(level: int):
     scene = Scene((replace(garment_of(mesh_of([], 3), np.zeros((3, 3))), level=level),), DOWN, ())
-    choice = choose_levels(scene, lambda time: frame_of(np.zeros((3, 3)), time))[0]
+    choice = choose_levels(scene, [frame_of(np.zeros((3, 3)), None)])[0]
     assert choice.level == max(level, 0)
 
 

@@ -63,6 +63,7 @@ class GarmentSource:
         sources: Which source won, by short name of the value.
         animated: Short names of the values whose source has time samples.
         apart_from: What it never touches though it would, by path: colliders and garments, and what says so.
+        subsets: Faces of the cage in each GeomSubset, by its name.
     """
 
     path: Sdf.Path
@@ -73,6 +74,7 @@ class GarmentSource:
     sources: dict[str, str]
     animated: frozenset[str] = field(default=frozenset())
     apart_from: dict[str, str] = field(default_factory=dict)
+    subsets: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @contextlib.contextmanager
