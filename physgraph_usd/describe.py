@@ -14,7 +14,7 @@ from .integrate import LEARNED
 from .mesh.defects import defects
 from .options import RefineOptions
 from .report import RefineReport
-from .resolution import LevelChoice, choose_levels, sample_frames
+from .resolution import LevelChoice, carries_none, choose_levels, sample_frames
 from .scene import Frame, Garment, GarmentFrame
 from .strain import strained_parts, stretched
 from .usd.reader import Shot
@@ -37,10 +37,11 @@ def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
     choices = choose_levels(opened.scene, frames)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
     report.garments = [_garment(*part) | {"colliders": _felt(opened, part[0])} for part in parts]
-    strained = _strained(opened, report, frames)
+    known = [carries_none(garment.path, choice) for garment, choice in zip(opened.scene.garments, choices, strict=True)]
+    known += _strained(opened, report, frames)
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
-    report.warnings = [str(notice) for notice in opened.warnings] + strained
+    report.warnings = [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
     return report
 
 
@@ -143,6 +144,9 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "level_reason": choice.reason,
         "fine_edge_mm": round(1e3 * choice.edge, 2),
         "wavelength_mm": round(1e3 * choice.wavelength, 2),
+        "level_needed": choice.needed,
+        "fine_points": choice.vertices[0],
+        "fine_points_needed": choice.vertices[1],
         "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},
         "sources": dict(source.sources),
         "self_contact": garment.self_contact,
@@ -154,13 +158,13 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
 
 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
-    """Add to the report the parts of garments that are no longer of their rest shape's size; returns the warnings."""
+    """Add to the report the parts of garments that are not of their rest shape's size; returns warnings, or ""."""
     said = []
     for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
         parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets)
         report.garments[index]["strained"] = [dataclasses.asdict(part) for part in parts]
         said.append(stretched(garment.path, source.sources["rest"], parts))
-    return [warning for warning in said if warning]
+    return said
 
 
 def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,6 +81,20 @@ class TestDone:
         assert share > 0.0
         assert asked["physgraph"].modelled["network"].startswith(f"physgraph made {share:.0%} of the steps")
         assert "network" not in asked["physgraph"].left_out
+
+    def test_the_level_that_would_do_and_its_cost_are_told_before_the_first_frame(self, shot: Path, tmp_path: Path):
+        told: list[object] = []
+        options: dict[str, Any] = {"overrides": (f"{BEND}=1e-6",), "level": 1}
+        report = refine(
+            shot, tmp_path / "fine.usdc", say=told.append, progress=lambda *done: told.append(done), **options
+        )
+        garment = inspect_shot(shot, **options)["garments"][0]
+        said = f"level {garment['level_needed']} resolves them: {garment['fine_points_needed']:,} vertices"
+        assert said in str(told[0])
+        assert said in garment["level_reason"]
+        assert report.garments[0] == garment
+        assert told[0] in report.warnings
+        assert (1, len(TIMES)) in told[1:]
 
     def test_progress_counts_up(self, shot: Path, tmp_path: Path):
         seen: list[tuple[int, int]] = []
