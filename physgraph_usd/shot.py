@@ -63,8 +63,9 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         report.seconds["open"] = clock.perf_counter() - began
         if options.dry_run:
             return report
-        for warning in report.warnings if options.say else ():
-            options.say(warning)
+        if options.say is not None:
+            for warning in report.warnings:
+                options.say(warning)
         solver = _ShotSolver(str(shot), [garment["level"] for garment in report.garments], options)
         solver.adopt(opened)
         _write_layer(opened, solver, out, options, report)
