@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Never
 import click
 
 from . import __version__
-from .cli_types import FrameRange, PictureSize, RefineLevel
+from .cli_types import FrameRange, PictureSize, RefineLevel, RestShape
 from .errors import PhysGraphError, UsageError
 
 if TYPE_CHECKING:
@@ -74,7 +74,9 @@ scene_options = _together(
     collider_option,
     click.option("--level", type=RefineLevel(), metavar="N|auto", help="Subdivisions; each makes four faces of one."),
     click.option("--set", "overrides", multiple=True, metavar="PRIM.ATTR=VALUE", help="Override an attribute."),
-    click.option("--rest", "rest_frame", type=float, metavar="FRAME", help="Take the rest shape from this frame."),
+    click.option(
+        "--rest", "rest_frame", type=RestShape(), metavar="FRAME|auto", help="Rest shape: this frame, or fitted to all."
+    ),
 )
 solve_options = _together(
     click.option("--integrator", metavar="NAME", help="How forces become displacements."),
@@ -288,15 +290,21 @@ def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -
     from .options import RefineOptions
     from .shot import refine_shot
 
+    told: list[str] = []
+
+    def tell(warning: str) -> None:
+        told.append(warning)
+        click.echo(f"warning: {name}{warning}", err=True)
+
     try:
         with _progress(Path(shot).name, in_lines=options.pop("progress", False)) as progress:
-            done = refine_shot(shot, layer, RefineOptions(**options, progress=progress))
+            done = refine_shot(shot, layer, RefineOptions(**options, progress=progress, say=tell))
     except UsageError:
         raise
     except PhysGraphError as error:
         click.echo(f"error: {name}{error}", err=True)
         return FAILED
-    return _say(done, name)
+    return _say(done, name, told)
 
 
 def _refine_side_by_side(
@@ -324,9 +332,9 @@ def _refine_side_by_side(
     return codes.pop() if len(codes) == 1 else IN_PART
 
 
-def _say(done: RefineReport, name: str) -> int:
-    """Print a run's warnings and its layer, or after a dry run its report; returns the exit code."""
-    for warning in done.warnings:
+def _say(done: RefineReport, name: str, told: Sequence[str] = ()) -> int:
+    """Print the warnings that were not told yet and a run's layer, or after a dry run its report; returns the code."""
+    for warning in (each for each in done.warnings if each not in told):
         click.echo(f"warning: {name}{warning}", err=True)
     click.echo(done.to_json() if done.out is None else done.out)
     return done.exit_code

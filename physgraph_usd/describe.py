@@ -14,26 +14,27 @@ from .integrate import LEARNED
 from .mesh.defects import defects
 from .options import RefineOptions
 from .report import RefineReport
-from .resolution import LevelChoice
+from .resolution import LevelChoice, carries_none, choose_levels, sample_frames
 from .scene import Frame, Garment, GarmentFrame
+from .strain import strained_parts, stretched
 from .usd.reader import Shot
 from .usd.stage import GarmentSource
 from .usd.survey import survey
 
 
-def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> RefineReport:
-    """Start the report of a run.
+def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
+    """Start the report of a run: choose the levels, and look for what a few frames give away.
 
     Args:
         opened: The shot.
-        choices: The level of each garment.
         options: The run's options.
 
     Returns:
         A report without frames.
     """
     report = RefineReport(opened.path, None, options.plain())
-    first = _first_frame(opened)
+    first, frames = _first_frame(opened), sample_frames(opened.scene, opened.frame)
+    choices = choose_levels(opened.scene, frames)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
     written = "--velocities" if options.velocities else "none"
     report.garments = [
@@ -42,10 +43,12 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
         | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
         for part in parts
     ]
+    known = [carries_none(garment.path, choice) for garment, choice in zip(opened.scene.garments, choices, strict=True)]
+    known += _strained(opened, report, frames)
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
-    report.warnings = [str(notice) for notice in opened.warnings]
+    report.warnings = [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
     return report
 
 
@@ -75,9 +78,9 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
         report.left_out["network"] = f"--integrator {asked}" + "".join(f"; {reason}" for reason in reasons)
 
 
-def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> dict[str, Any]:
+def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
-    report = begin_report(opened, choices, options)
+    report = begin_report(opened, options)
     return {
         "shot": opened.path,
         "metres_per_unit": opened.metres_per_unit,
@@ -150,6 +153,9 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "level_reason": choice.reason,
         "fine_edge_mm": round(1e3 * choice.edge, 2),
         "wavelength_mm": round(1e3 * choice.wavelength, 2),
+        "level_needed": choice.needed,
+        "fine_points": choice.vertices[0],
+        "fine_points_needed": choice.vertices[1],
         "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},
         "sources": dict(source.sources),
         "self_contact": garment.self_contact,
@@ -158,6 +164,16 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),
     }
+
+
+def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
+    """Add to the report the parts of garments that are not of their rest shape's size; returns warnings, or ""."""
+    said = []
+    for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
+        parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets)
+        report.garments[index]["strained"] = [dataclasses.asdict(part) for part in parts]
+        said.append(stretched(garment.path, source.sources["rest"], parts))
+    return said
 
 
 def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:

@@ -24,7 +24,7 @@ REPORT_NAME = "report.json"
 """Name of the report in a folder of its own."""
 SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
-_NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root", "asset_paths"}
+_NOT_OF_THE_RESULT = {"progress", "say", "report", "overwrite", "dry_run", "workers", "root", "asset_paths"}
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,11 @@ class RefineOptions:
         dry_run: Read and check everything, write nothing.
         velocities: Also write point velocities of garments that have none in the shot.
         heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
-        rest_frame: Time code whose points are the rest shape, or None.
+        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
         root: A .usda to write that lays the new layer over the shot, or None.
         asset_paths: "relative" or "absolute": how the layer and the root name other files.
         progress: Called with (frames done, frames in all), or None.
+        say: Called with each warning that is known before the first frame, then; or None.
     """
 
     frames: tuple[float, float] | None = None
@@ -82,10 +83,11 @@ class RefineOptions:
     dry_run: bool = False
     velocities: bool = False
     heat_map: bool = False
-    rest_frame: float | None = None
+    rest_frame: float | str | None = None
     root: Path | None = None
     asset_paths: str = "relative"
     progress: Callable[[int, int], None] | None = None
+    say: Callable[[str], None] | None = None
 
     def plain(self) -> dict[str, Any]:
         """The options that decide the result, ready for JSON."""

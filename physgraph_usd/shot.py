@@ -25,7 +25,7 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .report import RefineReport
-from .resolution import choose_levels, too_coarse
+from .resolution import too_coarse
 from .usd.provenance import asset_path, file_hashes, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
@@ -59,12 +59,14 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         raise LayerError(f"the folder {out.resolve().parent} does not exist")
     opened = _open(shot, options)
     try:
-        choices = choose_levels(opened.scene, opened.frame)
-        report = begin_report(opened, choices, options)
+        report = begin_report(opened, options)
         report.seconds["open"] = clock.perf_counter() - began
         if options.dry_run:
             return report
-        solver = _ShotSolver(str(shot), [choice.level for choice in choices], options)
+        if options.say is not None:
+            for warning in report.warnings:
+                options.say(warning)
+        solver = _ShotSolver(str(shot), [garment["level"] for garment in report.garments], options)
         solver.adopt(opened)
         _write_layer(opened, solver, out, options, report)
         report.seconds["total"] = clock.perf_counter() - began
@@ -94,7 +96,7 @@ def refine_shots(
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=end_with_parent) as pool:
-        alone = [(s, out, dataclasses.replace(options, workers=1, progress=None)) for s, out, options in jobs]
+        alone = [(s, out, dataclasses.replace(options, workers=1, progress=None, say=None)) for s, out, options in jobs]
         futures = [pool.submit(refine_shot, *job) for job in alone]
         for future in futures:
             try:
@@ -124,7 +126,7 @@ def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
     except StageError as error:
         return describe_meshes(str(shot), str(error))
     try:
-        return describe(opened, choose_levels(opened.scene, opened.frame), options)
+        return describe(opened, options)
     except StageError as error:
         return describe_meshes(str(shot), str(error))
     finally:
@@ -153,7 +155,7 @@ class _ShotSolver:
 
     def __init__(self, shot: str, levels: list[int], options: RefineOptions) -> None:
         self.levels = levels
-        self._shot, self._options = shot, dataclasses.replace(options, progress=None)
+        self._shot, self._options = shot, dataclasses.replace(options, progress=None, say=None)
         self._lanes = min(MOST_LANES, max(1, (os.cpu_count() or 1) // options.workers))
         self._opened: Shot | None = None
 

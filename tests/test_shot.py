@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,6 +83,20 @@ class TestDone:
         assert asked["physgraph"].modelled["network"].startswith(f"physgraph made {share:.0%} of the steps")
         assert "network" not in asked["physgraph"].left_out
 
+    def test_the_level_that_would_do_and_its_cost_are_told_before_the_first_frame(self, shot: Path, tmp_path: Path):
+        told: list[object] = []
+        options: dict[str, Any] = {"overrides": (f"{BEND}=1e-6",), "level": 1}
+        report = refine(
+            shot, tmp_path / "fine.usdc", say=told.append, progress=lambda *done: told.append(done), **options
+        )
+        garment = inspect_shot(shot, **options)["garments"][0]
+        said = f"level {garment['level_needed']} resolves them: {garment['fine_points_needed']:,} vertices"
+        assert said in str(told[0])
+        assert said in garment["level_reason"]
+        assert report.garments[0] == garment
+        assert told[0] in report.warnings
+        assert (1, len(TIMES)) in told[1:]
+
     def test_progress_counts_up(self, shot: Path, tmp_path: Path):
         seen: list[tuple[int, int]] = []
         refine(shot, tmp_path / "fine.usdc", progress=lambda done, total: seen.append((done, total)))
@@ -97,7 +112,7 @@ class TestDone:
         said = "4 of 6 samples, 1 and 4 to 6"
         assert report.garments[0]["samples_left_out"] == 4
         assert said in report.left_out["samples"]
-        assert [warning for warning in report.warnings if said in warning] == report.warnings
+        assert len([warning for warning in report.warnings if said in warning]) == 1
         record = Sdf.Layer.FindOrOpen(str(out)).customLayerData["physgraph"]
         assert dict(record["left_out"]) == {CLOTH: said}
         (problem,) = validate_layer(out)
@@ -107,7 +122,8 @@ class TestDone:
     def test_a_range_that_holds_all_samples_leaves_no_trace(self, shot: Path, tmp_path: Path):
         out = tmp_path / "fine.usdc"
         report = refine(shot, out, frames=(0.0, 100.0))
-        assert (report.warnings, report.garments[0]["samples_left_out"]) == ([], 0)
+        assert report.garments[0]["samples_left_out"] == 0
+        assert not any("the frame range" in warning for warning in report.warnings)
         assert "left_out" not in Sdf.Layer.FindOrOpen(str(out)).customLayerData["physgraph"]
         assert validate_layer(out) == []
 
@@ -269,7 +285,7 @@ class TestOptions:
         record = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc")).customLayerData["physgraph"]
         plain = RefineOptions(level=1, steps=3, heat_map=True).plain()
         assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
-            "progress", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths",
+            "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths",
         }  # fmt: skip
         assert json.loads(json.dumps(record, default=str))
 

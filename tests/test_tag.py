@@ -43,7 +43,7 @@ def test_a_tagged_shot_can_be_refined_as_it_is(untagged: Path, tmp_path: Path) -
 def test_a_tagged_layer_names_its_shot_as_asked(untagged: Path, tmp_path: Path) -> None:
     for form, named in (("relative", "./shot.usda"), ("absolute", str(untagged.resolve()))):
         out = tag(untagged, tmp_path / f"{form}.usda", garments=[COAT], asset_paths=form)
-        assert list(Sdf.Layer.FindOrOpen(str(out)).subLayerPaths) == [named]
+        assert Sdf.Layer.FindOrOpen(str(out)).subLayerPaths == [named]
     with pytest.raises(UsageError, match="known asset paths: relative, absolute"):
         tag(untagged, tmp_path / "x.usda", garments=[COAT], asset_paths="short")
 

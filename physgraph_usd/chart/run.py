@@ -16,7 +16,7 @@ import torch
 
 from .. import __version__
 from ..options import RefineOptions
-from ..resolution import choose_levels
+from ..resolution import choose_levels, sample_frames
 from ..scene import Frame, Scene
 from ..shot import MOST_LANES, prepare_device
 from ..usd.provenance import file_hashes
@@ -85,7 +85,7 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
     """Measure what is not yet in the folder."""
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
-    levels = tuple(choice.level for choice in choose_levels(opened.scene, opened.frame))
+    levels = tuple(choice.level for choice in choose_levels(opened.scene, sample_frames(opened.scene, opened.frame)))
 
     def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:
         lanes = min(MOST_LANES, os.cpu_count() or 1) if options.clock == "wall" else 1

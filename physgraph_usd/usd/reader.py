@@ -27,6 +27,7 @@ from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .placement import to_metres
 from .provenance import mute_refined
+from .rest import AUTO
 from .schema import GARMENT
 from .skinning import Bake
 from .stage import (
@@ -147,7 +148,7 @@ def open_shot(
     frames: tuple[float, float] | None = None,
     level: int | None = None,
     overrides: Sequence[str] = (),
-    rest_frame: float | None = None,
+    rest_frame: float | str | None = None,
     skip_invisible: bool = False,
 ) -> Shot:
     """Open a shot for refining.
@@ -161,7 +162,8 @@ def open_shot(
         frames: First and last time code in composed stage time; None: every authored one.
         level: Number of subdivisions, -1 for auto; None: what each garment's schema says.
         overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
-        rest_frame: Time code whose points are the rest shape of every garment; it goes before authored rest shapes.
+        rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to all of
+            the shot; it goes before authored rest shapes.
         skip_invisible: Leave out garments that are invisible at all their time codes.
 
     Returns:
@@ -204,7 +206,7 @@ def open_shot(
     return shot
 
 
-def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | None) -> None:
+def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:
     """Refuse options that no stage could satisfy."""
     if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
         raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
@@ -213,8 +215,8 @@ def _check_options(frames: tuple[float, float] | None, level: int | None, rest_f
             check_limits(GARMENT["refine:level"], level, "--level")
         except SchemaError as error:
             raise UsageError(str(error)) from error
-    if rest_frame is not None and not math.isfinite(rest_frame):
-        raise UsageError(f"rest frame {rest_frame} is no time code")
+    if not (rest_frame in (None, AUTO) or (isinstance(rest_frame, int | float) and math.isfinite(rest_frame))):
+        raise UsageError(f"rest frame {rest_frame!r} is neither a time code nor '{AUTO}'")
 
 
 def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) -> list[Usd.Prim]:

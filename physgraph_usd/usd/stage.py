@@ -66,6 +66,7 @@ class GarmentSource:
         apart_from: What it never touches though it would, by path: colliders and garments, and what says so.
         left_out: Its own authored times outside the range, where the layer holds it still.
         velocities: Whether the shot has velocities for it.
+        subsets: Faces of the cage in each GeomSubset, by its name.
     """
 
     path: Sdf.Path
@@ -78,6 +79,7 @@ class GarmentSource:
     apart_from: dict[str, str] = field(default_factory=dict)
     left_out: tuple[float, ...] = ()
     velocities: bool = False
+    subsets: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def left_out_said(self) -> str:
