@@ -22,8 +22,8 @@ import click
 import numpy as np
 import scipy.sparse as sp
 
-import physgraph_usd.integrate.collapsed as collapsed
 from physgraph_usd.group import Group
+from physgraph_usd.integrate import collapsed
 from physgraph_usd.level import hinge_geometry
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner

@@ -103,8 +103,7 @@ def solve_level(
     report.stiffened = system is not plain
     system.expected = budget.steps
     # What was learned under another metric is of no use.
-    goes_on = resume is not None and not report.stiffened
-    carry = resumed(integrator, system, resume) if goes_on else integrator.start(system, x)
+    carry = integrator.start(system, x) if resume is None or report.stiffened else resumed(integrator, system, resume)
     _require_finite(carry, level)
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()
