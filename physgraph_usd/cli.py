@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
@@ -19,9 +19,10 @@ import click
 
 from . import __version__
 from .cli_types import FrameRange, PictureSize, RefineLevel
-from .errors import PhysGraphError, UsageError
+from .errors import LayerError, PhysGraphError, UsageError
 
 if TYPE_CHECKING:
+    from .options import RefineOptions
     from .report import RefineReport
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
@@ -104,6 +105,8 @@ layer_options = _together(
     ),
     click.option("--progress", is_flag=True, help="Say each frame in a line of its own, into files and pipes too."),
     overwrite_option,
+    click.option("--resume", is_flag=True, help="Go on from the finished frames of a run that was interrupted."),
+    click.option("--keep-frames/--no-keep-frames", default=True, help="Leave finished frames when interrupted."),
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )
 
@@ -135,18 +138,26 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 
     The options that are left out keep the defaults of physgraph_usd.RefineOptions.
     """
+    from .options import RefineOptions
+    from .usd.atomic import termination_raises
+
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
     none = [None] * len(shots)
-    reports = none if report is None else _reports(shots, report)
-    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda")
+    reports = none if report is None else _one_each(shots, report, "--report", suffix="", accepts=(".json",))
+    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda", accepts=USD_SUFFIXES)
     given = {name: value for name, value in options.items() if value is not None}
-    if len(shots) > 1 and given.get("workers", 1) > 1:
-        sys.exit(_refine_side_by_side(shots, layers, reports, roots, given))
-    codes = {
-        _refine_one(shot, layer, given | {"report": report, "root": root}, name=f"{shot}: " if len(shots) > 1 else "")
+    in_lines, workers = given.pop("progress", False), given.pop("workers", 1)
+    jobs = [
+        (shot, layer, RefineOptions(**given, report=report, root=root))
         for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
-    }
-    sys.exit(codes.pop() if len(codes) == 1 else IN_PART)
+    ]
+    with termination_raises(), _folder_of(layers, out, dry_run=given["dry_run"]):
+        if len(jobs) > 1:
+            code = _refine_each(jobs, workers=workers, in_lines=in_lines)
+        else:
+            only, layer, settings = jobs[0]
+            code = _say(_refine_shown(only, layer, replace(settings, workers=workers), in_lines=in_lines), "")
+    sys.exit(code)
 
 
 @main.command()
@@ -200,11 +211,12 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
 @main.command()
 @click.argument("name", default="sleeve")
 @out_option("DIR", "Folder to write into.")
-def sample(name: str, out: Path) -> None:
+@overwrite_option
+def sample(name: str, out: Path, *, overwrite: bool) -> None:
     """Write the sample shot NAME and print its path; an unknown name lists those there are."""
     from .samples import write_sample
 
-    click.echo(write_sample(name, out))
+    click.echo(write_sample(name, out, overwrite=overwrite))
 
 
 @main.command()
@@ -274,44 +286,31 @@ def schema_path() -> None:
     click.echo(find())
 
 
-def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -> int:
-    from .options import RefineOptions
+def _refine_shown(shot: str, layer: Path, options: RefineOptions, *, in_lines: bool) -> RefineReport:
+    """Refine a shot and show on stderr how far it is."""
     from .shot import refine_shot
 
-    try:
-        with _progress(Path(shot).name, in_lines=options.pop("progress", False)) as progress:
-            done = refine_shot(shot, layer, RefineOptions(**options, progress=progress))
-    except UsageError:
-        raise
-    except PhysGraphError as error:
-        click.echo(f"error: {name}{error}", err=True)
-        return FAILED
-    return _say(done, name)
+    with _progress(Path(shot).name, in_lines=in_lines) as progress:
+        return refine_shot(shot, layer, replace(options, progress=progress))
 
 
-def _refine_side_by_side(
-    shots: tuple[str, ...],
-    layers: list[Path],
-    reports: Sequence[Path | None],
-    roots: Sequence[Path | None],
-    given: dict[str, Any],
-) -> int:
-    """Refine several shots in processes of their own; each shot keeps to one."""
-    from .options import RefineOptions
-    from .shot import refine_shots
+def _refine_each(jobs: Sequence[tuple[str, Path, RefineOptions]], *, workers: int, in_lines: bool) -> int:
+    """Refine several shots, each in a process of its own, and say at the end which failed and why."""
+    from .shot import refine_shot, refine_shots
 
-    jobs = [
-        (shot, layer, RefineOptions(**given, report=report, root=root))
-        for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
-    ]
-    codes = set()
-    for shot, done in zip(shots, refine_shots(jobs, workers=given["workers"]), strict=True):
+    refine = partial(_refine_shown, in_lines=in_lines) if workers == 1 else refine_shot
+    codes, failed = [], []
+    for (shot, _, _), done in zip(jobs, refine_shots(jobs, workers=workers, refine=refine), strict=True):
         if isinstance(done, PhysGraphError):
-            click.echo(f"error: {shot}: {done}", err=True)
-            codes.add(FAILED)
+            failed.append(f"error: {shot}: {done}")
+            codes.append(WRONG_USAGE if isinstance(done, UsageError) else FAILED)
         else:
-            codes.add(_say(done, f"{shot}: "))
-    return codes.pop() if len(codes) == 1 else IN_PART
+            codes.append(_say(done, f"{shot}: "))
+    for line in failed:
+        click.echo(line, err=True)
+    if failed:
+        click.echo(f"{len(failed)} of {len(jobs)} shots failed", err=True)
+    return codes[0] if len(set(codes)) == 1 else IN_PART
 
 
 def _say(done: RefineReport, name: str) -> int:
@@ -322,28 +321,46 @@ def _say(done: RefineReport, name: str) -> int:
     return done.exit_code
 
 
-def _one_each(
-    shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...] = ()
-) -> list[Path]:
+def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...]) -> list[Path]:
     """Name one output per shot: ``to`` itself when it is a file's name, else files in the folder ``to``."""
-    if to.suffix in (accepts or (suffix,)) and not to.is_dir():
+    if to.suffix in accepts and not to.is_dir():
         if len(shots) > 1:
             raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
+        return [to]
+    if to.suffix and not to.is_dir():
+        known = ", ".join(accepts)
+        raise UsageError(f"{option} {to}: unknown suffix '{to.suffix}'; known: {known}; or make a folder of that name")
+    if not suffix and len(shots) == 1:
         return [to]
     files = [to / (Path(shot).stem + suffix) for shot in shots]
     twice = sorted({str(file) for file in files if files.count(file) > 1})
     if twice:
         raise UsageError(f"{option} {to}: two shots would both be written to {twice[0]}; refine them one by one")
-    to.mkdir(parents=True, exist_ok=True)
     return files
 
 
-def _reports(shots: tuple[str, ...], to: Path) -> Sequence[Path]:
-    """One report per shot: a JSON file, or a folder with a page, inside ``to`` where there are several shots."""
-    if to.suffix == ".json" and not to.is_dir():
-        return _one_each(shots, to, "--report", suffix=".json")
-    to.mkdir(parents=True, exist_ok=True)
-    return [to] if len(shots) == 1 else _one_each(shots, to, "--report", suffix="")
+@contextmanager
+def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
+    """Make the folder that layers go into, unless ``out`` names a layer; it goes again where nothing came into it.
+
+    Finished frames that are left by an interruption are named.
+    """
+    from .frames import frames_folder
+
+    made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
+    try:
+        for folder in reversed(made):
+            folder.mkdir()
+    except OSError as error:
+        raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        for kept in filter(Path.is_dir, map(frames_folder, layers)):
+            click.echo(f"finished frames are kept in {kept}; --resume goes on from them", err=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 @contextmanager

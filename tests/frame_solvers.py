@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from physgraph_usd.chunks import Outcome
+from physgraph_usd.errors import GarmentError
+from physgraph_usd.frames import Outcome
 
 
 class Counting:
@@ -25,20 +27,42 @@ class Failing(Counting):
             yield Outcome(5.0, (), (), {"time": 5.0, "error": "no"}) if failed else outcome
 
 
-class Dying(Counting):
+class Ending(Counting):
+    """Comes to an end at the frame 5."""
+
+    def end(self) -> None:
+        raise NotImplementedError
+
     def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
         for outcome in super().__call__(times):
             if outcome.time == 5.0:
-                os._exit(9)
+                self.end()
             yield outcome
 
 
-class Raising(Counting):
-    def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
-        for outcome in super().__call__(times):
-            if outcome.time == 5.0:
-                raise ValueError("a bug")
-            yield outcome
+class Dying(Ending):
+    def end(self) -> None:
+        os._exit(9)
+
+
+class Killed(Ending):
+    def end(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Raising(Ending):
+    def end(self) -> None:
+        raise ValueError("a bug")
+
+
+class Exhausted(Ending):
+    def end(self) -> None:
+        np.empty(1 << 50)
+
+
+class Broken(Ending):
+    def end(self) -> None:
+        raise GarmentError("/World/cloth", "torn", time=5.0, remedy="mend it")
 
 
 class Short(Counting):

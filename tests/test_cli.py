@@ -13,6 +13,7 @@ from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
@@ -110,6 +111,21 @@ class TestRefine:
         assert json.loads(result.stdout)
         assert not list(tmp_path.iterdir())
 
+    @pytest.mark.parametrize("more", [(), ("--dry-run",)])
+    @pytest.mark.parametrize("option", ["-o", "--root", "--report"])
+    def test_a_suffix_that_is_none_of_ours_is_refused_by_name(
+        self, sample: Sample, tmp_path: Path, option: str, more: tuple[str, ...]
+    ) -> None:
+        named = {"-o": tmp_path / "fine.usdc"} | {option: tmp_path / "x.abc"}
+        result = run("refine", sample("swatch"), *(word for pair in named.items() for word in pair), *more, *SMALL)
+        assert (result.exit_code, "'.abc'; known: ." in result.stderr) == (2, True), result.stderr
+        assert not list(tmp_path.iterdir())
+
+    def test_a_dry_run_makes_no_folder(self, sample: Sample, tmp_path: Path) -> None:
+        more = ("--report", tmp_path / "b" / "c", "--root", tmp_path / "d")
+        assert run("refine", sample("swatch"), "-o", tmp_path / "a", *more, "--dry-run", *SMALL).exit_code == 0
+        assert not list(tmp_path.iterdir())
+
     def test_existing_layer_is_kept_unless_told(self, sample: Sample, tmp_path: Path) -> None:
         out = tmp_path / "fine.usdc"
         out.write_bytes(b"mine")
@@ -144,27 +160,33 @@ class TestRefine:
 
 
 class TestSeveralShots:
-    def test_each_gets_its_files(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+    @pytest.fixture
+    def jobs(self, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Path, Any]]:
+        """What refine_shots is asked for; it does nothing here."""
+        asked: list[tuple[str, Path, Any]] = []
+
+        def refine_shots(jobs: list[tuple[str, Path, Any]], **_: object) -> list[SimpleNamespace]:
+            asked.extend(jobs)
+            return [SimpleNamespace(out=out, warnings=(), exit_code=0) for _, out, _ in jobs]
+
+        monkeypatch.setattr("physgraph_usd.shot.refine_shots", refine_shots)
+        return asked
+
+    def test_each_gets_its_files(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
         result = run("refine", "a/one.usda", "b/two.usd", "-o", tmp_path / "out", "--report", tmp_path / "reports")
         assert result.exit_code == 0
-        assert [call.out.name for call in refined] == ["one.refined.usdc", "two.refined.usdc"]
-        assert [call.options.report for call in refined] == [tmp_path / "reports" / name for name in ("one", "two")]
+        assert [out.name for _, out, _ in jobs] == ["one.refined.usdc", "two.refined.usdc"]
+        assert [options.report for *_, options in jobs] == [tmp_path / "reports" / name for name in ("one", "two")]
+        assert not list(tmp_path.iterdir()), "folders that nothing came into stay"
 
-    def test_equal_names_are_refused(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+    def test_equal_names_are_refused(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
         result = run("refine", "a/shot.usda", "b/shot.usda", "-o", tmp_path / "out")
-        assert (result.exit_code, refined) == (2, [])
+        assert (result.exit_code, jobs) == (2, [])
         assert "shot.refined.usdc" in result.stderr
 
-    def test_one_file_for_two_is_refused(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+    def test_one_file_for_two_is_refused(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
         result = run("refine", "a.usda", "b.usda", "-o", tmp_path / "out.usdc")
-        assert (result.exit_code, refined) == (2, [])
-
-    def test_a_broken_one_leaves_the_others(self, sample: Sample, tmp_path: Path) -> None:
-        missing = tmp_path / "missing.usda"
-        result = run("refine", missing, sample("swatch"), "-o", tmp_path / "out", *SMALL)
-        assert result.exit_code == 3
-        assert "missing.usda" in result.stderr
-        assert [file.name for file in (tmp_path / "out").iterdir()] == ["swatch.refined.usdc"]
+        assert (result.exit_code, jobs) == (2, [])
 
 
 class TestErrors:
@@ -251,6 +273,12 @@ class TestOtherCommands:
         tagged = tmp_path / "tagged.usda"
         assert run("tag", sample("swatch"), "-o", tagged, "--garment", path, "--preset", "denim").exit_code == 0
         assert run("refine", tagged, "-o", tmp_path / "fine.usdc", *SMALL).exit_code == 0
+
+    @pytest.mark.parametrize("name", ["t.txt", "t", "t.usdz"])
+    def test_tag_writes_what_usd_can_open(self, sample: Sample, tmp_path: Path, name: str) -> None:
+        result = run("tag", sample("swatch"), "-o", tmp_path / name, "--garment", "cloth")
+        assert (result.exit_code, "known suffixes: .usd, .usda, .usdc" in result.stderr) == (2, True), result.stderr
+        assert not list(tmp_path.iterdir())
 
     def test_preview(self, sample: Sample, tmp_path: Path) -> None:
         picture = tmp_path / "picture.png"

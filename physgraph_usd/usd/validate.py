@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Tf, Usd
+from pxr import Sdf, Usd
 
 from ..errors import LayerError
 from . import layer_rules
 from .provenance import read_record, root_over
 from .rules import RULES, Fine, Problem, subsets
-from .stage import pxr_errors, reason_of
+from .stage import USD_ERRORS, pxr_errors, reason_of
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
 _COUNTS = "InvalidSubsetFamily"
@@ -125,7 +125,7 @@ def _open(path: Path) -> Sdf.Layer:
     """Open a layer."""
     try:
         layer = Sdf.Layer.FindOrOpen(str(path))
-    except Tf.ErrorException as error:
+    except USD_ERRORS as error:
         raise LayerError(f"cannot read {path}: {reason_of(error)}") from error
     if not layer:
         raise LayerError(f"cannot read {path}")
