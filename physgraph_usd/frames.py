@@ -133,8 +133,9 @@ class FrameFolder:
                 np.savez(stream, **arrays)
             temporary.replace(self._file(index, _DONE if outcome.points else _FAILED))
         except OSError as error:
-            temporary.unlink(missing_ok=True)
             raise LayerError(f"cannot write {self._file(index)}: {error.strerror}") from error
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def read(self, index: int, time: float | None) -> Outcome | None:
         """What came of a frame, or None where it is not there yet.

@@ -181,3 +181,24 @@ class TestLayers:
         moves = [rms(fine(shot, one, a) - fine(shot, one, b)) / (EDGE / 2) for a, b in pairwise(LONG)]
         assert min(moves) > 2 * max(apart)
         assert sample_times(one) == sample_times(two) == LONG
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_a_resumed_run_goes_on_as_if_it_had_not_been_interrupted(self, tmp_path: Path, workers: int):
+        """What the run-up leaves where it goes on is no more than what it leaves between two workers."""
+        shot, out = cloth_shot(tmp_path / "shot.usdc", times=LONG), tmp_path / "fine.usdc"
+
+        def interrupt(done: int, _: int) -> None:
+            if done == 12:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            refine(shot, out, progress=interrupt, workers=workers)
+        report = refine(shot, out, resume=True)
+        assert "12 of 24 frames are those of a run" in report.warnings[0] or workers > 1
+        assert "each stretch after 6 frames that are solved again" in report.warnings[0]
+        assert [frame["time"] for frame in report.frames] == list(LONG)
+        whole = layer_with(shot, tmp_path / "whole")
+        apart = [rms(fine(shot, whole, time) - fine(shot, out, time)) / (EDGE / 2) for time in LONG]
+        assert max(apart[:12]) == 0.0
+        assert max(apart) < SEAM, apart
+        assert faults(out, shot) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 import subprocess
 import sys
 import sysconfig
@@ -21,6 +22,10 @@ from click.testing import CliRunner, Result
 from physgraph_usd import cli, errors
 
 pytest.importorskip("pxr", reason="the commands read stages with usd-core")
+
+from frame_solvers import as_named
+from pxr import Usd, UsdGeom
+from shots import CLOTH, cloth_shot
 
 Sample = Callable[[str], Path]
 SMALL = ("--frames", "1:2", "--level", "1")
@@ -126,6 +131,23 @@ class TestRefine:
         assert run("refine", sample("swatch"), "-o", tmp_path / "a", *more, "--dry-run", *SMALL).exit_code == 0
         assert not list(tmp_path.iterdir())
 
+    @pytest.mark.parametrize("option", ["--report", "--root"])
+    def test_what_cannot_be_written_is_refused_before_the_work(
+        self, sample: Sample, tmp_path: Path, option: str
+    ) -> None:
+        (tmp_path / "file").write_text("mine")
+        for place in (tmp_path / "file", Path("/proc/nowhere")):
+            named = (
+                "-o",
+                tmp_path / "fine.usdc",
+                option,
+                place / "x" / ("a.json" if option == "--report" else "a.usda"),
+            )
+            result = run("refine", sample("swatch"), *named, "--progress", *SMALL)
+            assert result.exit_code in (1, 2)
+            assert result.stderr.startswith("error: cannot write"), result.stderr
+        assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
     def test_existing_layer_is_kept_unless_told(self, sample: Sample, tmp_path: Path) -> None:
         out = tmp_path / "fine.usdc"
         out.write_bytes(b"mine")
@@ -188,8 +210,50 @@ class TestSeveralShots:
         result = run("refine", "a.usda", "b.usda", "-o", tmp_path / "out.usdc")
         assert (result.exit_code, jobs) == (2, [])
 
+    @pytest.mark.parametrize("workers", ["1", "2"])
+    def test_those_that_fail_leave_the_others(self, tmp_path: Path, workers: str) -> None:
+        """A garment that is broken, an output that exists, a report that cannot be written."""
+        shots = [cloth_shot(tmp_path / f"{name}.usda") for name in ("good", "torn", "done", "told")]
+        stage = Usd.Stage.Open(str(shots[1]))
+        UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetFaceVertexIndicesAttr().Set([0, 1, 999])
+        stage.Save()
+        out, reports = tmp_path / "out", tmp_path / "reports"
+        out.mkdir()
+        reports.mkdir()
+        (out / "done.refined.usdc").write_text("mine")
+        (reports / "told").write_text("mine")
+        line = ("refine", *shots[1:], shots[0], "-o", out, "--report", reports)
+        result = run(*line, "--workers", workers, *SMALL)
+        assert result.exit_code == 3, result.output
+        assert sorted(file.name for file in out.iterdir()) == ["done.refined.usdc", "good.refined.usdc"]
+        said = result.stderr.splitlines()[-4:]
+        assert said[-1] == "3 of 4 shots failed"
+        for name, why in {"torn": CLOTH, "done": "exists", "told": "cannot write"}.items():
+            assert any(f"{name}.usda: " in line and why in line for line in said), said
+        assert (out / "done.refined.usdc").read_text() == (reports / "told").read_text() == "mine"
+
+    def test_one_that_dies_leaves_the_others(self, tmp_path: Path) -> None:
+        from physgraph_usd.options import RefineOptions
+        from physgraph_usd.shot import refine_shots
+
+        jobs = [(name, tmp_path / f"{name}.usdc", RefineOptions()) for name in ("dies", "raises", "returns")]
+        died, raised, returned = refine_shots(jobs, workers=2, refine=as_named)
+        assert "a worker process died (SIGSEGV)" in str(died)
+        assert "unexpected KeyError: 'a bug'" in str(raised)
+        assert returned == "returns"
+
+
+def kinds(root: type[errors.PhysGraphError]) -> list[type[errors.PhysGraphError]]:
+    return [root, *(kind for each in root.__subclasses__() for kind in kinds(each))]
+
 
 class TestErrors:
+    @pytest.mark.parametrize("kind", kinds(errors.PhysGraphError))
+    def test_every_error_travels_between_processes(self, kind: type[errors.PhysGraphError]) -> None:
+        error = kind("</A>", "is torn")
+        there = pickle.loads(pickle.dumps(error))
+        assert (type(there), str(there), vars(there)) == (kind, str(error), vars(error))
+
     @pytest.mark.parametrize(
         ("error", "code"),
         [

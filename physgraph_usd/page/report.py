@@ -101,7 +101,7 @@ def _pictures(report: RefineReport) -> str:
     picks = sorted({round(i * (len(written) - 1) / (PICTURES - 1)) for i in range(PICTURES)}) if written else []
     try:
         return title + "".join(_picture(report, written[i]) for i in picks)
-    except (StageError, LayerError) as error:
+    except (StageError, LayerError, OSError) as error:  # a full temporary disk too
         return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"
 
 

@@ -103,7 +103,7 @@ def reason_of(error: Exception) -> str:
     except UnicodeDecodeError:
         return "the file has bytes that are no text; it is damaged"
     if not isinstance(error, Tf.ErrorException):
-        return f"the file is damaged or was cut short while it was read: {in_brief(text.splitlines()[0])}"
+        return f"the file is damaged or was cut short while it was read: {in_brief(text.partition(' - ')[0])}"
     reasons = [part.split(" : ", 1)[-1].strip().strip("'").strip() for part in text.split("\n\tError in ")]
     kept = list(dict.fromkeys(in_brief(reason) for reason in reasons if reason))
     return "; ".join(kept[:MOST_REASONS]) + _others(max(len(kept) - MOST_REASONS, 0)) or "USD gave no reason"
