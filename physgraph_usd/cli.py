@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part.
 
 from __future__ import annotations
 
+import errno
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -39,11 +40,18 @@ class Commands(click.Group):
     """A group whose commands end with ``error: ...`` and the error's exit code instead of a traceback."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command; an error of our tree becomes one line on stderr."""
+        """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
+        from .processes import memory_is_named
+
         try:
-            return super().invoke(ctx)
+            with memory_is_named():
+                return super().invoke(ctx)
         except PhysGraphError as error:
             _leave(ctx, str(error), WRONG_USAGE if isinstance(error, UsageError) else FAILED)
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise
+            _leave(ctx, f"{error.filename or 'cannot read or write'}: {error.strerror}", FAILED)
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
             if missing not in EXTRAS:

@@ -305,6 +305,11 @@ class TestErrors:
         assert "missing.usda" in result.stderr + result.stdout
         assert not list(tmp_path.iterdir())
 
+    def test_a_folder_that_is_a_file_is_1(self, tmp_path: Path) -> None:
+        (tmp_path / "run.toml").write_text("minutes = 1.0")
+        result = run("train", "--config", tmp_path / "run.toml", "-o", tmp_path / "run.toml")
+        assert (result.exit_code, result.stderr) == (1, f"error: {tmp_path / 'run.toml'}: File exists\n")
+
     def test_done_in_part_is_3(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         report = SimpleNamespace(out=tmp_path / "a.usdc", warnings=("frame 3 failed",), exit_code=3)
         monkeypatch.setattr("physgraph_usd.shot.refine_shot", lambda *_: report)
