@@ -6,11 +6,12 @@ Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part.
 
 from __future__ import annotations
 
+import errno
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
@@ -19,9 +20,10 @@ import click
 
 from . import __version__
 from .cli_types import FrameRange, PictureSize, RefineLevel, RestShape
-from .errors import PhysGraphError, UsageError
+from .errors import LayerError, PhysGraphError, UsageError
 
 if TYPE_CHECKING:
+    from .options import RefineOptions
     from .report import RefineReport
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
@@ -38,11 +40,18 @@ class Commands(click.Group):
     """A group whose commands end with ``error: ...`` and the error's exit code instead of a traceback."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command; an error of our tree becomes one line on stderr."""
+        """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
+        from .processes import memory_is_named
+
         try:
-            return super().invoke(ctx)
+            with memory_is_named():
+                return super().invoke(ctx)
         except PhysGraphError as error:
             _leave(ctx, str(error), WRONG_USAGE if isinstance(error, UsageError) else FAILED)
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise
+            _leave(ctx, f"{error.filename or 'cannot read or write'}: {error.strerror}", FAILED)
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
             if missing not in EXTRAS:
@@ -110,6 +119,8 @@ layer_options = _together(
     ),
     click.option("--progress", is_flag=True, help="Say each frame in a line of its own, into files and pipes too."),
     overwrite_option,
+    click.option("--resume", is_flag=True, help="Go on from the finished frames of a run that was interrupted."),
+    click.option("--keep-frames/--no-keep-frames", default=True, help="Leave finished frames when interrupted."),
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )
 
@@ -141,18 +152,26 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 
     The options that are left out keep the defaults of physgraph_usd.RefineOptions.
     """
+    from .options import RefineOptions
+    from .usd.atomic import termination_raises
+
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
     none = [None] * len(shots)
-    reports = none if report is None else _reports(shots, report)
-    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda")
+    reports = none if report is None else _one_each(shots, report, "--report", suffix="", accepts=(".json",))
+    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda", accepts=USD_SUFFIXES)
     given = {name: value for name, value in options.items() if value is not None}
-    if len(shots) > 1 and given.get("workers", 1) > 1:
-        sys.exit(_refine_side_by_side(shots, layers, reports, roots, given))
-    codes = {
-        _refine_one(shot, layer, given | {"report": report, "root": root}, name=f"{shot}: " if len(shots) > 1 else "")
+    in_lines, workers = given.pop("progress", False), given.pop("workers", 1)
+    jobs = [
+        (shot, layer, RefineOptions(**given, report=report, root=root))
         for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
-    }
-    sys.exit(codes.pop() if len(codes) == 1 else IN_PART)
+    ]
+    with termination_raises(), _folder_of(layers, out, dry_run=given["dry_run"]):
+        if len(jobs) > 1:
+            code = _refine_each(jobs, workers=workers, in_lines=in_lines)
+        else:
+            only, layer, settings = jobs[0]
+            code = _say(_refine_shown(only, layer, replace(settings, workers=workers), in_lines=in_lines))
+    sys.exit(code)
 
 
 @main.command()
@@ -212,11 +231,12 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
 @main.command()
 @click.argument("name", default="sleeve")
 @out_option("DIR", "Folder to write into.")
-def sample(name: str, out: Path) -> None:
+@overwrite_option
+def sample(name: str, out: Path, *, overwrite: bool) -> None:
     """Write the sample shot NAME and print its path; an unknown name lists those there are."""
     from .samples import write_sample
 
-    click.echo(write_sample(name, out))
+    click.echo(write_sample(name, out, overwrite=overwrite))
 
 
 @main.command()
@@ -286,82 +306,91 @@ def schema_path() -> None:
     click.echo(find())
 
 
-def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -> int:
-    from .options import RefineOptions
+def _refine_shown(
+    shot: str, layer: Path, options: RefineOptions, *, in_lines: bool, several: bool = False, alone: bool = True
+) -> RefineReport:
+    """Refine a shot and say on stderr each warning when it is known, and how far it is where it is alone at work."""
     from .shot import refine_shot
 
     told: list[str] = []
 
     def tell(warning: str) -> None:
-        told.append(warning)
-        click.echo(f"warning: {name}{warning}", err=True)
+        if warning not in told:
+            told.append(warning)
+            click.echo(f"warning: {shot}: {warning}" if several else f"warning: {warning}", err=True)
 
-    try:
-        with _progress(Path(shot).name, in_lines=options.pop("progress", False)) as progress:
-            done = refine_shot(shot, layer, RefineOptions(**options, progress=progress, say=tell))
-    except UsageError:
-        raise
-    except PhysGraphError as error:
-        click.echo(f"error: {name}{error}", err=True)
-        return FAILED
-    return _say(done, name, told)
+    with _progress(Path(shot).name, in_lines=in_lines) if alone else nullcontext() as progress:
+        done = refine_shot(shot, layer, replace(options, progress=progress, say=tell))
+    for warning in done.warnings:
+        tell(warning)
+    return done
 
 
-def _refine_side_by_side(
-    shots: tuple[str, ...],
-    layers: list[Path],
-    reports: Sequence[Path | None],
-    roots: Sequence[Path | None],
-    given: dict[str, Any],
-) -> int:
-    """Refine several shots in processes of their own; each shot keeps to one."""
-    from .options import RefineOptions
+def _refine_each(jobs: Sequence[tuple[str, Path, RefineOptions]], *, workers: int, in_lines: bool) -> int:
+    """Refine several shots, each in a process of its own, and say at the end which failed and why."""
     from .shot import refine_shots
 
-    jobs = [
-        (shot, layer, RefineOptions(**given, report=report, root=root))
-        for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
-    ]
-    codes = set()
-    for shot, done in zip(shots, refine_shots(jobs, workers=given["workers"]), strict=True):
+    refine = partial(_refine_shown, in_lines=in_lines, several=True, alone=workers == 1)
+    codes, failed = [], []
+    for (shot, _, _), done in zip(jobs, refine_shots(jobs, workers=workers, refine=refine), strict=True):
         if isinstance(done, PhysGraphError):
-            click.echo(f"error: {shot}: {done}", err=True)
-            codes.add(FAILED)
+            failed.append(f"error: {shot}: {done}")
+            codes.append(WRONG_USAGE if isinstance(done, UsageError) else FAILED)
         else:
-            codes.add(_say(done, f"{shot}: "))
-    return codes.pop() if len(codes) == 1 else IN_PART
+            codes.append(_say(done))
+    for line in failed:
+        click.echo(line, err=True)
+    if failed:
+        click.echo(f"{len(failed)} of {len(jobs)} shots failed", err=True)
+    return codes[0] if len(set(codes)) == 1 else IN_PART
 
 
-def _say(done: RefineReport, name: str, told: Sequence[str] = ()) -> int:
-    """Print the warnings that were not told yet and a run's layer, or after a dry run its report; returns the code."""
-    for warning in (each for each in done.warnings if each not in told):
-        click.echo(f"warning: {name}{warning}", err=True)
+def _say(done: RefineReport) -> int:
+    """Print a run's layer, or after a dry run its report; returns the exit code."""
     click.echo(done.to_json() if done.out is None else done.out)
     return done.exit_code
 
 
-def _one_each(
-    shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...] = ()
-) -> list[Path]:
+def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...]) -> list[Path]:
     """Name one output per shot: ``to`` itself when it is a file's name, else files in the folder ``to``."""
-    if to.suffix in (accepts or (suffix,)) and not to.is_dir():
+    if to.suffix in accepts and not to.is_dir():
         if len(shots) > 1:
             raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
+        return [to]
+    if to.suffix and not to.is_dir():
+        known = ", ".join(accepts)
+        raise UsageError(f"{option} {to}: unknown suffix '{to.suffix}'; known: {known}; or make a folder of that name")
+    if not suffix and len(shots) == 1:
         return [to]
     files = [to / (Path(shot).stem + suffix) for shot in shots]
     twice = sorted({str(file) for file in files if files.count(file) > 1})
     if twice:
         raise UsageError(f"{option} {to}: two shots would both be written to {twice[0]}; refine them one by one")
-    to.mkdir(parents=True, exist_ok=True)
     return files
 
 
-def _reports(shots: tuple[str, ...], to: Path) -> Sequence[Path]:
-    """One report per shot: a JSON file, or a folder with a page, inside ``to`` where there are several shots."""
-    if to.suffix == ".json" and not to.is_dir():
-        return _one_each(shots, to, "--report", suffix=".json")
-    to.mkdir(parents=True, exist_ok=True)
-    return [to] if len(shots) == 1 else _one_each(shots, to, "--report", suffix="")
+@contextmanager
+def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
+    """Make the folder that layers go into, unless ``out`` names a layer; it goes again where nothing came into it.
+
+    Finished frames that are left by an interruption are named.
+    """
+    from .frames import frames_folder
+
+    made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
+    try:
+        for folder in reversed(made):
+            folder.mkdir()
+    except OSError as error:
+        raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        for kept in filter(Path.is_dir, map(frames_folder, layers)):
+            click.echo(f"finished frames are kept in {kept}; --resume goes on from them", err=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 @contextmanager

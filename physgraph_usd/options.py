@@ -20,11 +20,13 @@ POTENTIALS = ("continuum", "paper")
 MODES = ("over", "sibling")
 CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
 """Forms of contact by their names on the command line."""
-REPORT_NAME = "report.json"
-"""Name of the report in a folder of its own."""
+REPORT_NAME, PAGE_NAME = "report.json", "report.html"
+"""Names of the report and its page in a folder of their own."""
 SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
-_NOT_OF_THE_RESULT = {"progress", "say", "report", "overwrite", "dry_run", "workers", "root", "asset_paths"}
+_NOT_OF_THE_RESULT = {
+    "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "asset_paths", "resume", "keep_frames",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ class RefineOptions:
         report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
+        resume: Go on from the finished frames of a run that was interrupted, in ``<layer>.frames``.
+        keep_frames: Leave finished frames there when the run is interrupted.
         velocities: Also write point velocities of garments that have none in the shot.
         heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
         rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
@@ -81,6 +85,8 @@ class RefineOptions:
     report: Path | None = None
     overwrite: bool = False
     dry_run: bool = False
+    resume: bool = False
+    keep_frames: bool = True
     velocities: bool = False
     heat_map: bool = False
     rest_frame: float | str | None = None
@@ -140,10 +146,17 @@ class RefineOptions:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
-        report = None if self.report is None else json_of(Path(self.report))
-        for file in (report, self.root):
-            if file is not None and not (self.overwrite or self.dry_run) and Path(file).exists():
-                raise UsageError(f"{file} exists; choose another name or allow overwriting")
+
+    def targets(self, layer: Path) -> list[tuple[str, Path]]:
+        """Every file that a run writes, in words and where."""
+        files = [("the layer", layer)]
+        if self.root is not None:
+            files.append(("the root", Path(self.root)))
+        if self.report is not None:
+            report = json_of(Path(self.report))
+            files.append(("the report", report))
+            files += [("the report's page", report.with_name(PAGE_NAME))] if report != self.report else []
+        return files
 
 
 def json_of(report: Path) -> Path:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .usd.atomic import write_text
+
 DONE, FAILED, IN_PART = 0, 1, 3
 
 
@@ -59,8 +61,9 @@ class RefineReport:
         return json.dumps(self.to_dict(), indent=2, default=str)
 
     def write(self, path: Path) -> None:
-        """Write the report as JSON, whole or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".part")
-        partial.write_text(self.to_json() + "\n", encoding="utf-8")
-        partial.replace(path)
+        """Write the report as JSON, whole or not at all.
+
+        Raises:
+            LayerError: It cannot be written.
+        """
+        write_text(path, self.to_json() + "\n")

@@ -310,6 +310,16 @@ def test_a_line_that_was_cut_off_is_dropped(tmp_path: Path):
     assert [row["method"] for row in Journal(tmp_path, {"shot": "a"}, overwrite=False).rows("point")] == ["a", "b"]
 
 
+@pytest.mark.parametrize("line", [b"{", b"[1]", b"\xff", b'{"row": "moon"}', b"[" * 100_000])
+def test_a_damaged_row_is_named(tmp_path: Path, line: bytes):
+    Journal(tmp_path, {"shot": "a"}, overwrite=False).add("point", method="a")
+    file = tmp_path / "chart.rows.jsonl"
+    file.write_bytes(file.read_bytes() + line + b"\n")
+    with pytest.raises(UsageError, match=r"chart\.rows\.jsonl, line 3"):
+        Journal(tmp_path, {"shot": "a"}, overwrite=False)
+    assert Journal(tmp_path, {"shot": "a"}, overwrite=True).rows("point") == []
+
+
 def test_a_solver_outside_is_measured_by_the_same_ruler(
     made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any
 ):

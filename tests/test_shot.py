@@ -285,7 +285,8 @@ class TestOptions:
         record = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc")).customLayerData["physgraph"]
         plain = RefineOptions(level=1, steps=3, heat_map=True).plain()
         assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
-            "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths",
+            "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths", "resume",
+            "keep_frames",
         }  # fmt: skip
         assert json.loads(json.dumps(record, default=str))
 

@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Tf, Usd, Vt
+from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError
 from .atomic import prepare_target, publish, temporary_path
-from .stage import reason_of
+from .stage import TRAVERSAL, USD_ERRORS, reason_of
 
 RECORD = "physgraph"
 _COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
@@ -88,7 +88,7 @@ def mute_refined(stage: Usd.Stage) -> list[str]:
 
 
 def file_hashes(stage: Usd.Stage, folder: Path, *, absolute: bool = False) -> dict[str, str]:
-    """SHA-256 of every file that a stage is composed from.
+    """SHA-256 of every layer that a stage is composed from, value clips included.
 
     Args:
         stage: The shot.
@@ -99,6 +99,11 @@ def file_hashes(stage: Usd.Stage, folder: Path, *, absolute: bool = False) -> di
         Hash by path, with forward slashes, sorted.
     """
     files = {Path(layer.realPath) for layer in stage.GetUsedLayers() if layer.realPath}
+    for prim in Usd.PrimRange.Stage(stage, TRAVERSAL):
+        if prim.HasAuthoredMetadata("clips"):
+            clips = Usd.ClipsAPI(prim)
+            named = [found for name in clips.GetClips() for found in clips.ComputeClipAssetPaths(name)]
+            files |= {Path(found.resolvedPath) for found in named if found.resolvedPath}
     paths = sorted(path for path in files if path.is_file())
     return {asset_path(path, folder, absolute=absolute): _sha256(path) for path in paths}
 
@@ -199,7 +204,7 @@ def export_layer(layer: Sdf.Layer, path: Path) -> Path:
         if not layer.Export(str(temporary)):
             raise LayerError(f"cannot write {path}")
         publish(temporary, path)
-    except Tf.ErrorException as error:
+    except USD_ERRORS as error:
         raise LayerError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -19,6 +19,8 @@ from ..errors import PhysGraphError, StageError
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
 """The name of a rule of USD's own parser, which tells a user nothing."""
+USD_ERRORS: tuple[type[Exception], ...] = (Tf.ErrorException, *filter(None, [getattr(Tf, "CppException", None)]))
+"""What pxr raises; it has the second, for files that end too early, since 24.11."""
 MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 STANDARD_GRAVITY = 9.81
@@ -102,18 +104,20 @@ def pxr_errors(what: str, kind: type[PhysGraphError] = StageError) -> Iterator[N
     """
     try:
         yield
-    except Tf.ErrorException as error:
+    except USD_ERRORS as error:
         raise kind(f"{what}: {reason_of(error)}") from error
     except UnicodeDecodeError as error:  # a damaged crate hands out names that are no text
         raise kind(f"{what}: a name in the file is no text; the file is damaged") from error
 
 
-def reason_of(error: Tf.ErrorException) -> str:
-    """Give the first reasons inside a USD error, without its C++ places."""
+def reason_of(error: Exception) -> str:
+    """Give the first reasons inside a USD error, without its C++ places and calls."""
     try:
         text = str(error)
     except UnicodeDecodeError:
         return "the file has bytes that are no text; it is damaged"
+    if not isinstance(error, Tf.ErrorException):
+        return f"the file is damaged or was cut short while it was read: {in_brief(text.partition(' - ')[0])}"
     reasons = [part.split(" : ", 1)[-1].strip().strip("'").strip() for part in text.split("\n\tError in ")]
     kept = list(dict.fromkeys(in_brief(reason) for reason in reasons if reason))
     return "; ".join(kept[:MOST_REASONS]) + _others(max(len(kept) - MOST_REASONS, 0)) or "USD gave no reason"

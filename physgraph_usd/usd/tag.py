@@ -11,6 +11,7 @@ from ..errors import StageError, UsageError
 from ..fabric import PRESETS, Fabric
 from ..sides import SIDES
 from .atomic import ASSET_PATHS, prepare_target
+from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .find import find_colliders, find_garments
 from .provenance import asset_path, export_layer, root_over
 from .schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, Property
@@ -59,8 +60,8 @@ def tag(
     if (layer is not None and not garments) or (side is not None and not colliders):
         raise UsageError("a layer is for garments and a side for colliders; name one")
     target = Path(out)
-    if target.resolve() == Path(shot).resolve():
-        raise UsageError(f"{out} is the shot itself; the input is never edited, choose another name")
+    check_suffix("the layer", target, LAYER_SUFFIXES)
+    check_targets([("the layer", target)], files_of(shot))
     prepare_target(target, overwrite=overwrite)
     stage, _ = open_stage(str(shot))
     cloth = find_garments(stage, garments) if garments else []

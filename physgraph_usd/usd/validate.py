@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Tf, Usd
+from pxr import Sdf, Usd
 
 from ..errors import LayerError
 from . import layer_rules
 from .provenance import read_record, recorded_shot, root_over
 from .rules import RULES, Fine, Problem, subsets
-from .stage import check_there, is_there, pxr_errors, reason_of
+from .stage import USD_ERRORS, check_there, is_there, pxr_errors, reason_of
 from .variants import same_variants
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
@@ -130,7 +130,7 @@ def _open(path: str | Path) -> Sdf.Layer:
     check_there(path, LayerError)
     try:
         layer = Sdf.Layer.FindOrOpen(str(path))
-    except Tf.ErrorException as error:
+    except USD_ERRORS as error:
         raise LayerError(f"cannot read {path}: {reason_of(error)}") from error
     if not layer:
         raise LayerError(f"cannot read {path}")
@@ -189,7 +189,7 @@ def _findings(
         try:
             context = module.ValidationContext([registry.GetOrLoadValidatorByName(name)])
             own = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]
-        except Tf.ErrorException:
+        except USD_ERRORS:
             failed.append(name)
             continue
         for findings, problems in zip(found, own, strict=True):

@@ -20,6 +20,7 @@ from ..mesh.subdivide import Refinement
 from . import overs, provenance
 from .atomic import termination_raises
 from .carry import FineMap
+from .files import check_targets, files_of
 from .heat import HeatTrack
 from .hints import ModelHints
 from .material_opinions import author_used_values
@@ -73,7 +74,7 @@ class LayerWriter:
             raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
-        _check_not_input(shot.stage, out)
+        check_targets([("the layer", out)], files_of(shot.path))
         _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._rate, self._velocities = _rate(shot.stage), velocities
@@ -247,14 +248,6 @@ def _rate(stage: Usd.Stage) -> float:
     """Time codes per second; USD's fallback of 24 where the stage's cannot be a rate."""
     rate = stage.GetTimeCodesPerSecond()
     return rate if rate > 0 else 24.0
-
-
-def _check_not_input(stage: Usd.Stage, out: Path) -> None:
-    """Refuse to write over a file that the shot is composed from."""
-    target = out.resolve()
-    for layer in stage.GetUsedLayers():
-        if layer.realPath and Path(layer.realPath).resolve() == target:
-            raise UsageError(f"{out} is part of the shot; the input is never edited, choose another name")
 
 
 def _check_not_refined(shot: Shot) -> None:
