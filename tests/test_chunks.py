@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shots import EDGE, cloth_shot, faults, fine, refine, sample_times
 
-from physgraph_usd.chunks import chunks_of, solve_in_chunks
+from physgraph_usd.chunks import RUN_UP, chunks_of, solve_in_chunks
 from physgraph_usd.errors import SolveError
 
 SEAM = 5e-2
@@ -29,6 +29,16 @@ def test_chunks_cover_all_times_once_evenly(count: int, workers: int):
     sizes = [b - a for a, b in parts]
     assert len(parts) <= workers
     assert not sizes or max(sizes) - min(sizes) <= 1
+
+
+@pytest.mark.parametrize(
+    ("count", "workers", "times"), [(24, 2, 1.33), (24, 4, 2.0), (240, 2, 1.9), (240, 4, 3.6), (24, 24, 24 / 7)]
+)
+def test_the_longest_process_says_how_much_quicker_a_shot_can_be(count: int, workers: int, times: float):
+    """The figures of docs/solver.md, by N / (N / W + R)."""
+    longest = max(last - max(0, first - RUN_UP) for first, last in chunks_of(list(range(count)), workers))
+    assert longest == count / workers + RUN_UP
+    assert count / longest == pytest.approx(times, rel=0.02)
 
 
 def test_order_and_run_up():
