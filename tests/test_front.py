@@ -8,7 +8,8 @@ import pytest
 
 pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
 
-from benchmarks.front import placed
+from benchmarks.front import SLOW_MS, TURNS, placed, timed
+from physgraph_usd.chart.problem import Solved
 from physgraph_usd.chart.table import quickest
 
 
@@ -39,6 +40,15 @@ def test_a_method_that_comes_below_the_reference_is_what_all_gaps_are_counted_fr
     assert line[3] == "28.00%"
     assert (known.least, known.by, known.apart) == (-0.25, "lbfgs, 8 steps", pytest.approx(0.2))
     assert "by lbfgs, 8 steps; the next best ends 20.00% of the fall above" in str(known)
+
+
+@pytest.mark.parametrize(("first", "turns"), [(20.0, TURNS), (SLOW_MS + 1.0, 1)])
+def test_the_time_of_every_method_is_the_least_of_as_many_turns(first: float, turns: int):
+    taken = [first, first - 5.0, first + 5.0][:turns]
+    left = iter(taken)
+    _, least = timed(lambda: Solved((), next(left), 0.0, 0, None))
+    assert least == min(taken)
+    assert not list(left)
 
 
 def test_a_time_between_two_budgets_is_interpolated_by_powers_and_what_gets_worse_is_left_out():
