@@ -34,8 +34,8 @@ STARTS = (
 """Integrators and steps: unlike one another, and what found the least first, for a short search ends early."""
 SHORT, LEAST = 3, 2
 """How many of them a short search takes, and one whose time is out: with one alone nobody knows how good it is."""
-ON, ROUNDS = ("quasi-newton-flat", 100), 3
-"""How a start goes on, and how often at most."""
+ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10
+"""How a start goes on, how often at most, and how often more where it is one of the finalists."""
 NEWTON, POLISHES = ("newton", 8), 6
 FINALISTS = 2
 SETTLED = 2e-4
@@ -182,6 +182,7 @@ def find_reference(
         )
         runs.append(descent.go_on(", and on", ON, most=ROUNDS, until=began + DESCENT * seconds))
     for each in sorted(runs, key=lambda run: run.energy)[:FINALISTS]:
+        each.go_on(", and on", ON, most=MORE, until=began + seconds)
         each.go_on(", and Newton", NEWTON, most=POLISHES, until=began + seconds)
     best, *others = sorted(runs, key=lambda run: run.energy)
     apart = (others[0].energy - best.energy) / max(start - best.energy, 1e-30) if others else None
