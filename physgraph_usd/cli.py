@@ -100,7 +100,7 @@ solve_options = _together(
     click.option("--contact", type=click.Choice(["quadratic", "paper", "off"]), help="How bodies push the cloth."),
     click.option("--self-contact", type=click.Choice(["auto", "paper", "off"]), help="How cloth pushes cloth."),
     click.option("--temporal", type=click.Choice(["tether", "warm", "off"]), help="How a frame uses the last one."),
-    click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes that share the frames."),
+    click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes; each begins 6 frames early."),
 )
 asset_paths_option = click.option(
     "--asset-paths", type=click.Choice(["relative", "absolute"]), help="How files written name other files."

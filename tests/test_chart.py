@@ -113,6 +113,14 @@ def test_gaps_lie_between_the_reference_and_plain_upsampling(made: tuple[Path, P
     assert set(chart.methods) >= {DEFAULT, UPSAMPLED, SMOOTH, "quasi-newton", "gd", "gd, nested"}
 
 
+def test_page_and_summary_name_who_found_the_least_and_how_far_the_next_one_is(made: tuple[Path, Path, Chart]):
+    _, folder, chart = made
+    [known] = chart.references
+    assert known["apart"] >= 0.0
+    assert any(known["by"] in line and f"ends {known['apart']:.2%} of the fall above" in line for line in chart.lines())
+    assert f"{known['apart']:.2%}" in (folder / "chart.html").read_text(encoding="utf-8")
+
+
 def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Chart], tmp_path: Path):
     shot, _, chart = made
     report = refine(

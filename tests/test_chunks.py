@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shots import EDGE, cloth_shot, faults, fine, refine, sample_times
 
-from physgraph_usd.chunks import chunks_of, solve_in_chunks
+from physgraph_usd.chunks import RUN_UP, chunks_of, solve_in_chunks
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SolveError, UsageError
 from physgraph_usd.frames import FrameFolder, Outcome
 
@@ -53,6 +53,17 @@ def test_chunks_cover_what_is_missing_once_evenly(missing: set[int], workers: in
     sizes = [sum(map(len, share)) for share in shares]
     assert len(shares) <= workers
     assert not sizes or max(sizes) - min(sizes) <= 1
+
+
+@pytest.mark.parametrize(
+    ("count", "workers", "times"), [(24, 2, 1.33), (24, 4, 2.0), (240, 2, 1.9), (240, 4, 3.6), (24, 24, 24 / 7)]
+)
+def test_the_longest_process_says_how_much_quicker_a_shot_can_be(count: int, workers: int, times: float):
+    """The figures of docs/solver.md, by N / (N / W + R)."""
+    parts = [part for share in chunks_of(range(count), workers) for part in share]
+    longest = max(part.stop - max(0, part.start - RUN_UP) for part in parts)
+    assert longest == count / workers + RUN_UP
+    assert count / longest == pytest.approx(times, rel=0.02)
 
 
 def test_order_and_run_up(tmp_path: Path):
