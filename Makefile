@@ -16,7 +16,7 @@ TESTS := $(BIN)/pytest -n $(JOBS)
 
 demo: $(VENV)/.demo
 	@mkdir -p $(DEMO)
-	@shot=$$($(BIN)/physgraph-usd sample sleeve -o $(DEMO)) && \
+	@shot=$$($(BIN)/physgraph-usd sample sleeve -o $(DEMO) --overwrite) && \
 	$(BIN)/physgraph-usd refine $$shot -o $(DEMO)/sleeve.refined.usdc --report $(DEMO)/sleeve.json --overwrite >/dev/null && \
 	$(BIN)/physgraph-usd preview $(DEMO)/sleeve.refined.usdc --shot $$shot -o $(DEMO)/sleeve.png >/dev/null && \
 	printf '\nshot     %s\nlayer    %s\nreport   %s\npicture  %s\n' \

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import torch
 
+from physgraph_usd.chart.reference import Reference
 from physgraph_usd.group import Group
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Integrator, System
@@ -35,7 +36,7 @@ from physgraph_usd.solve_settings import SolveSettings
 from physgraph_usd.train.patches import PatchConfig, make_patches
 
 from .rows import Found, Row, run_alone, say, table
-from .unseen import cases
+from .unseen import cases, reference_of
 
 STEPS = 30
 PAPER_STEPS = 5
@@ -63,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     named = [name for name in given.shots.split(",") if name]
     patches = garments(named, given) if named else trained_like(given.device)
     for number, patch in enumerate(patches):
-        say(f"\npatch {number}: {patch.words}, {patch.group.levels[-1].vertex_count} vertices")
+        say(f"\npatch {number}: {patch.words}, {patch.group.levels[-1].vertex_count} vertices, {patch.reference}")
         lines = curves(patch, given.weights, given.physgraph, device=given.device)
         show_table(lines)
         if given.out and number == 0:
@@ -72,14 +73,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A cloth in one pose: levels, a system each, recentred cage [m], first and least energy at the finest [J]."""
+    """A cloth in one pose: levels, a system each, recentred cage [m], and the least energy known."""
 
     words: str
     group: Group
     systems: list[System]
     coarse: torch.Tensor
-    start: float
-    least: float
+    reference: Reference
 
 
 def trained_like(device: str, config: PatchConfig = CONFIG) -> Iterator[Problem]:
@@ -89,7 +89,8 @@ def trained_like(device: str, config: PatchConfig = CONFIG) -> Iterator[Problem]
         chains, settings = refine_garments([garment], [garment.level]), SolveSettings(METHODS["quasi-newton"])
         group = Group([garment], chains, patch.gravity, settings, dtype=torch.float32, device=device)
         systems, coarse = group.systems([patch.frame])
-        yield Problem(patch.words, group, systems, coarse, patch.start[-1], patch.least[-1])
+        known = reference_of(garment, patch.gravity, patch.frame, level=garment.level, device=device)
+        yield Problem(patch.words, group, systems, coarse, known)
 
 
 def rows(short: bool) -> Found:
@@ -123,7 +124,7 @@ def overtaken(lines: dict[str, list[float]]) -> list[tuple[str, int]]:
 def garments(names: Sequence[str], given: argparse.Namespace) -> Iterator[Problem]:
     """Whole garments with gravity and guide, in jersey."""
     for case in cases(shots=names, fabrics=["jersey"], device=given.device, cache=given.cache):
-        yield Problem(case.name, case.group, case.systems, case.coarse, case.start, case.least)
+        yield Problem(case.name, case.group, case.systems, case.coarse, case.reference)
 
 
 def curves(patch: Problem, paper: Path, own: Path, *, device: str) -> dict[str, list[float]]:
@@ -142,7 +143,7 @@ def curves(patch: Problem, paper: Path, own: Path, *, device: str) -> dict[str, 
     if own.exists():
         network = load_network(own, kind="physgraph", device=device)
         found["physgraph, finest level"] = flat(patch, integrator_of(network))
-    return found
+    return from_least(found)
 
 
 def best(name: str, runs: dict[float, list[float]]) -> dict[str, list[float]]:
@@ -159,7 +160,7 @@ def flat(patch: Problem, integrator: Integrator) -> list[float]:
     while len(gaps) <= STEPS:
         after = integrator.step(system, carry)
         waiting = min(max(system.evaluations - before, 1), STEPS + 1 - len(gaps)) - 1
-        gaps += [gaps[-1]] * waiting + [gap(patch, after.energy)]
+        gaps += [gaps[-1]] * waiting + [patch.reference.gap(after.energy)]
         carry, before = after, system.evaluations
     return gaps
 
@@ -174,13 +175,14 @@ def nested(patch: Problem, integrator: Integrator) -> list[float]:
             x, report = solve_level(system, integrator, x, level=index, budget=Budget(each))
             energy, spent = report.energy_after, spent + report.evaluations
         if spent <= STEPS:
-            gaps[spent] = gap(patch, energy)
+            gaps[spent] = patch.reference.gap(energy)
     return gaps
 
 
-def gap(patch: Problem, energy: float) -> float:
-    """(Phi - Phi*) / (Phi0 - Phi*)."""
-    return (energy - patch.least) / (patch.start - patch.least)
+def from_least(lines: dict[str, list[float]]) -> dict[str, list[float]]:
+    """Gaps counted from the least energy that any of them came to, where that is below the one known before."""
+    least = min(0.0, *(value for gaps in lines.values() for value in gaps if math.isfinite(value)))
+    return {name: [(value - least) / (1.0 - least) for value in gaps] for name, gaps in lines.items()}
 
 
 def show_table(lines: dict[str, list[float]]) -> None:

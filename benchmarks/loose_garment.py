@@ -21,15 +21,13 @@ from scipy.spatial import cKDTree
 
 from benchmarks.rows import Found, Row, run_alone, under
 from benchmarks.shots import frames_of, opened, problem_of
-from physgraph_usd.chart.problem import COLD, Problem
+from physgraph_usd.chart.problem import COLD
+from physgraph_usd.chart.reference import find_reference
 from physgraph_usd.level import Level
-from physgraph_usd.scene import Frame
 
 TIME = 24.0
 BAND = (4.0, 10.0)
 """Wavelengths of the band, in mean fine edges."""
-STEPS = {True: 100, False: 400}
-"""Steps of the converged solve at the finest level, by whether the form is the short one."""
 
 
 def measure(short: bool) -> Found:
@@ -39,27 +37,24 @@ def measure(short: bool) -> Found:
     [frame] = frames_of(shot, [TIME])
     settings = replace(COLD, contact=replace(COLD.contact, cloth="off"))
     ours = single.solve(frame, settings).points[0]
-    least = double.solve(frame, replace(settings, steps=STEPS[short], tolerance=0.0)).points[0]
-    plain, smooth = (single.upsampled(frame, smooth=smooth)[0] for smooth in (False, True))
-    energy = [energy_of(double, frame, points) for points in (ours, least, plain, smooth)]
+    found = find_reference(double, frame, settings=settings, short=short)
+    least = found.points[0]
+    smooth = single.upsampled(frame, smooth=True)[0]
+    energies = [double.judge(frame, [points], settings).energies for points in (ours, smooth)]
+    known = found.lowered(energies[0], "refine's default")
+    gaps = [100 * known.gap(sum(each.values())) for each in energies]
     level = single.refiner.groups[0].levels[-1]
     h = float(level.spacing.mean())
     bands = [band_energy(level, points - smooth) for points in (ours, least)]
     apart = chamfer(ours, least)
     rows = [
-        under("gap of refine's default", 100 * (energy[0] - energy[1]) / (energy[2] - energy[1]), 5.0, unit=" %"),
-        Row("gap of Loop subdivision", f"{100 * (energy[3] - energy[1]) / (energy[2] - energy[1]):.3g} %"),
+        under("gap of refine's default", gaps[0], 5.0, unit=" %"),
+        Row("gap of Loop subdivision", f"{gaps[1]:.3g} %"),
         within("detail of 4 to 10 edges, over the converged solve's", bands[0] / bands[1], 0.25),
         Row("distance from the converged solve", f"{1e3 * apart:.2f} mm ({apart / h:.2f} edges)"),
         Row("distance of Loop subdivision from it", f"{1e3 * chamfer(smooth, least):.2f} mm"),
     ]
-    return Found(rows, [f"{len(ours):,} fine vertices, time code {TIME:g}."])
-
-
-def energy_of(problem: Problem, frame: Frame, points: np.ndarray) -> float:
-    """All that is minimised here [J]."""
-    found = problem.judge(frame, [points]).energies
-    return sum(value for name, value in found.items() if name != "self_contact")
+    return Found(rows, [f"{len(ours):,} fine vertices, time code {TIME:g}. {known}."])
 
 
 def within(what: str, value: float, most: float) -> Row:

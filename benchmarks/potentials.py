@@ -14,6 +14,7 @@ overlapping parts of the body, where there is no outside and the report calls it
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -23,6 +24,7 @@ import torch
 from benchmarks.rows import Found, Row, run_alone, table, under
 from benchmarks.shots import distances, frames_of, opened, problem_of
 from physgraph_usd.chart.problem import Problem, with_garments
+from physgraph_usd.chart.reference import Reference, find_reference
 from physgraph_usd.fabric import PRESETS
 from physgraph_usd.integrate import METHODS, Method
 from physgraph_usd.integrate.learned import integrator_of
@@ -47,8 +49,8 @@ WIDER = 0.003
 """An offset with which the cloth lies outside that margin [m]."""
 K, STEPS = 5, 12
 """Steps of the paper's network and of refine's default."""
-CONVERGED, LONG = 60, 500
-"""Steps of the converged solve at the finest level, short and long form; four times as many below."""
+SECONDS = {True: 60.0, False: math.inf}
+"""Time for the least energy of a pose, by whether the form is the short one."""
 TERMS: tuple[str, ...] = ("stretch", "bending", "gravity")
 INPUT, LOOP, LEAST = "skinned input, upsampled", "Loop subdivision", "converged"
 RAW, GUARDED = "physgraph-paper, K = 5, raw", "physgraph-paper, K = 5, guarded"
@@ -106,12 +108,12 @@ class Sums:
 def measure(short: bool) -> Found:
     """The tables of all samples, and what they come to."""
     rows: list[Row] = []
-    steps = CONVERGED if short else LONG
-    notes = [form(short, steps)]
+    notes = []
     for name in POSES:
-        sums = run(name, steps)
-        fall = sums[INPUT].whole - sums[LEAST].whole
-        gap = {each: 100 * (found.whole - sums[LEAST].whole) / fall for each, found in sums.items()}
+        sums, known = run(name, short)
+        least = sum(each.least for each in known)
+        fall = sums[INPUT].whole - least
+        gap = {each: 100 * (found.whole - least) / fall for each, found in sums.items()}
         rows += figures(name, sums, gap)
         head = [f"{name}, mean of {sums[INPUT].poses} [erg]", "potential", *TERMS, "gap", "within 2 mm", "inside"]
         lines = [
@@ -124,14 +126,11 @@ def measure(short: bool) -> Found:
             ]
             for each, found in sums.items()
         ]
-        notes.append(table(head, lines))
+        notes += [
+            table(head, lines),
+            "\n".join(f"- {name}, {time:g}: {each}" for time, each in zip(POSES[name][1], known, strict=True)),
+        ]
     return Found(rows, notes)
-
-
-def form(short: bool, steps: int) -> str:
-    """How far the converged solve went, in words."""
-    other = f", the long form {LONG}" if short else ""
-    return f"The converged solve takes {steps} steps at the finest level{other}."
 
 
 def figures(name: str, sums: dict[str, Sums], gap: dict[str, float]) -> list[Row]:
@@ -149,16 +148,18 @@ def figures(name: str, sums: dict[str, Sums], gap: dict[str, float]) -> list[Row
     ]
 
 
-def run(name: str, steps: int) -> dict[str, Sums]:
-    """Every method over the poses of a sample, the converged solve with so many steps."""
+def run(name: str, short: bool) -> tuple[dict[str, Sums], list[Reference]]:
+    """Every method over the poses of a sample, and the least energy known of each pose."""
     garments, times = POSES[name]
     shot = opened(name, LEVEL, garments)
     single, double = problem_of(shot), problem_of(shot, torch.float64)
     sums: dict[str, Sums] = {}
+    least: list[Reference] = []
     raw = Method(lambda: integrator_of(shipped_network("physgraph-paper")), nested=False)
     for frame in frames_of(shot, times):
         here = with_garments(frame, lambda each: replace(each, fabric=PRESETS["paper"]))
         wide = with_garments(here, lambda each: replace(each, offset=WIDER))
+        known = find_reference(double, here, seconds=SECONDS[short])
         results = {
             INPUT: single.upsampled(here, smooth=False),
             LOOP: single.upsampled(here, smooth=True),
@@ -166,7 +167,7 @@ def run(name: str, steps: int) -> dict[str, Sums]:
             GUARDED: solved(single, here, METHODS["physgraph-paper"], K),
             OURS: solved(single, here, METHODS["quasi-newton"], STEPS),
             OUTSIDE: solved(single, wide, METHODS["quasi-newton"], STEPS),
-            LEAST: solved(double, here, METHODS["quasi-newton"], steps),
+            LEAST: known.points,
         }
         height = in_paper_form(double, here, results[INPUT])["gravity"]
         for method, points in results.items():
@@ -174,7 +175,9 @@ def run(name: str, steps: int) -> dict[str, Sums]:
             paper["gravity"] -= height
             whole = double.judge(wide if method == OUTSIDE else here, points).energy
             sums.setdefault(method, Sums()).add(paper, whole, distances(double, here, points))
-    return sums
+            known = known if method == OUTSIDE else known.lowered({"all": whole}, method)
+        least.append(known)
+    return sums, least
 
 
 def solved(problem: Problem, frame: Frame, method: Method, steps: int) -> tuple[np.ndarray, ...]:

@@ -4,7 +4,7 @@
 
 Prints the gap (Phi - Phi*) / (Phi0 - Phi*) of nested quasi-Newton against milliseconds, force evaluation against torch
 autograd, and the whole frame's time, reading and writing included, against its solver time. Times are medians of one
-run; compare them as ratios. Phi* is the least energy that float64 nested quasi-Newton and Newton found.
+run; compare them as ratios. Phi* is that of `physgraph_usd.chart.reference`, as in every benchmark.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.unseen import reference_of
+from physgraph_usd.chart.reference import Reference
 from physgraph_usd.forces.base import ForceModule
 from physgraph_usd.group import Group
 from physgraph_usd.integrate import method_named
-from physgraph_usd.integrate.newton import Newton
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.level import Level
@@ -58,17 +59,19 @@ def main() -> None:
         frame = shot.frame(shot.scene.times[-1]).garments
         refinements = Refiner.subdivide(shot.scene, [g.level for g in shot.scene.garments])
         settings = SolveSettings(method_named("quasi-newton"))
-        single, double = (
-            Group(
-                shot.scene.garments, refinements, shot.scene.gravity, settings, dtype=dtype, device="cpu", lanes=CORES
-            )
-            for dtype in (torch.float32, torch.float64)
+        single = Group(
+            shot.scene.garments,
+            refinements,
+            shot.scene.gravity,
+            settings,
+            dtype=torch.float32,
+            device="cpu",
+            lanes=CORES,
         )
         finest = single.levels[-1]
         say(f"sleeve, last frame: {finest.vertex_count} fine vertices, {len(finest.edges)} edges")
-        start, least = reference(double, frame)
-        say(f"Phi0 {start:.6g} J, Phi* {least:.6g} J")
-        front = schedule_table(single, frame, start, least)
+        known = reference_of(shot.scene.garments[0], shot.scene.gravity, frame[0], level=shot.scene.garments[0].level)
+        front = schedule_table(single, frame, known)
         say_ratio(front)
         evaluation_table(single, frame)
         frame_table(shot_path, Path(folder))
@@ -87,27 +90,15 @@ def descend(group: Group, frame, steps) -> tuple[float, float, torch.Tensor]:
     return energy, time.perf_counter() - began, x
 
 
-def reference(group: Group, frame) -> tuple[float, float]:
-    """Energy of the upsampled input and the least energy known [J]."""
-    systems, coarse = group.systems(frame)
-    start = systems[-1].energy_and_force(group.levels[-1].base.apply(coarse))[0]
-    energies = []
-    for steps in ((400, 400, 1200), (80, 80, 800)):
-        energy, _, x = descend(group, frame, steps)
-        energies.append(energy)
-    x, report = solve_level(systems[-1], Newton(), x, level=0, budget=Budget(5))
-    return start, min(*energies, report.energy_after)
-
-
-def schedule_table(group: Group, frame, start: float, least: float) -> list[tuple[float, float]]:
+def schedule_table(group: Group, frame, known: Reference) -> list[tuple[float, float]]:
     """Print gap against time; returns (gap, seconds) for each schedule."""
+    runs = {steps: [descend(group, frame, steps) for _ in range(REPEATS)] for steps in SCHEDULES}
+    for steps, made in runs.items():
+        known = known.lowered({"all": made[0][0]}, f"quasi-Newton, {steps} steps")
+    say(f"Phi0 {1e3 * known.start:.5g} mJ, {known}")
     say("\n| steps per level | gap | ms |\n|---|---|---|")
-    front = []
-    for steps in SCHEDULES:
-        runs = [descend(group, frame, steps) for _ in range(REPEATS)]
-        gap = (runs[0][0] - least) / (start - least)
-        seconds = statistics.median(run[1] for run in runs)
-        front.append((gap, seconds))
+    front = [(known.gap(made[0][0]), statistics.median(run[1] for run in made)) for made in runs.values()]
+    for steps, (gap, seconds) in zip(SCHEDULES, front, strict=True):
         say(f"| {steps} | {gap:.2%} | {1e3 * seconds:.0f} |")
     return front
 

@@ -10,20 +10,22 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from physgraph_usd.chart.problem import ALONE, Problem
+from physgraph_usd.chart.reference import Reference, find_reference
 from physgraph_usd.fabric import PRESETS
 from physgraph_usd.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.integrate.base import Carry, Integrator, System
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.saddle import leave_saddle
 from physgraph_usd.integrate.solve import Budget, solve_level
 from physgraph_usd.level import refine_garments
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import Garment, GarmentFrame
+from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
 from physgraph_usd.solve_settings import SolveSettings
 from physgraph_usd.usd.reader import open_shot
 
@@ -37,12 +39,11 @@ SHOTS: dict[str, tuple[str, float | None]] = {
     "02_makehuman_usdskel_dm.usdc": ("/shot/char/shorts", 30.0),
     "06_torus_pull.usda": ("/shot/cloth", 30.0),
     "09_cesiumman_kilt/shot.usda": ("/shot/kilt", 24.0),
+    "10_style3d_skirt_twist.usdc": ("/shot/skirt", 10.0),
 }
 """Samples and, where the folder of real assets is there, shots: garment and time code (None: the last)."""
 FABRICS = ("jersey", "denim", "silk")
 LEVEL = 2
-REFERENCE = ((150, 150, 200), (40, 80, 200))
-"""Nested quasi-Newton in float64 behind the least energy known."""
 LANES = os.cpu_count() or 1
 
 
@@ -56,8 +57,7 @@ class Case:
         frame: Its pose and fabric.
         systems: One a level.
         coarse: Recentred cage [m].
-        start: Energy of the upsampled cage [J].
-        least: Least energy known [J].
+        reference: The least energy known.
     """
 
     name: str
@@ -65,12 +65,7 @@ class Case:
     frame: GarmentFrame
     systems: list[System]
     coarse: torch.Tensor
-    start: float
-    least: float
-
-    def gap(self, energy: float) -> float:
-        """(Phi - Phi*) / (Phi0 - Phi*)."""
-        return (energy - self.least) / (self.start - self.least)
+    reference: Reference
 
 
 def cases(
@@ -80,6 +75,7 @@ def cases(
     device: str = "cpu",
     cache: Path | None = None,
     level: int = LEVEL,
+    short: bool = False,
 ) -> Iterator[Case]:
     """Cases one after another; real shots are left out where they are not there.
 
@@ -89,8 +85,9 @@ def cases(
         device: "cpu" or "cuda".
         cache: JSON file that keeps the least energies, or None.
         level: Subdivisions.
+        short: Whether the least energies are looked for from fewer starts.
     """
-    known: dict[str, float] = json.loads(cache.read_text()) if cache and cache.exists() else {}
+    known: dict[str, Any] = json.loads(cache.read_text()) if cache and cache.exists() else {}
     for name in shots:
         opened = opened_garment(name)
         if opened is None:
@@ -99,23 +96,23 @@ def cases(
         for fabric in fabrics:
             frame = replace(points, fabric=PRESETS[fabric])
             label = f"{name.partition('/')[0].partition('.')[0]}, {fabric}"
-            single, double = (
-                plain_group(garment, gravity, d, level=level, device=device) for d in (torch.float32, torch.float64)
-            )
-            key = f"{label}, level {level}"
-            if key not in known:
-                known[key] = least_of(double, frame)
+            group = plain_group(garment, gravity, torch.float32, level=level, device=device)
+            key = f"{label}, level {level}{', short' if short else ''}"
+            if not isinstance(known.get(key), dict):
+                known[key] = reference_of(garment, gravity, frame, level=level, device=device, short=short).plain()
                 if cache:
                     cache.write_text(json.dumps(known, indent=1))
-            systems, coarse = single.systems([frame])
-            start = systems[-1].energy_and_force(single.levels[-1].base.apply(coarse))[0]
-            yield Case(label, single, frame, systems, coarse, start, known[key])
+            systems, coarse = group.systems([frame])
+            yield Case(label, group, frame, systems, coarse, Reference.of(known[key]))
 
 
-def least_of(group: Group, frame: GarmentFrame) -> float:
-    """The least energy of some long nested solves [J]."""
-    systems, coarse = group.systems([frame])
-    return min(descend(group, systems, coarse, QuasiNewton(), steps=steps).energy for steps in REFERENCE)
+def reference_of(
+    garment: Garment, gravity: np.ndarray, frame: GarmentFrame, *, level: int, device: str = "cpu", short: bool = False
+) -> Reference:
+    """The least energy known of a garment that touches nothing, in one frame."""
+    scene = Scene((garment,), gravity, ())
+    problem = Problem(scene, [level], device=device, lanes=LANES, dtype=torch.float64)
+    return find_reference(problem, Frame(None, (frame,)), settings=ALONE, short=short)
 
 
 @dataclass(frozen=True)

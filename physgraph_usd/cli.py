@@ -6,11 +6,12 @@ Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part.
 
 from __future__ import annotations
 
+import errno
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
@@ -18,10 +19,11 @@ from typing import TYPE_CHECKING, Any, Never
 import click
 
 from . import __version__
-from .cli_types import FrameRange, PictureSize, RefineLevel
-from .errors import PhysGraphError, UsageError
+from .cli_types import FrameRange, PictureSize, RefineLevel, RestShape
+from .errors import LayerError, PhysGraphError, UsageError
 
 if TYPE_CHECKING:
+    from .options import RefineOptions
     from .report import RefineReport
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
@@ -38,11 +40,18 @@ class Commands(click.Group):
     """A group whose commands end with ``error: ...`` and the error's exit code instead of a traceback."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command; an error of our tree becomes one line on stderr."""
+        """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
+        from .processes import memory_is_named
+
         try:
-            return super().invoke(ctx)
+            with memory_is_named():
+                return super().invoke(ctx)
         except PhysGraphError as error:
             _leave(ctx, str(error), WRONG_USAGE if isinstance(error, UsageError) else FAILED)
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise
+            _leave(ctx, f"{error.filename or 'cannot read or write'}: {error.strerror}", FAILED)
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
             if missing not in EXTRAS:
@@ -74,7 +83,9 @@ scene_options = _together(
     collider_option,
     click.option("--level", type=RefineLevel(), metavar="N|auto", help="Subdivisions; each makes four faces of one."),
     click.option("--set", "overrides", multiple=True, metavar="PRIM.ATTR=VALUE", help="Override an attribute."),
-    click.option("--rest", "rest_frame", type=float, metavar="FRAME", help="Take the rest shape from this frame."),
+    click.option(
+        "--rest", "rest_frame", type=RestShape(), metavar="FRAME|auto", help="Rest shape: this frame, or fitted to all."
+    ),
 )
 solve_options = _together(
     click.option("--integrator", metavar="NAME", help="How forces become displacements."),
@@ -89,13 +100,17 @@ solve_options = _together(
     click.option("--contact", type=click.Choice(["quadratic", "paper", "off"]), help="How bodies push the cloth."),
     click.option("--self-contact", type=click.Choice(["auto", "paper", "off"]), help="How cloth pushes cloth."),
     click.option("--temporal", type=click.Choice(["tether", "warm", "off"]), help="How a frame uses the last one."),
-    click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes that share the frames."),
+    click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes; each begins 6 frames early."),
+)
+asset_paths_option = click.option(
+    "--asset-paths", type=click.Choice(["relative", "absolute"]), help="How files written name other files."
 )
 layer_options = _together(
     click.option("--mode", type=click.Choice(["over", "sibling"]), help="Refine in place, or beside the coarse mesh."),
-    click.option("--velocities", is_flag=True, help="Also write point velocities."),
+    click.option("--velocities", is_flag=True, help="Write point velocities even where the shot has none."),
     click.option("--heat-map", is_flag=True, help="Also write depth inside bodies and crossings as primvars."),
     click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),
+    asset_paths_option,
     click.option(
         "--report",
         type=click.Path(path_type=Path),
@@ -105,6 +120,8 @@ layer_options = _together(
     click.option("--progress", is_flag=True, help="Say each frame in a line of its own, into files and pipes too."),
     click.option("--strict", is_flag=True, help="Exit with 3 where a frame did not settle."),
     overwrite_option,
+    click.option("--resume", is_flag=True, help="Go on from the finished frames of a run that was interrupted."),
+    click.option("--keep-frames/--no-keep-frames", default=True, help="Leave finished frames when interrupted."),
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )
 
@@ -136,18 +153,26 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 
     The options that are left out keep the defaults of physgraph_usd.RefineOptions.
     """
+    from .options import RefineOptions
+    from .usd.atomic import termination_raises
+
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
     none = [None] * len(shots)
-    reports = none if report is None else _reports(shots, report)
-    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda")
+    reports = none if report is None else _one_each(shots, report, "--report", suffix="", accepts=(".json",))
+    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda", accepts=USD_SUFFIXES)
     given = {name: value for name, value in options.items() if value is not None}
-    if len(shots) > 1 and given.get("workers", 1) > 1:
-        sys.exit(_refine_side_by_side(shots, layers, reports, roots, given))
-    codes = {
-        _refine_one(shot, layer, given | {"report": report, "root": root}, name=f"{shot}: " if len(shots) > 1 else "")
+    in_lines, workers = given.pop("progress", False), given.pop("workers", 1)
+    jobs = [
+        (shot, layer, RefineOptions(**given, report=report, root=root))
         for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
-    }
-    sys.exit(codes.pop() if len(codes) == 1 else IN_PART)
+    ]
+    with termination_raises(), _folder_of(layers, out, dry_run=given["dry_run"]):
+        if len(jobs) > 1:
+            code = _refine_each(jobs, workers=workers, in_lines=in_lines)
+        else:
+            only, layer, settings = jobs[0]
+            code = _say(_refine_shown(only, layer, replace(settings, workers=workers), in_lines=in_lines))
+    sys.exit(code)
 
 
 @main.command()
@@ -155,12 +180,16 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 @scene_options
 @json_option
 def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
-    """Print what would be refined, with what, from where, and every defect found in SHOT."""
+    """Print what would be refined, with what, from where, and every defect found in SHOT.
+
+    Exits with 1 when SHOT cannot be refined as asked.
+    """
     from .shot import inspect_shot
 
     given = {name: value for name, value in options.items() if value is not None}
     found = inspect_shot(shot, **given)
     click.echo(json.dumps(found, indent=2) if as_json else "\n".join(_outline(found)))
+    sys.exit(FAILED if "problem" in found else DONE)
 
 
 @main.command()
@@ -171,12 +200,14 @@ def inspect(shot: str, *, as_json: bool, **options: Any) -> None:
 @click.option("--preset", metavar="FABRIC", help="Fabric of the garments, such as denim; see docs/fabrics.md.")
 @click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
 @click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
+@asset_paths_option
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
     """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
     from .usd.tag import tag as tag_shot
 
-    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **options))
+    given = {name: value for name, value in options.items() if value is not None}
+    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **given))
 
 
 @main.command()
@@ -201,11 +232,12 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
 @main.command()
 @click.argument("name", default="sleeve")
 @out_option("DIR", "Folder to write into.")
-def sample(name: str, out: Path) -> None:
+@overwrite_option
+def sample(name: str, out: Path, *, overwrite: bool) -> None:
     """Write the sample shot NAME and print its path; an unknown name lists those there are."""
     from .samples import write_sample
 
-    click.echo(write_sample(name, out))
+    click.echo(write_sample(name, out, overwrite=overwrite))
 
 
 @main.command()
@@ -275,76 +307,91 @@ def schema_path() -> None:
     click.echo(find())
 
 
-def _refine_one(shot: str, layer: Path, options: dict[str, Any], *, name: str) -> int:
-    from .options import RefineOptions
+def _refine_shown(
+    shot: str, layer: Path, options: RefineOptions, *, in_lines: bool, several: bool = False, alone: bool = True
+) -> RefineReport:
+    """Refine a shot and say on stderr each warning when it is known, and how far it is where it is alone at work."""
     from .shot import refine_shot
 
-    try:
-        with _progress(Path(shot).name, in_lines=options.pop("progress", False)) as progress:
-            done = refine_shot(shot, layer, RefineOptions(**options, progress=progress))
-    except UsageError:
-        raise
-    except PhysGraphError as error:
-        click.echo(f"error: {name}{error}", err=True)
-        return FAILED
-    return _say(done, name)
+    told: list[str] = []
+
+    def tell(warning: str) -> None:
+        if warning not in told:
+            told.append(warning)
+            click.echo(f"warning: {shot}: {warning}" if several else f"warning: {warning}", err=True)
+
+    with _progress(Path(shot).name, in_lines=in_lines) if alone else nullcontext() as progress:
+        done = refine_shot(shot, layer, replace(options, progress=progress, say=tell))
+    for warning in done.warnings:
+        tell(warning)
+    return done
 
 
-def _refine_side_by_side(
-    shots: tuple[str, ...],
-    layers: list[Path],
-    reports: Sequence[Path | None],
-    roots: Sequence[Path | None],
-    given: dict[str, Any],
-) -> int:
-    """Refine several shots in processes of their own; each shot keeps to one."""
-    from .options import RefineOptions
+def _refine_each(jobs: Sequence[tuple[str, Path, RefineOptions]], *, workers: int, in_lines: bool) -> int:
+    """Refine several shots, each in a process of its own, and say at the end which failed and why."""
     from .shot import refine_shots
 
-    jobs = [
-        (shot, layer, RefineOptions(**given, report=report, root=root))
-        for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True)
-    ]
-    codes = set()
-    for shot, done in zip(shots, refine_shots(jobs, workers=given["workers"]), strict=True):
+    refine = partial(_refine_shown, in_lines=in_lines, several=True, alone=workers == 1)
+    codes, failed = [], []
+    for (shot, _, _), done in zip(jobs, refine_shots(jobs, workers=workers, refine=refine), strict=True):
         if isinstance(done, PhysGraphError):
-            click.echo(f"error: {shot}: {done}", err=True)
-            codes.add(FAILED)
+            failed.append(f"error: {shot}: {done}")
+            codes.append(WRONG_USAGE if isinstance(done, UsageError) else FAILED)
         else:
-            codes.add(_say(done, f"{shot}: "))
-    return codes.pop() if len(codes) == 1 else IN_PART
+            codes.append(_say(done))
+    for line in failed:
+        click.echo(line, err=True)
+    if failed:
+        click.echo(f"{len(failed)} of {len(jobs)} shots failed", err=True)
+    return codes[0] if len(set(codes)) == 1 else IN_PART
 
 
-def _say(done: RefineReport, name: str) -> int:
-    """Print a run's warnings and its layer, or after a dry run its report; returns the exit code."""
-    for warning in done.warnings:
-        click.echo(f"warning: {name}{warning}", err=True)
+def _say(done: RefineReport) -> int:
+    """Print a run's layer, or after a dry run its report; returns the exit code."""
     click.echo(done.to_json() if done.out is None else done.out)
     return done.exit_code
 
 
-def _one_each(
-    shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...] = ()
-) -> list[Path]:
+def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...]) -> list[Path]:
     """Name one output per shot: ``to`` itself when it is a file's name, else files in the folder ``to``."""
-    if to.suffix in (accepts or (suffix,)) and not to.is_dir():
+    if to.suffix in accepts and not to.is_dir():
         if len(shots) > 1:
             raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
+        return [to]
+    if to.suffix and not to.is_dir():
+        known = ", ".join(accepts)
+        raise UsageError(f"{option} {to}: unknown suffix '{to.suffix}'; known: {known}; or make a folder of that name")
+    if not suffix and len(shots) == 1:
         return [to]
     files = [to / (Path(shot).stem + suffix) for shot in shots]
     twice = sorted({str(file) for file in files if files.count(file) > 1})
     if twice:
         raise UsageError(f"{option} {to}: two shots would both be written to {twice[0]}; refine them one by one")
-    to.mkdir(parents=True, exist_ok=True)
     return files
 
 
-def _reports(shots: tuple[str, ...], to: Path) -> Sequence[Path]:
-    """One report per shot: a JSON file, or a folder with a page, inside ``to`` where there are several shots."""
-    if to.suffix == ".json" and not to.is_dir():
-        return _one_each(shots, to, "--report", suffix=".json")
-    to.mkdir(parents=True, exist_ok=True)
-    return [to] if len(shots) == 1 else _one_each(shots, to, "--report", suffix="")
+@contextmanager
+def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
+    """Make the folder that layers go into, unless ``out`` names a layer; it goes again where nothing came into it.
+
+    Finished frames that are left by an interruption are named.
+    """
+    from .frames import frames_folder
+
+    made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
+    try:
+        for folder in reversed(made):
+            folder.mkdir()
+    except OSError as error:
+        raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        for kept in filter(Path.is_dir, map(frames_folder, layers)):
+            click.echo(f"finished frames are kept in {kept}; --resume goes on from them", err=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 @contextmanager

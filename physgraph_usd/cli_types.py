@@ -40,6 +40,19 @@ class RefineLevel(click.ParamType):
         return int(value)
 
 
+class RestShape(click.ParamType):
+    """A time code, or ``auto``."""
+
+    name = "rest"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        """Turn the text into a time code, unless it is ``auto``."""
+        try:
+            return value if value == "auto" else float(value)
+        except ValueError:
+            self.fail(f"{value!r} is neither a time code nor 'auto'", param, ctx)
+
+
 class PictureSize(click.ParamType):
     """Width and height in pixels, ``1280x640``."""
 

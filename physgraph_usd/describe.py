@@ -14,31 +14,41 @@ from .integrate import LEARNED
 from .mesh.defects import defects
 from .options import RefineOptions
 from .report import RefineReport
-from .resolution import LevelChoice
+from .resolution import LevelChoice, carries_none, choose_levels, sample_frames
 from .scene import Frame, Garment, GarmentFrame
+from .strain import strained_parts, stretched
 from .usd.reader import Shot
 from .usd.stage import GarmentSource
 from .usd.survey import survey
 
 
-def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> RefineReport:
-    """Start the report of a run.
+def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
+    """Start the report of a run: choose the levels, and look for what a few frames give away.
 
     Args:
         opened: The shot.
-        choices: The level of each garment.
         options: The run's options.
 
     Returns:
         A report without frames.
     """
     report = RefineReport(opened.path, None, options.plain())
-    first = _first_frame(opened)
+    first, frames = _first_frame(opened), sample_frames(opened.scene, opened.frame)
+    choices = choose_levels(opened.scene, frames)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
-    report.garments = [_garment(*part) | {"colliders": _felt(opened, part[0])} for part in parts]
+    written = "--velocities" if options.velocities else "none"
+    report.garments = [
+        _garment(*part)
+        | {"colliders": _felt(opened, part[0])}
+        | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
+        for part in parts
+    ]
+    known = [carries_none(garment.path, choice) for garment, choice in zip(opened.scene.garments, choices, strict=True)]
+    known += _strained(opened, report, frames)
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
-    report.warnings = [str(notice) for notice in opened.warnings]
+    report.variants = list(opened.selections)
+    report.warnings = [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
     return report
 
 
@@ -68,9 +78,9 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
         report.left_out["network"] = f"--integrator {asked}" + "".join(f"; {reason}" for reason in reasons)
 
 
-def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> dict[str, Any]:
+def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
-    report = begin_report(opened, choices, options)
+    report = begin_report(opened, options)
     return {
         "shot": opened.path,
         "metres_per_unit": opened.metres_per_unit,
@@ -79,6 +89,7 @@ def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOption
         "colliders": list(opened.colliders),
         "modelled": report.modelled,
         "left_out": report.left_out,
+        "variants": report.variants,
         "defects": {
             garment.path: [defect.message for defect in defects(garment.mesh, garment.rest)]
             for garment in opened.scene.garments
@@ -137,10 +148,14 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "faces": len(garment.mesh.counts),
         "size_m": [round(float(length), 4) for length in size],
         "samples": len(source.times),
+        "samples_left_out": len(source.left_out),
         "level": choice.level,
         "level_reason": choice.reason,
         "fine_edge_mm": round(1e3 * choice.edge, 2),
         "wavelength_mm": round(1e3 * choice.wavelength, 2),
+        "level_needed": choice.needed,
+        "fine_points": choice.vertices[0],
+        "fine_points_needed": choice.vertices[1],
         "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},
         "sources": dict(source.sources),
         "self_contact": garment.self_contact,
@@ -151,12 +166,22 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
     }
 
 
+def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
+    """Add to the report the parts of garments that are not of their rest shape's size; returns warnings, or ""."""
+    said = []
+    for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
+        parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets)
+        report.garments[index]["strained"] = [dataclasses.asdict(part) for part in parts]
+        said.append(stretched(garment.path, source.sources["rest"], parts))
+    return said
+
+
 def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
     angles = "rest shape" if any(garment.bent_rest for garment in opened.scene.garments) else "flat"
     modelled = {
         **_in_plane(report),
         "bending": f"dihedral angles, {angles}",
-        "gravity": f"{np.linalg.norm(opened.scene.gravity):.3g} m/s^2",
+        "gravity": _pull(opened.scene.gravity),
         "guide": "ties the local average to the coarse animation",
     }
     if _touching(opened) and options.contact != "off":
@@ -168,6 +193,18 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
+
+
+def _pull(gravity: np.ndarray) -> str:
+    """Strength and direction of gravity [m/s^2], shape (3,), by axis where it follows one."""
+    strength = float(np.linalg.norm(gravity))
+    if not strength:
+        return "0 m/s^2"
+    direction = gravity / strength
+    axis = int(np.abs(direction).argmax())
+    if np.abs(np.delete(direction, axis)).max() < 1e-6:
+        return f"{strength:.3g} m/s^2 towards {'-' if direction[axis] < 0 else '+'}{'XYZ'[axis]}"
+    return f"{strength:.3g} m/s^2 towards ({', '.join(f'{part:.3g}' for part in direction)})"
 
 
 def _in_plane(report: RefineReport) -> dict[str, str]:
@@ -205,6 +242,9 @@ def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
         "friction": "out of scope: shapes at rest under pressure alone; the guide and the tether hold cloth in place",
     }
+    held = [f"{source.path}: {source.left_out_said}" for source in opened.sources if source.left_out]
+    if held:
+        left_out["samples"] = f"outside the frame range, where the layer holds the cloth still: {'; '.join(held)}"
     if "self contact" not in report.modelled:
         left_out["self contact"] = "switched off by --self-contact"
     if "contact" not in report.modelled:

@@ -14,9 +14,21 @@ A message gives the value, the place and the choices, in one line each.
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class PhysGraphError(Exception):
     """Root of all errors raised on purpose; its text is meant for the user."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes as text and fields, whatever the arguments of a subclass are."""
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(kind: type[PhysGraphError], args: tuple[Any, ...], fields: dict[str, Any]) -> PhysGraphError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(fields)
+    return error
 
 
 class UsageError(PhysGraphError):

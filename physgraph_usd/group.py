@@ -84,7 +84,6 @@ class Group:
         self._cloth = ClothContact(self.levels, self.garments)
         self._material: tuple[object, ...] = ()
         self._forces: list[LevelForces] = []
-        self._stretch = 0.0
         # What an integrator records on CUDA lasts as long as the systems and itself.
         self._systems_last, self._integrators = device != "cpu", dict[object, Integrator]()
 
@@ -226,7 +225,6 @@ class Group:
             pairs = zip(self.levels, self._guide_maps, strict=True)
             self._forces = [build_forces(level, guide_map, self.garments, **given) for level, guide_map in pairs]
             self._material = material
-            self._stretch = max(frame.fabric.stretch for frame in frames)
         return self._forces
 
     def _start(
@@ -256,8 +254,9 @@ class Group:
         seams = Seams.find(self.levels[0], coarse)
         if cloth is None and not touching and seams is None:
             return None
-        weight = float(np.linalg.norm(self._gravity)) * max(frame.fabric.density for frame in frames)
-        settings = settings.scaled(self.levels[0], stretch=self._stretch, weight=weight)
+        stretch, density = (max(getattr(each.fabric, name) for each in frames) for name in ("stretch", "density"))
+        weight = float(np.linalg.norm(self._gravity)) * density
+        settings = settings.scaled(self.levels[0], stretch=stretch, weight=weight)
         bodies = None
         if touching:
             bodies = FrameBodies.begin(self.levels, touching, coarse, origin=origin, settings=settings)

@@ -13,17 +13,21 @@ from .errors import UsageError
 from .integrate import method_named
 from .integrate.weights import weights_hash
 from .solve_settings import SolveSettings
+from .usd.atomic import ASSET_PATHS
 
 TEMPORAL = ("tether", "warm", "off")
 POTENTIALS = ("continuum", "paper")
 MODES = ("over", "sibling")
 CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
 """Forms of contact by their names on the command line."""
-REPORT_NAME = "report.json"
-"""Name of the report in a folder of its own."""
+REPORT_NAME, PAGE_NAME = "report.json", "report.html"
+"""Names of the report and its page in a folder of their own."""
 SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
-_NOT_OF_THE_RESULT = {"progress", "report", "overwrite", "dry_run", "workers", "root", "strict"}
+_NOT_OF_THE_RESULT = {
+    "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "asset_paths", "resume",
+    "keep_frames", "strict",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,16 @@ class RefineOptions:
         report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
-        velocities: Also write point velocities.
+        resume: Go on from the finished frames of a run that was interrupted, in ``<layer>.frames``.
+        keep_frames: Leave finished frames there when the run is interrupted.
+        velocities: Also write point velocities of garments that have none in the shot.
         heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
-        rest_frame: Time code whose points are the rest shape, or None.
+        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
         root: A .usda to write that lays the new layer over the shot, or None.
         strict: Count a shot with frames that did not settle as done in part.
+        asset_paths: "relative" or "absolute": how the layer and the root name other files.
         progress: Called with (frames done, frames in all), or None.
+        say: Called with each warning that is known before the first frame, then; or None.
     """
 
     frames: tuple[float, float] | None = None
@@ -79,12 +87,16 @@ class RefineOptions:
     report: Path | None = None
     overwrite: bool = False
     dry_run: bool = False
+    resume: bool = False
+    keep_frames: bool = True
     velocities: bool = False
     heat_map: bool = False
-    rest_frame: float | None = None
+    rest_frame: float | str | None = None
     root: Path | None = None
     strict: bool = False
+    asset_paths: str = "relative"
     progress: Callable[[int, int], None] | None = None
+    say: Callable[[str], None] | None = None
 
     def plain(self) -> dict[str, Any]:
         """The options that decide the result, ready for JSON."""
@@ -127,6 +139,7 @@ class RefineOptions:
             ("mode", self.mode, MODES),
             ("contact", self.contact, tuple(CONTACTS)),
             ("self contact", self.self_contact, tuple(SELF_CONTACTS)),
+            ("asset paths", self.asset_paths, ASSET_PATHS),
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")
@@ -136,10 +149,17 @@ class RefineOptions:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
-        report = None if self.report is None else json_of(Path(self.report))
-        for file in (report, self.root):
-            if file is not None and not (self.overwrite or self.dry_run) and Path(file).exists():
-                raise UsageError(f"{file} exists; choose another name or allow overwriting")
+
+    def targets(self, layer: Path) -> list[tuple[str, Path]]:
+        """Every file that a run writes, in words and where."""
+        files = [("the layer", layer)]
+        if self.root is not None:
+            files.append(("the root", Path(self.root)))
+        if self.report is not None:
+            report = json_of(Path(self.report))
+            files.append(("the report", report))
+            files += [("the report's page", report.with_name(PAGE_NAME))] if report != self.report else []
+        return files
 
 
 def json_of(report: Path) -> Path:

@@ -11,6 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from .errors import StageError, UsageError
 from .raycast import BACKGROUND, Surface, View, draw, encode_color, fit_view
+from .usd.atomic import check_place
+from .usd.files import check_targets, files_of
 from .usd.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
 
 STILL, LOOP = ".png", ".gif"
@@ -56,13 +58,17 @@ def preview(
         The picture written.
 
     Raises:
-        UsageError: When the suffix is unknown or a PNG is asked for several times.
+        UsageError: When the suffix is unknown, a PNG is asked for several times, or the picture is one of the shot's.
+        LayerError: When nothing can be written there.
         StageError: When a stage cannot be opened or shows no mesh.
     """
     layer, out = Path(layer), Path(out)
     if out.suffix.lower() not in {STILL, LOOP}:
         raise UsageError(f"cannot draw {out.name!r}; known suffixes: {STILL}, {LOOP}")
-    panels = _panels(layer, shot_of(layer) if shot is None else Path(shot))
+    below = shot_of(layer) if shot is None else Path(shot)
+    check_targets([("the picture", out)], files_of(layer) | (files_of(below) if below else set()))
+    check_place(out)
+    panels = _panels(layer, below)
     codes = _times(panels, times, out.suffix.lower())
     for panel in panels:
         panel.stage.bake(tuple(code for code in codes if code is not None))

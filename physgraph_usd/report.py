@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .usd.atomic import write_text
+
 DONE, FAILED, IN_PART = 0, 1, 3
 
 
@@ -25,6 +27,7 @@ class RefineReport:
         failed: Time codes that have no sample in the layer, with the error.
         unsettled: Frames that were written though the solver left them unsettled: path, time and in what way.
         strict: Whether a run with unsettled frames counts as done in part.
+        variants: Variant selections in force on what the garments depend on, as paths ``/World/coat{fit=loose}``.
         warnings: What the user should know.
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB].
@@ -40,6 +43,7 @@ class RefineReport:
     failed: dict[str, str] = field(default_factory=dict)
     unsettled: list[dict[str, Any]] = field(default_factory=list)
     strict: bool = False
+    variants: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float = 0.0
@@ -61,8 +65,9 @@ class RefineReport:
         return json.dumps(self.to_dict(), indent=2, default=str)
 
     def write(self, path: Path) -> None:
-        """Write the report as JSON, whole or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".part")
-        partial.write_text(self.to_json() + "\n", encoding="utf-8")
-        partial.replace(path)
+        """Write the report as JSON, whole or not at all.
+
+        Raises:
+            LayerError: It cannot be written.
+        """
+        write_text(path, self.to_json() + "\n")

@@ -1,15 +1,17 @@
 """How fine a garment must be: no more than its wrinkles (DESIGN section 5), and whether it was fine enough.
 
 The buckling wavelength is 2 pi sqrt(D / (Y strain)), with the compression of the cage's edges, 90th percentile over
-a few frames. A level resolves it when its mean edge is under a fifth of it. That is for the choice beforehand.
-Afterwards the folds tell: on too coarse a mesh wrinkles of its own size appear, and edges fold sharply (S39).
+a few frames. It is the shortest wave in which the cloth can fold; settled folds are longer (`benchmarks.levels`).
+A level resolves it when its mean edge is under a fifth of it, and carries nothing of it when two edges are longer. That
+is for the choice beforehand. Afterwards the folds tell: on too coarse a mesh wrinkles of its own size appear, and edges
+fold sharply (S39).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from .errors import StageError
 from .level import Level, hinge_geometry
+from .mesh.subdivide import fine_count
 from .mesh.topology import edges_of
 from .scene import Frame, Garment, GarmentFrame, Scene
 
@@ -24,7 +27,11 @@ AUTO = -1
 MOST = 4
 SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
+LIMIT = 5
+"""The most that the schema allows."""
 EDGES_PER_WAVE = 5.0
+FEWEST_EDGES = 2.0
+"""No mesh carries a wave of fewer edges: what would fold so folds at the mesh's own size."""
 SHARP_FOLD = math.radians(45.0)
 SHARP_SHARE = 0.01
 """Share of sharp folds above which the mesh shows: 0.1% on the T-shirt at level 3, 1.1% at level 2, where it does."""
@@ -43,27 +50,47 @@ class LevelChoice:
         reason: Why, in words.
         wavelength: Buckling wavelength [m].
         edge: Mean rest edge at that level [m].
+        needed: The least level that resolves the wavelength.
+        vertices: Number of vertices at the chosen level, and at the one needed.
     """
 
     level: int
     reason: str
     wavelength: float
     edge: float
+    needed: int
+    vertices: tuple[int, int]
+
+    @property
+    def advice(self) -> str:
+        """The level that would do and what it costs; time grows at most as vertices do (`benchmarks.levels`)."""
+        have, want = self.vertices
+        cost = f"{want:,} vertices, up to {want / max(have, 1):.0f} times the time"
+        return f"level {self.needed} resolves them: {cost}" + (f" ({LIMIT} is the most)" * (self.needed > LIMIT))
 
 
-def choose_levels(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[LevelChoice]:
+def sample_frames(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[Frame]:
+    """Read a few frames spread over the shot, the first and the last among them; unreadable ones are left out.
+
+    Args:
+        scene: The scene.
+        frame_at: Reads a frame.
+    """
+    picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
+    times: list[float | None] = [scene.times[i] for i in picks] or [None]
+    return [frame for time in times if (frame := _readable(frame_at, time)) is not None]
+
+
+def choose_levels(scene: Scene, frames: Sequence[Frame]) -> list[LevelChoice]:
     """Take each garment's own level, or for `AUTO` the least that resolves its wrinkles.
 
     Args:
         scene: The scene.
-        frame_at: Reads a frame; asked for a few frames.
+        frames: A few of its frames.
 
     Returns:
         One choice per garment.
     """
-    picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
-    times: list[float | None] = [scene.times[i] for i in picks] or [None]
-    frames = [frame for time in times if (frame := _readable(frame_at, time)) is not None]
     return [
         _choose(garment, [frame.garments[index] for frame in frames]) for index, garment in enumerate(scene.garments)
     ]
@@ -81,18 +108,23 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     ends = edges_of(garment.mesh.triangulate(garment.rest).triangles, garment.mesh.vertex_count).vertices
     if not len(ends) or not frames:
         level = 0 if garment.level == AUTO else garment.level
-        return LevelChoice(level, "there are no faces or no readable frames to go by", 0.0, 0.0)
+        count = fine_count(garment.mesh, level)
+        return LevelChoice(level, "there are no faces or no readable frames to go by", 0.0, 0.0, level, (count, count))
     rest = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
     strain, edge = _compression(rest, ends, frames), float(rest.mean())
     fabric = frames[0].fabric
     wave = 2.0 * math.pi * math.sqrt(fabric.bend / max(fabric.stretch * strain, LEAST_TENSION))
     said = f"wrinkles of {1e3 * wave:.1f} mm (compression {strain:.2g}), cage edges of {1e3 * edge:.1f} mm"
     needed = math.ceil(math.log2(max(edge * EDGES_PER_WAVE / max(wave, SHORTEST_WAVE * edge), 1.0)))
-    level, reason = garment.level, "as authored or asked for"
+    level, reason = garment.level, f"as authored or asked for; {said}"
     if level == AUTO:
-        level = min(needed, MOST)
-        reason = f"auto: {said}" + (f"; {needed} needed, {MOST} is the most" if needed > MOST else "")
-    return LevelChoice(level, reason, wave, edge / 2**level)
+        level, reason = min(needed, MOST), f"auto: {said}" + (f", {MOST} is the most that it takes" * (needed > MOST))
+    fine = edge / 2**level
+    choice = LevelChoice(
+        level, reason, wave, fine, needed, (fine_count(garment.mesh, level), fine_count(garment.mesh, needed))
+    )
+    reached = f"; edges of {1e3 * fine:.1f} mm resolve wrinkles of {1e3 * EDGES_PER_WAVE * fine:.1f} mm and more"
+    return replace(choice, reason=reason + reached + (f"; {choice.advice}" if needed > level else ""))
 
 
 def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame]) -> float:
@@ -100,6 +132,23 @@ def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame])
     lengths = [np.linalg.norm(f.points[ends[:, 1]] - f.points[ends[:, 0]], axis=1) for f in frames]
     ratios = np.concatenate(lengths) / np.tile(np.maximum(rest, 1e-12), len(frames))
     return max(float(np.percentile(1.0 - ratios, 90)), LEAST_STRAIN)
+
+
+def carries_none(path: str, choice: LevelChoice) -> str:
+    """A warning where a garment can fold in waves of which its level carries nothing, or "".
+
+    Args:
+        path: The garment.
+        choice: Its level.
+    """
+    if choice.needed <= choice.level or choice.wavelength >= FEWEST_EDGES * choice.edge:
+        return ""
+    wave, edge = 1e3 * choice.wavelength, 1e3 * choice.edge
+    return (
+        f"<{path}>: its fabric can fold in waves of {wave:.1f} mm; level {choice.level} has edges of {edge:.1f} mm, "
+        f"a fifth of a wave is {wave / EDGES_PER_WAVE:.1f} mm: folds may be of the mesh's own size; {choice.advice}; "
+        "or raise bendStiffness"
+    )
 
 
 def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:

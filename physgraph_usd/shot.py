@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
 import os
 import resource
 import sys
 import time as clock
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +16,22 @@ import torch
 import warp as wp
 
 from . import __version__
-from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
+from .chunks import RUN_UP, solve_in_chunks
 from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
+from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
+from .processes import call_each, memory_is_named
 from .report import RefineReport
-from .resolution import choose_levels, too_coarse
+from .resolution import too_coarse
 from .settled import told_unsettled, unsettled_frames
-from .usd.provenance import file_hashes, write_root
+from .usd.atomic import check_place
+from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
+from .usd.provenance import asset_path, file_hashes, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
 
@@ -56,24 +59,30 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     """
     began = clock.perf_counter()
     out = Path(out)
-    options.check()
-    if not options.dry_run and not out.resolve().parent.is_dir():
-        raise LayerError(f"the folder {out.resolve().parent} does not exist")
+    check_jobs([(shot, out, options)])
+    if not options.dry_run:
+        _check_places(out, options)
+    with memory_is_named():
+        return _refine(shot, out, options, began=began)
+
+
+def _refine(shot: str | Path, out: Path, options: RefineOptions, *, began: float) -> RefineReport:
     opened = _open(shot, options)
     try:
-        choices = choose_levels(opened.scene, opened.frame)
-        report = begin_report(opened, choices, options)
+        report = begin_report(opened, options)
         report.seconds["open"] = clock.perf_counter() - began
         if options.dry_run:
             return report
-        solver = _ShotSolver(str(shot), [choice.level for choice in choices], options)
+        _tell(report.warnings, options)
+        solver = _ShotSolver(str(shot), [garment["level"] for garment in report.garments], options)
         solver.adopt(opened)
         _write_layer(opened, solver, out, options, report)
         report.seconds["total"] = clock.perf_counter() - began
         report.peak_memory_mb = _peak_memory_mb()
         report.out = out
         if options.root is not None:
-            write_root(Path(options.root), layer=out, shot=Path(shot), overwrite=options.overwrite)
+            files = {"layer": out, "shot": Path(shot), "absolute": options.asset_paths == "absolute"}
+            write_root(Path(options.root), **files, overwrite=options.overwrite)
         if options.report is not None:
             _write_report(report, Path(options.report), opened)
     finally:
@@ -81,27 +90,57 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     return report
 
 
+Job = tuple[str | Path, Path, RefineOptions]
+"""A shot, the layer to write and options."""
+
+
 def refine_shots(
-    jobs: Sequence[tuple[str, Path, RefineOptions]], *, workers: int
+    jobs: Sequence[Job], *, workers: int, refine: Callable[..., RefineReport] = refine_shot
 ) -> Iterator[RefineReport | PhysGraphError]:
-    """Refine several shots side by side, each in one process.
+    """Refine several shots, each in a process of its own: one that fails, or dies, leaves the others alone.
 
     Args:
         jobs: Shot, layer to write and options of each.
-        workers: Number of processes.
+        workers: Shots at a time.
+        refine: What refines one of them; it must be picklable.
 
     Returns:
         Per job, in order, its report or the error that ended it.
+
+    Raises:
+        UsageError: No job was begun: an option is wrong, or a file to write is one that another job reads or writes.
     """
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=end_with_parent) as pool:
-        alone = [(s, out, dataclasses.replace(options, workers=1, progress=None)) for s, out, options in jobs]
-        futures = [pool.submit(refine_shot, *job) for job in alone]
-        for future in futures:
-            try:
-                yield future.result()
-            except PhysGraphError as error:
-                yield error
+    check_jobs(jobs)
+    alone = [(s, out, dataclasses.replace(options, workers=1, progress=None, say=None)) for s, out, options in jobs]
+    return call_each(refine, alone, workers=workers)
+
+
+def check_jobs(jobs: Sequence[Job]) -> None:
+    """Refuse options that no shot could be refined with, and to write over what is read or written by any of the jobs.
+
+    Raises:
+        UsageError: With the value, and the file.
+    """
+    targets: list[Target] = []
+    inputs: set[Path] = set()
+    for shot, out, options in jobs:
+        options.check()
+        for what, path in (("the layer", out), ("the root", options.root)):
+            if path is not None:
+                check_suffix(what, Path(path), LAYER_SUFFIXES)
+        targets += options.targets(out)
+        inputs |= files_of(shot) | {Path(file) for file in (options.weights,) if file}
+    check_targets(targets, inputs)
+
+
+def _check_places(out: Path, options: RefineOptions) -> None:
+    """Refuse before the work, not after an hour of frames, what could not be written then."""
+    if not out.resolve().parent.is_dir():
+        raise LayerError(f"the folder {out.resolve().parent} does not exist")
+    for _, path in options.targets(out):
+        if path.is_file() and not options.overwrite:
+            raise UsageError(f"{path} exists; choose another name or allow overwriting")
+        check_place(path)
 
 
 def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
@@ -125,7 +164,7 @@ def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
     except StageError as error:
         return describe_meshes(str(shot), str(error))
     try:
-        return describe(opened, choose_levels(opened.scene, opened.frame), options)
+        return describe(opened, options)
     except StageError as error:
         return describe_meshes(str(shot), str(error))
     finally:
@@ -154,7 +193,7 @@ class _ShotSolver:
 
     def __init__(self, shot: str, levels: list[int], options: RefineOptions) -> None:
         self.levels = levels
-        self._shot, self._options = shot, dataclasses.replace(options, progress=None)
+        self._shot, self._options = shot, dataclasses.replace(options, progress=None, say=None)
         self._lanes = min(MOST_LANES, max(1, (os.cpu_count() or 1) // options.workers))
         self._opened: Shot | None = None
 
@@ -170,7 +209,7 @@ class _ShotSolver:
         """Solve time codes in order; one that fails yields its error, and the next starts from the last good one."""
         device = self._options.device
         prepare_device(device)
-        shot = self._opened or _open(self._shot, self._options)
+        shot = self._opened = self._opened or _open(self._shot, self._options)
         settings = self._options.solve_settings()
         options = {"device": device, "lanes": self._lanes, "heat_map": self._options.heat_map}
         refiner = Refiner(shot.scene, settings, levels=self.levels, **options)
@@ -209,22 +248,31 @@ def prepare_device(device: str) -> None:
 def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOptions, report: RefineReport) -> None:
     times: list[float | None] = list(opened.scene.times) or [None]
     refinements = Refiner.subdivide(opened.scene, solver.levels)
-    began, written = clock.perf_counter(), 0.0
-    with LayerWriter(
-        opened,
-        refinements,
-        out,
-        mode=options.mode,
-        velocities=options.velocities,
-        provenance=_provenance(opened, out, options),
-        overwrite=options.overwrite,
-    ) as writer:
+    began, written, provenance = clock.perf_counter(), 0.0, _provenance(opened, out, options)
+    run = provenance | {"levels": solver.levels, "times": times, "report": options.report is not None}
+    frames = FrameFolder(
+        frames_folder(out), run, resume=options.resume, drop=options.overwrite, keep=options.keep_frames
+    )
+    with (
+        frames,
+        LayerWriter(
+            opened,
+            refinements,
+            out,
+            mode=options.mode,
+            velocities=options.velocities,
+            provenance=provenance,
+            overwrite=options.overwrite,
+        ) as writer,
+    ):
         run_up = 0 if options.temporal == "off" else RUN_UP
-        outcomes = solve_in_chunks(solver, times, workers=options.workers, run_up=run_up)
-        for done, outcome in enumerate(outcomes, start=1):
-            written += _take(outcome, writer, report)
-            if options.progress:
-                options.progress(done, len(times))
+        solved = solve_in_chunks(solver, times, frames, workers=options.workers, run_up=run_up)
+        report.warnings += _tell(_resumed(frames, len(times), run_up), options)
+        with closing(solved):
+            for done, outcome in enumerate(solved, start=1):
+                written += _take(outcome, writer, report)
+                if options.progress:
+                    options.progress(done, len(times))
         if len(report.failed) == len(times):
             raise SolveError(next(iter(report.failed.values())))
         start = clock.perf_counter()
@@ -239,6 +287,25 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
+
+
+def _tell(warnings: list[str], options: RefineOptions) -> list[str]:
+    """Say warnings before the first frame, and return them."""
+    if options.say is not None:
+        for warning in warnings:
+            options.say(warning)
+    return warnings
+
+
+def _resumed(frames: FrameFolder, count: int, run_up: int) -> list[str]:
+    """A warning where frames of an earlier run are used, or could have been."""
+    if frames.dropped:
+        said = "finished frames of a run that was interrupted are solved anew; --resume would have used them"
+        return [f"{frames.dropped} {said}"]
+    if not frames.kept:
+        return []
+    how = f", each stretch after {run_up} frames that are solved again" if run_up else ""
+    return [f"{len(frames.kept)} of {count} frames are those of a run that was interrupted; the others are solved{how}"]
 
 
 def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
@@ -292,8 +359,13 @@ def _broken(report: RefineReport) -> list[str]:
 
 
 def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:
-    inputs = file_hashes(opened.stage, out.resolve().parent)
-    return {"version": __version__, "options": options.plain(), "inputs": inputs}
+    folder, absolute = out.resolve().parent, options.asset_paths == "absolute"
+    return {
+        "version": __version__,
+        "options": options.plain(),
+        "shot": asset_path(opened.path, folder, absolute=absolute),
+        "inputs": file_hashes(opened.stage, folder, absolute=absolute),
+    }
 
 
 def _peak_memory_mb() -> float:

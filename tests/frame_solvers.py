@@ -1,13 +1,16 @@
-"""Stand-ins for the solver of a shot, in a module that a worker process imports fast."""
+"""Stand-ins for what runs in processes of its own, in a module that a worker process imports fast."""
 
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from physgraph_usd.chunks import Outcome
+from physgraph_usd.errors import GarmentError
+from physgraph_usd.frames import Outcome
 
 
 class Counting:
@@ -25,22 +28,53 @@ class Failing(Counting):
             yield Outcome(5.0, (), (), {"time": 5.0, "error": "no"}) if failed else outcome
 
 
-class Dying(Counting):
+class Ending(Counting):
+    """Comes to an end at the frame 5."""
+
+    def end(self) -> None:
+        raise NotImplementedError
+
     def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
         for outcome in super().__call__(times):
             if outcome.time == 5.0:
-                os._exit(9)
+                self.end()
             yield outcome
 
 
-class Raising(Counting):
-    def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
-        for outcome in super().__call__(times):
-            if outcome.time == 5.0:
-                raise ValueError("a bug")
-            yield outcome
+class Dying(Ending):
+    def end(self) -> None:
+        os._exit(9)
+
+
+class Killed(Ending):
+    def end(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Raising(Ending):
+    def end(self) -> None:
+        raise ValueError("a bug")
+
+
+class Exhausted(Ending):
+    def end(self) -> None:
+        np.empty(1 << 50)
+
+
+class Broken(Ending):
+    def end(self) -> None:
+        raise GarmentError("/World/cloth", "torn", time=5.0, remedy="mend it")
 
 
 class Short(Counting):
     def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
         yield from list(super().__call__(times))[:-1]
+
+
+def as_named(shot: str, *_: object) -> Any:
+    """Stands in for refine_shot in a process of its own."""
+    if shot == "dies":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if shot == "raises":
+        raise KeyError("a bug")
+    return shot

@@ -16,7 +16,7 @@ from layers import vec3
 from pxr import Sdf
 
 from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.usd.atomic import leave_if_asked, remove_stale, temporary_path, termination_raises
+from physgraph_usd.usd.atomic import HOST, leave_if_asked, remove_stale, temporary_path, termination_raises
 from physgraph_usd.usd.stream import LayerStream
 
 POINTS = Sdf.Path("/World/coat.points")
@@ -89,21 +89,37 @@ def test_folders_and_strange_names_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.usdc").mkdir()
     with pytest.raises(UsageError, match="is a folder"):
         LayerStream(tmp_path / "folder.usdc")
-    with pytest.raises(UsageError, match=r"\.usdc, \.usda or \.usd"):
+    with pytest.raises(UsageError, match=r"known suffixes: \.usd, \.usda, \.usdc"):
         LayerStream(tmp_path / "out.abc")
 
 
 def test_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
     target = tmp_path / "out.usdc"
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
-    stale = tmp_path / f"out.usdc.{int(dead.stdout)}.tmp.usdc"
-    alive = tmp_path / f"out.usdc.{os.getppid()}.tmp.usdc"
-    other = tmp_path / f"shot.usdc.{int(dead.stdout)}.tmp.usdc"
-    for path in (stale, alive, other):
+    stale = tmp_path / f"out.usdc.{HOST}.{int(dead.stdout)}.tmp.usdc"
+    alive = tmp_path / f"out.usdc.{HOST}.{os.getppid()}.tmp.usdc"
+    other = tmp_path / f"shot.usdc.{HOST}.{int(dead.stdout)}.tmp.usdc"
+    elsewhere = tmp_path / f"out.usdc.{HOST}2.{int(dead.stdout)}.tmp.usdc"
+    for path in (stale, alive, other, elsewhere):
         path.write_text("x")
     assert remove_stale(target) == [stale]
-    assert names(tmp_path) == sorted([alive.name, other.name])
+    assert names(tmp_path) == sorted([alive.name, other.name, elsewhere.name])
     assert temporary_path(target).parent == tmp_path
+
+
+def test_hosts_of_one_disk_do_not_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two machines write one layer under the same process number; neither takes the other's file away."""
+    target = tmp_path / "out.usdc"
+    with LayerStream(target) as stream:
+        fill(stream, 1)
+        stream.flush()
+        monkeypatch.setattr("physgraph_usd.usd.atomic.HOST", "elsewhere")
+        with LayerStream(target) as second:
+            fill(second, 1)
+            second.flush()
+            assert len(names(tmp_path)) == 2
+        stream.commit()
+    assert names(tmp_path) == ["out.usdc"]
 
 
 WRITE = """

@@ -48,7 +48,7 @@ def test_the_defaults_ask_for_nothing_but_the_garment(command: ModuleType, tmp_p
     expected = ["pg", "refine", str(tmp_path / "shot-Coat.v001.coarse.usdc")]
     expected += ["-o", str(tmp_path / "shot-Coat.v001.refined.usdc"), "--root"]
     expected += [str(tmp_path / "shot-Coat.v001.refined.usda"), "--garment", "/root/Coat/mesh"]
-    assert line == [*expected, "--frames", "1:24", "--level", "2", "--progress"]
+    assert line == [*expected, "--frames", "1:24", "--level", "2", "--progress", "--no-keep-frames"]
 
 
 def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
         *garments,
         *("--collider", "/c", "--frames", "-3:5", "--level", "auto"),
         *("--set", "physgraph:material:stretchStiffness=30", "--set", "physgraph:material:bendStiffness=4.7e-06"),
-        *("--report", str(files.report), "--progress", "--device", "cuda", "--weights", "my file"),
+        *("--report", str(files.report), "--progress", "--no-keep-frames", "--device", "cuda", "--weights", "my file"),
     ]
 
 

@@ -113,6 +113,14 @@ def test_gaps_lie_between_the_reference_and_plain_upsampling(made: tuple[Path, P
     assert set(chart.methods) >= {DEFAULT, UPSAMPLED, SMOOTH, "quasi-newton", "gd", "gd, nested"}
 
 
+def test_page_and_summary_name_who_found_the_least_and_how_far_the_next_one_is(made: tuple[Path, Path, Chart]):
+    _, folder, chart = made
+    [known] = chart.references
+    assert known["apart"] >= 0.0
+    assert any(known["by"] in line and f"ends {known['apart']:.2%} of the fall above" in line for line in chart.lines())
+    assert f"{known['apart']:.2%}" in (folder / "chart.html").read_text(encoding="utf-8")
+
+
 def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Chart], tmp_path: Path):
     shot, _, chart = made
     report = refine(
@@ -308,6 +316,16 @@ def test_a_line_that_was_cut_off_is_dropped(tmp_path: Path):
     again = Journal(tmp_path, {"shot": "a"}, overwrite=False)
     again.add("point", method="b", ms=math.pi)
     assert [row["method"] for row in Journal(tmp_path, {"shot": "a"}, overwrite=False).rows("point")] == ["a", "b"]
+
+
+@pytest.mark.parametrize("line", [b"{", b"[1]", b"\xff", b'{"row": "moon"}', b"[" * 100_000])
+def test_a_damaged_row_is_named(tmp_path: Path, line: bytes):
+    Journal(tmp_path, {"shot": "a"}, overwrite=False).add("point", method="a")
+    file = tmp_path / "chart.rows.jsonl"
+    file.write_bytes(file.read_bytes() + line + b"\n")
+    with pytest.raises(UsageError, match=r"chart\.rows\.jsonl, line 3"):
+        Journal(tmp_path, {"shot": "a"}, overwrite=False)
+    assert Journal(tmp_path, {"shot": "a"}, overwrite=True).rows("point") == []
 
 
 def test_a_solver_outside_is_measured_by_the_same_ruler(

@@ -3,74 +3,159 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from cloth import rms
-from frame_solvers import Counting, Dying, Failing, Raising, Short
+from frame_solvers import Broken, Counting, Dying, Exhausted, Failing, Killed, Raising, Short
 from hypothesis import given
 from hypothesis import strategies as st
 from shots import EDGE, cloth_shot, faults, fine, refine, sample_times
 
-from physgraph_usd.chunks import chunks_of, solve_in_chunks
-from physgraph_usd.errors import SolveError
+from physgraph_usd.chunks import RUN_UP, chunks_of, solve_in_chunks
+from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SolveError, UsageError
+from physgraph_usd.frames import FrameFolder, Outcome
 
 SEAM = 5e-2
 """Largest difference that the number of workers makes, RMS over a frame, in fine edge lengths; 0.036 was measured."""
 LONG = tuple(float(time) for time in range(1, 25))
 
 
-@given(count=st.integers(0, 60), workers=st.integers(1, 80))
-def test_chunks_cover_all_times_once_evenly(count: int, workers: int):
-    parts = chunks_of(list(range(count)), workers)
-    assert [index for a, b in parts for index in range(a, b)] == list(range(count))
-    sizes = [b - a for a, b in parts]
-    assert len(parts) <= workers
+TIMES = [float(t) for t in range(8)]
+
+
+def solve(solver: Callable[..., Iterator[Outcome]], folder: Path, *, workers: int, **options: Any) -> list[Outcome]:
+    """Solve eight frames; each says in its points how many frames its process had solved before."""
+    with FrameFolder(folder, {}, **options) as frames:
+        return list(solve_in_chunks(solver, TIMES, frames, workers=workers, run_up=3))
+
+
+def before(outcomes: Sequence[Outcome]) -> list[int]:
+    return [int(np.asarray(outcome.points[0])[0, 0]) for outcome in outcomes]
+
+
+def interrupt(folder: Path, solver: Counting, finished: Iterable[int]) -> None:
+    """A run that is interrupted when it has finished some frames."""
+    with FrameFolder(folder, {"level": 2}) as frames:
+        for index in finished:
+            frames.write(index, next(iter(solver([float(index)]))))
+        raise KeyboardInterrupt
+
+
+@given(missing=st.sets(st.integers(0, 60)), workers=st.integers(1, 80))
+def test_chunks_cover_what_is_missing_once_evenly(missing: set[int], workers: int):
+    shares = chunks_of(sorted(missing), workers)
+    assert [index for share in shares for part in share for index in part] == sorted(missing)
+    sizes = [sum(map(len, share)) for share in shares]
+    assert len(shares) <= workers
     assert not sizes or max(sizes) - min(sizes) <= 1
 
 
-def test_order_and_run_up():
-    times = [float(t) for t in range(8)]
-    outcomes = list(solve_in_chunks(Counting(), times, workers=2, run_up=3))
-    assert [outcome.time for outcome in outcomes] == times
-    assert [int(np.asarray(outcome.points[0])[0, 0]) for outcome in outcomes] == [0, 1, 2, 3, 3, 4, 5, 6]
+@pytest.mark.parametrize(
+    ("count", "workers", "times"), [(24, 2, 1.33), (24, 4, 2.0), (240, 2, 1.9), (240, 4, 3.6), (24, 24, 24 / 7)]
+)
+def test_the_longest_process_says_how_much_quicker_a_shot_can_be(count: int, workers: int, times: float):
+    """The figures of docs/solver.md, by N / (N / W + R)."""
+    parts = [part for share in chunks_of(range(count), workers) for part in share]
+    longest = max(part.stop - max(0, part.start - RUN_UP) for part in parts)
+    assert longest == count / workers + RUN_UP
+    assert count / longest == pytest.approx(times, rel=0.02)
+
+
+def test_order_and_run_up(tmp_path: Path):
+    outcomes = solve(Counting(), tmp_path / "f", workers=2)
+    assert [outcome.time for outcome in outcomes] == TIMES
+    assert before(outcomes) == [0, 1, 2, 3, 3, 4, 5, 6]
     assert [outcome.reused for outcome in outcomes] == [(n % 2 == 1,) for n in (0, 1, 2, 3, 3, 4, 5, 6)]
     assert os.getpid() not in {outcome.record["pid"] for outcome in outcomes}
 
 
-def test_one_worker_stays_in_this_process():
-    outcomes = list(solve_in_chunks(Counting(), [1.0, 2.0], workers=1))
-    assert {outcome.record["pid"] for outcome in outcomes} == {os.getpid()}
+def test_one_worker_stays_in_this_process(tmp_path: Path):
+    assert {outcome.record["pid"] for outcome in solve(Counting(), tmp_path / "f", workers=1)} == {os.getpid()}
 
 
-def test_a_frame_that_failed_is_handed_on_and_ends_nothing():
-    outcomes = list(solve_in_chunks(Failing(), [float(t) for t in range(8)], workers=2))
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_frame_that_failed_is_handed_on_and_ends_nothing(tmp_path: Path, workers: int):
+    outcomes = solve(Failing(), tmp_path / "f", workers=workers)
     assert [outcome.time for outcome in outcomes if not outcome.points] == [5.0]
     assert len(outcomes) == 8
 
 
-def test_a_process_that_dies_is_a_clear_error():
-    with pytest.raises(SolveError, match="a worker process died"):
-        list(solve_in_chunks(Dying(), [float(t) for t in range(8)], workers=2))
-
-
-def test_a_bug_in_a_worker_is_not_hidden():
-    with pytest.raises(ValueError, match="a bug"):
-        list(solve_in_chunks(Raising(), [float(t) for t in range(8)], workers=2))
-
-
-def test_a_worker_that_ends_early_is_named():
-    with pytest.raises(SolveError, match="without the result of time code 3"):
-        list(solve_in_chunks(Short(), [float(t) for t in range(8)], workers=2))
-
-
-def test_no_folder_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    list(solve_in_chunks(Counting(), [1.0, 2.0], workers=2))
-    next(solve_in_chunks(Counting(), [1.0, 2.0], workers=2))
+@pytest.mark.parametrize(
+    ("solver", "error", "said"),
+    [
+        (Dying(), SolveError, r"a worker process died \(exit code 9\)"),
+        (Killed(), SolveError, r"died \(SIGKILL\), perhaps for lack of memory"),
+        (Raising(), PhysGraphError, "unexpected ValueError: a bug"),
+        (Exhausted(), SolveError, "out of memory"),
+        (Broken(), GarmentError, "</World/cloth> at time code 5: torn"),
+        (Short(), SolveError, "without the result of time code 3"),
+    ],
+)
+def test_what_ends_a_worker_is_named(tmp_path: Path, solver: Counting, error: type[PhysGraphError], said: str):
+    with pytest.raises(error, match=said):
+        solve(solver, tmp_path / "f", workers=2, keep=False)
     assert not list(tmp_path.iterdir())
+
+
+class TestKeptFrames:
+    """Frames that a run had finished when it was interrupted."""
+
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        """The frames 0, 1, 4 of a run whose fifth frame ended it."""
+        with pytest.raises(KeyboardInterrupt):
+            interrupt(tmp_path / "f", Counting(), (0, 1, 4))
+        return tmp_path / "f"
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_are_used_and_the_others_are_solved_after_a_run_up(self, folder: Path, workers: int):
+        with FrameFolder(folder, {"level": 2}, resume=True) as frames:
+            outcomes = list(solve_in_chunks(Counting(), TIMES, frames, workers=workers, run_up=3))
+        assert [outcome.time for outcome in outcomes] == TIMES
+        assert before(outcomes)[:5] == [0, 0, 2, 3, 0]
+        assert before(outcomes)[5] == 3
+        assert not folder.exists()
+
+    def test_are_solved_anew_without_resume(self, folder: Path):
+        frames = FrameFolder(folder, {"level": 2})
+        assert (frames.kept, frames.dropped) == (frozenset(), 3)
+        assert not list(folder.glob("*.npz"))
+
+    def test_of_another_run_are_not_dropped_unasked(self, folder: Path):
+        for resume, drop in ((False, False), (True, False), (True, True)):
+            with pytest.raises(UsageError, match=r"holds 3 finished frames of a run with other level; .* --overwrite"):
+                FrameFolder(folder, {"level": 3}, resume=resume, drop=drop)
+        assert len(list(folder.glob("*.npz"))) == 3
+        assert FrameFolder(folder, {"level": 3}, drop=True).dropped == 0
+        assert not list(folder.glob("*.npz"))
+
+    def test_that_are_not_whole_are_solved_again(self, folder: Path):
+        (folder / "1.npz").write_bytes((folder / "1.npz").read_bytes()[:-40])
+        assert FrameFolder(folder, {"level": 2}, resume=True).kept == {0, 4}
+
+    def test_that_are_damaged_are_named(self, folder: Path):
+        data = (folder / "1.npz").read_bytes()
+        (folder / "1.npz").write_bytes(data[:150] + b"\xff" * 40 + data[190:])
+        frames = FrameFolder(folder, {"level": 2}, resume=True)
+        with pytest.raises(LayerError, match=r"1\.npz is damaged"):
+            list(solve_in_chunks(Counting(), TIMES, frames, workers=1))
+
+    def test_a_folder_of_the_users_is_left_alone(self, tmp_path: Path):
+        (tmp_path / "f").mkdir()
+        (tmp_path / "f" / "notes.txt").write_text("mine")
+        with pytest.raises(UsageError, match="no folder of finished frames"):
+            FrameFolder(tmp_path / "f", {}, drop=True)
+        assert (tmp_path / "f" / "notes.txt").read_text() == "mine"
+
+    def test_failed_frames_are_not_kept(self, tmp_path: Path):
+        with pytest.raises(KeyboardInterrupt):
+            interrupt(tmp_path / "f", Failing(), range(8))
+        assert FrameFolder(tmp_path / "f", {"level": 2}, resume=True).kept == {0, 1, 2, 3, 4, 6, 7}
 
 
 def layer_with(shot: Path, folder: Path, **options: object) -> Path:
@@ -108,3 +193,25 @@ class TestLayers:
         moves = [rms(fine(shot, one, a) - fine(shot, one, b)) / (EDGE / 2) for a, b in pairwise(LONG)]
         assert min(moves) > 2 * max(apart)
         assert sample_times(one) == sample_times(two) == LONG
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_a_resumed_run_goes_on_as_if_it_had_not_been_interrupted(self, tmp_path: Path, workers: int):
+        """What the run-up leaves where it goes on is no more than what it leaves between two workers."""
+        shot, out = cloth_shot(tmp_path / "shot.usdc", times=LONG), tmp_path / "fine.usdc"
+
+        def interrupt(done: int, _: int) -> None:
+            if done == 12:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            refine(shot, out, progress=interrupt, workers=workers)
+        report = refine(shot, out, resume=True)
+        (said,) = [warning for warning in report.warnings if "of 24 frames are those of a run" in warning]
+        assert said.startswith("12 of 24") or workers > 1
+        assert "each stretch after 6 frames that are solved again" in said
+        assert [frame["time"] for frame in report.frames] == list(LONG)
+        whole = layer_with(shot, tmp_path / "whole")
+        apart = [rms(fine(shot, whole, time) - fine(shot, out, time)) / (EDGE / 2) for time in LONG]
+        assert max(apart[:12]) == 0.0
+        assert max(apart) < SEAM, apart
+        assert faults(out, shot) == []

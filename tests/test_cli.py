@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 import subprocess
 import sys
 import sysconfig
@@ -13,6 +14,7 @@ from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
@@ -20,6 +22,10 @@ from click.testing import CliRunner, Result
 from physgraph_usd import cli, errors
 
 pytest.importorskip("pxr", reason="the commands read stages with usd-core")
+
+from frame_solvers import as_named
+from pxr import Usd, UsdGeom
+from shots import CLOTH, cloth_shot
 
 Sample = Callable[[str], Path]
 SMALL = ("--frames", "1:2", "--level", "1")
@@ -94,6 +100,23 @@ class TestRefine:
         assert root.is_file()
         assert run("validate", out, "--shot", sample("swatch")).exit_code == 0
 
+    @pytest.mark.parametrize(("paths", "code"), [("relative", 1), ("absolute", 0)])
+    def test_a_moved_layer_finds_its_shot_by_absolute_paths(
+        self, sample: Sample, tmp_path: Path, paths: str, code: int
+    ) -> None:
+        written, moved = tmp_path / "written", tmp_path / "some" / "where" / "else"
+        written.mkdir()
+        out, root = written / "fine.usdc", written / "fine.usda"
+        args = ("--asset-paths", paths, "--root", root, *SMALL)
+        assert run("refine", sample("swatch"), "-o", out, *args).exit_code == 0
+        assert run("validate", out).exit_code == 0
+        moved.parent.mkdir(parents=True)
+        written.rename(moved)
+        result = run("validate", moved / "fine.usdc")
+        assert result.exit_code == code
+        assert ("the shot that its record names is not at" in result.stdout) == bool(code)
+        assert str(sample("swatch")) in (moved / "fine.usda").read_text() if paths == "absolute" else True
+
     def test_quiet_when_not_a_terminal(self, sample: Sample, tmp_path: Path) -> None:
         result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", *SMALL)
         assert "%" not in result.stderr
@@ -109,6 +132,38 @@ class TestRefine:
         assert result.exit_code == 0
         assert json.loads(result.stdout)
         assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize("more", [(), ("--dry-run",)])
+    @pytest.mark.parametrize("option", ["-o", "--root", "--report"])
+    def test_a_suffix_that_is_none_of_ours_is_refused_by_name(
+        self, sample: Sample, tmp_path: Path, option: str, more: tuple[str, ...]
+    ) -> None:
+        named = {"-o": tmp_path / "fine.usdc"} | {option: tmp_path / "x.abc"}
+        result = run("refine", sample("swatch"), *(word for pair in named.items() for word in pair), *more, *SMALL)
+        assert (result.exit_code, "'.abc'; known: ." in result.stderr) == (2, True), result.stderr
+        assert not list(tmp_path.iterdir())
+
+    def test_a_dry_run_makes_no_folder(self, sample: Sample, tmp_path: Path) -> None:
+        more = ("--report", tmp_path / "b" / "c", "--root", tmp_path / "d")
+        assert run("refine", sample("swatch"), "-o", tmp_path / "a", *more, "--dry-run", *SMALL).exit_code == 0
+        assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize("option", ["--report", "--root"])
+    def test_what_cannot_be_written_is_refused_before_the_work(
+        self, sample: Sample, tmp_path: Path, option: str
+    ) -> None:
+        (tmp_path / "file").write_text("mine")
+        for place in (tmp_path / "file", Path("/proc/nowhere")):
+            named = (
+                "-o",
+                tmp_path / "fine.usdc",
+                option,
+                place / "x" / ("a.json" if option == "--report" else "a.usda"),
+            )
+            result = run("refine", sample("swatch"), *named, "--progress", *SMALL)
+            assert result.exit_code in (1, 2)
+            assert result.stderr.startswith("error: cannot write"), result.stderr
+        assert [file.name for file in tmp_path.iterdir()] == ["file"]
 
     def test_existing_layer_is_kept_unless_told(self, sample: Sample, tmp_path: Path) -> None:
         out = tmp_path / "fine.usdc"
@@ -133,41 +188,89 @@ class TestRefine:
 
         run("refine", "a.usda", "-o", tmp_path / "a.usdc")
         for field in fields(RefineOptions):
-            if field.name != "progress":
+            if field.name not in {"progress", "say"}:
                 assert getattr(refined[0].options, field.name) == getattr(RefineOptions(), field.name), field.name
 
     def test_every_option_is_one_of_the_call(self) -> None:
         from physgraph_usd.options import RefineOptions
 
         declared = {parameter.name for parameter in cli.refine.params} - {"shots", "out"}
-        assert declared == {field.name for field in fields(RefineOptions)}
+        assert declared == {field.name for field in fields(RefineOptions)} - {"say"}
 
 
 class TestSeveralShots:
-    def test_each_gets_its_files(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+    @pytest.fixture
+    def jobs(self, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Path, Any]]:
+        """What refine_shots is asked for; it does nothing here."""
+        asked: list[tuple[str, Path, Any]] = []
+
+        def refine_shots(jobs: list[tuple[str, Path, Any]], **_: object) -> list[SimpleNamespace]:
+            asked.extend(jobs)
+            return [SimpleNamespace(out=out, warnings=(), exit_code=0) for _, out, _ in jobs]
+
+        monkeypatch.setattr("physgraph_usd.shot.refine_shots", refine_shots)
+        return asked
+
+    def test_each_gets_its_files(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
         result = run("refine", "a/one.usda", "b/two.usd", "-o", tmp_path / "out", "--report", tmp_path / "reports")
         assert result.exit_code == 0
-        assert [call.out.name for call in refined] == ["one.refined.usdc", "two.refined.usdc"]
-        assert [call.options.report for call in refined] == [tmp_path / "reports" / name for name in ("one", "two")]
+        assert [out.name for _, out, _ in jobs] == ["one.refined.usdc", "two.refined.usdc"]
+        assert [options.report for *_, options in jobs] == [tmp_path / "reports" / name for name in ("one", "two")]
+        assert not list(tmp_path.iterdir()), "folders that nothing came into stay"
 
-    def test_equal_names_are_refused(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+    def test_equal_names_are_refused(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
         result = run("refine", "a/shot.usda", "b/shot.usda", "-o", tmp_path / "out")
-        assert (result.exit_code, refined) == (2, [])
+        assert (result.exit_code, jobs) == (2, [])
         assert "shot.refined.usdc" in result.stderr
 
-    def test_one_file_for_two_is_refused(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
+    def test_one_file_for_two_is_refused(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
         result = run("refine", "a.usda", "b.usda", "-o", tmp_path / "out.usdc")
-        assert (result.exit_code, refined) == (2, [])
+        assert (result.exit_code, jobs) == (2, [])
 
-    def test_a_broken_one_leaves_the_others(self, sample: Sample, tmp_path: Path) -> None:
-        missing = tmp_path / "missing.usda"
-        result = run("refine", missing, sample("swatch"), "-o", tmp_path / "out", *SMALL)
-        assert result.exit_code == 3
-        assert "missing.usda" in result.stderr
-        assert [file.name for file in (tmp_path / "out").iterdir()] == ["swatch.refined.usdc"]
+    @pytest.mark.parametrize("workers", ["1", "2"])
+    def test_those_that_fail_leave_the_others(self, tmp_path: Path, workers: str) -> None:
+        """A garment that is broken, an output that exists, a report that cannot be written."""
+        shots = [cloth_shot(tmp_path / f"{name}.usda") for name in ("good", "torn", "done", "told")]
+        stage = Usd.Stage.Open(str(shots[1]))
+        UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetFaceVertexIndicesAttr().Set([0, 1, 999])
+        stage.Save()
+        out, reports = tmp_path / "out", tmp_path / "reports"
+        out.mkdir()
+        reports.mkdir()
+        (out / "done.refined.usdc").write_text("mine")
+        (reports / "told").write_text("mine")
+        line = ("refine", *shots[1:], shots[0], "-o", out, "--report", reports)
+        result = run(*line, "--workers", workers, *SMALL)
+        assert result.exit_code == 3, result.output
+        assert sorted(file.name for file in out.iterdir()) == ["done.refined.usdc", "good.refined.usdc"]
+        said = result.stderr.splitlines()[-4:]
+        assert said[-1] == "3 of 4 shots failed"
+        for name, why in {"torn": CLOTH, "done": "exists", "told": "cannot write"}.items():
+            assert any(f"{name}.usda: " in line and why in line for line in said), said
+        assert (out / "done.refined.usdc").read_text() == (reports / "told").read_text() == "mine"
+
+    def test_one_that_dies_leaves_the_others(self, tmp_path: Path) -> None:
+        from physgraph_usd.options import RefineOptions
+        from physgraph_usd.shot import refine_shots
+
+        jobs = [(name, tmp_path / f"{name}.usdc", RefineOptions()) for name in ("dies", "raises", "returns")]
+        died, raised, returned = refine_shots(jobs, workers=2, refine=as_named)
+        assert "a worker process died (SIGSEGV)" in str(died)
+        assert "unexpected KeyError: 'a bug'" in str(raised)
+        assert returned == "returns"
+
+
+def kinds(root: type[errors.PhysGraphError]) -> list[type[errors.PhysGraphError]]:
+    return [root, *(kind for each in root.__subclasses__() for kind in kinds(each))]
 
 
 class TestErrors:
+    @pytest.mark.parametrize("kind", kinds(errors.PhysGraphError))
+    def test_every_error_travels_between_processes(self, kind: type[errors.PhysGraphError]) -> None:
+        error = kind("</A>", "is torn")
+        there = pickle.loads(pickle.dumps(error))
+        assert (type(there), str(there), vars(there)) == (kind, str(error), vars(error))
+
     @pytest.mark.parametrize(
         ("error", "code"),
         [
@@ -208,16 +311,21 @@ class TestErrors:
         assert (result.exit_code, result.stdout) == (2, "")
         assert "rror: " in result.stderr
 
-    @pytest.mark.parametrize("command", ["refine", "inspect", "tag", "validate", "preview"])
+    @pytest.mark.parametrize("command", ["refine", "inspect", "tag", "validate", "preview", "chart"])
     def test_missing_file_is_1(self, command: str, tmp_path: Path) -> None:
         out = {"inspect": (), "validate": (), "preview": ("-o", tmp_path / "x.png")}.get(
             command, ("-o", tmp_path / "x.usdc")
         )
         garment = ("--garment", "/A") if command == "tag" else ()
         result = run(command, tmp_path / "missing.usda", *out, *garment)
-        assert result.exit_code == 1
-        assert "missing.usda" in result.stderr + result.stdout
+        assert (result.exit_code, result.stdout) == (1, "")
+        assert result.stderr == f"error: no such file: {tmp_path / 'missing.usda'}\n"
         assert not list(tmp_path.iterdir())
+
+    def test_a_folder_that_is_a_file_is_1(self, tmp_path: Path) -> None:
+        (tmp_path / "run.toml").write_text("minutes = 1.0")
+        result = run("train", "--config", tmp_path / "run.toml", "-o", tmp_path / "run.toml")
+        assert (result.exit_code, result.stderr) == (1, f"error: {tmp_path / 'run.toml'}: File exists\n")
 
     def test_done_in_part_is_3(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         report = SimpleNamespace(out=tmp_path / "a.usdc", warnings=("frame 3 failed",), exit_code=3)
@@ -245,12 +353,29 @@ class TestOtherCommands:
         assert "swatch" in text.stdout
         assert "times: 1, 2, 3, ..., 24 (24 in all)" in text.stdout
 
+    def test_inspect_of_what_cannot_be_refined_is_1(self, sample: Sample) -> None:
+        result = run("inspect", sample("swatch"), "--garment", "/trousers", "--json")
+        assert result.exit_code == 1
+        found = json.loads(result.stdout)
+        assert "no prim at </trousers>" in found["problem"]
+        assert found["meshes"]
+
+    @pytest.mark.parametrize(("name", "down"), [("swatch", "-Y"), ("swatch_zup", "-Z")])
+    def test_inspect_says_where_gravity_pulls(self, sample: Sample, name: str, down: str) -> None:
+        assert f"gravity: 9.81 m/s^2 towards {down}\n" in run("inspect", sample(name)).stdout
+
     def test_tag_then_refine(self, sample: Sample, tmp_path: Path) -> None:
         found = json.loads(run("inspect", sample("swatch"), "--json").stdout)
         path = found["garments"][0]["path"]
         tagged = tmp_path / "tagged.usda"
         assert run("tag", sample("swatch"), "-o", tagged, "--garment", path, "--preset", "denim").exit_code == 0
         assert run("refine", tagged, "-o", tmp_path / "fine.usdc", *SMALL).exit_code == 0
+
+    @pytest.mark.parametrize("name", ["t.txt", "t", "t.usdz"])
+    def test_tag_writes_what_usd_can_open(self, sample: Sample, tmp_path: Path, name: str) -> None:
+        result = run("tag", sample("swatch"), "-o", tmp_path / name, "--garment", "cloth")
+        assert (result.exit_code, "known suffixes: .usd, .usda, .usdc" in result.stderr) == (2, True), result.stderr
+        assert not list(tmp_path.iterdir())
 
     def test_preview(self, sample: Sample, tmp_path: Path) -> None:
         picture = tmp_path / "picture.png"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API
 
-from physgraph_usd.chunks import Outcome, _collect, _solve_chunk
 from physgraph_usd.colliders.mesh import MeshBody
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.colliders.primitives import ShapeSurface
 from physgraph_usd.contact.heat import body_crossings, penetration_map
 from physgraph_usd.errors import LayerError
+from physgraph_usd.frames import FrameFolder, Outcome
 from physgraph_usd.mesh.topology import edges_of
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.usd.reader import open_shot
@@ -274,10 +273,11 @@ class TestShots:
         assert samples(layers[0], "penetration", CLOTH)
 
     def test_each_garment_keeps_its_own_in_a_frames_file(self, tmp_path: Path):
-        times = [1.0, 2.0, 3.0]
-        _solve_chunk(Heated(), list(times), 1, tmp_path, 5)
-        for index, time in enumerate(times[1:], start=5):
-            outcome = _collect(tmp_path / f"{index}.npz", time, Future())
+        frames = FrameFolder(tmp_path / "frames", {})
+        for index, solved in enumerate(Heated()([1.0, 2.0])):
+            frames.write(index, solved)
+            outcome = frames.read(index, solved.time)
+            assert outcome is not None
             first, second, third = outcome.heat
             assert (second, third) == (None, {})
             assert first is not None

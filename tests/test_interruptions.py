@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from shots import cloth_shot, command, faults, sample_times
 
+from physgraph_usd.frames import frames_folder
+
 TIMES = tuple(float(t) for t in range(1, 61))
 LINE = ("--level", "2", "--steps", "4", "--temporal", "off")
 
@@ -42,7 +44,7 @@ def running(shot: Path, out: Path, *extra: str) -> Iterator[subprocess.Popen[byt
     process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
         limit = time.monotonic() + 60
-        while process.poll() is None and not list(out.parent.glob("*.tmp.*")) and time.monotonic() < limit:
+        while process.poll() is None and len(finished(out)) < 3 and time.monotonic() < limit:
             time.sleep(0.002)
         yield process
     finally:
@@ -51,15 +53,24 @@ def running(shot: Path, out: Path, *extra: str) -> Iterator[subprocess.Popen[byt
         process.wait()
 
 
-def finishes(shot: Path, out: Path, whole: bytes) -> None:
-    """A rerun with the same command gives the whole layer and clears up what was left."""
-    done = command("refine", shot, "-o", out, *LINE)
+def finished(out: Path) -> list[Path]:
+    """Frames that a run has finished."""
+    return [file for file in frames_folder(out).glob("*.npz") if file.stem.isdecimal()]
+
+
+def finishes(shot: Path, out: Path, whole: bytes, *more: str) -> None:
+    """A rerun that goes on, or begins anew, gives the whole layer and clears up what was left."""
+    count = len(finished(out))
+    done = command("refine", shot, "-o", out, *LINE, *more)
     assert done.returncode == 0, done.stderr
+    used = f"{count} of {len(TIMES)} frames are those of a run that was interrupted"
+    anew = f"{count} finished frames of a run that was interrupted are solved anew; --resume would have used them"
+    assert (used if "--resume" in more else anew) in done.stderr
     assert out.read_bytes() == whole
     assert [file.name for file in out.parent.iterdir()] == [out.name]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_killed_run_leaves_nothing_under_the_name_and_a_rerun_finishes(
     shot: Path, whole: bytes, tmp_path: Path, seed: int
 ):
@@ -74,7 +85,7 @@ def test_a_killed_run_leaves_nothing_under_the_name_and_a_rerun_finishes(
         process.wait()
     assert alive, "the run was over before it was killed: make it longer"
     assert not out.exists()
-    finishes(shot, out, whole)
+    finishes(shot, out, whole, *(() if seed else ("--resume",)))
 
 
 @pytest.mark.slow
@@ -90,18 +101,62 @@ def test_killed_at_any_moment_from_start_to_end(shot: Path, whole: bytes, tmp_pa
         assert len(sample_times(out)) == len(TIMES)
         assert faults(out, shot) == []
     else:
-        assert command("refine", shot, "-o", out, *LINE).returncode == 0
+        assert command("refine", shot, "-o", out, *LINE, "--resume").returncode == 0
 
 
+@pytest.mark.parametrize("workers", ["1", "2"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_polite_signal_clears_up(shot: Path, tmp_path: Path, number: signal.Signals):
-    out = tmp_path / "fine.usdc"
-    with running(shot, out) as process:
-        time.sleep(0.05)
+def test_a_polite_signal_keeps_finished_frames_and_nothing_else(
+    shot: Path, whole: bytes, tmp_path: Path, number: signal.Signals, workers: str
+):
+    """The run is resumed with another number of workers; the layer has the bytes of one that was left alone (S34)."""
+    out = shot.parent / f"polite{number}{workers}" / "fine.usdc"
+    out.parent.mkdir()
+    with running(shot, out, "--workers", workers) as process:
         process.send_signal(number)
         code = process.wait(timeout=30)
     assert code != 0
+    assert [file.name for file in out.parent.iterdir()] == [frames_folder(out).name]
+    assert all(file.name == "run.json" or file in finished(out) for file in frames_folder(out).iterdir())
+    if (number, workers) == (signal.SIGTERM, "1"):
+        finishes(shot, out, whole, "--resume", "--workers", "2")
+
+
+def test_frames_of_another_run_are_neither_used_nor_dropped_unasked(shot: Path, tmp_path: Path):
+    out = tmp_path / "fine.usdc"
+    with running(shot, out) as process:
+        process.send_signal(signal.SIGTERM)
+        process.wait(timeout=30)
+    count = len(finished(out))
+    for resume in ((), ("--resume",)):
+        other = command("refine", shot, "-o", out, *LINE, "--set", "physgraph:material:density=0.3", *resume)
+        assert other.returncode == 2, other.stderr
+        assert f"holds {count} finished frames of a run with other overrides" in other.stderr
+    assert len(finished(out)) == count
+
+
+def test_finished_frames_are_not_kept_when_not_asked_for(shot: Path, tmp_path: Path):
+    with running(shot, tmp_path / "fine.usdc", "--no-keep-frames") as process:
+        process.send_signal(signal.SIGTERM)
+        process.wait(timeout=30)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("number", "workers"), [(signal.SIGTERM, "2"), (signal.SIGINT, "1")])
+def test_a_signal_leaves_no_empty_folder(shot: Path, tmp_path: Path, number: signal.Signals, workers: str):
+    """Before the first frame, of several shots, into folders that were not there."""
+    other = cloth_shot(tmp_path / "other.usdc")
+    out = tmp_path / "new" / "out"
+    line = ["refine", str(shot), str(other), "-o", str(out), "--report", str(tmp_path / "new" / "reports"), *LINE]
+    process = subprocess.Popen([sys.executable, "-m", "physgraph_usd", *line, "--workers", workers])
+    try:
+        while process.poll() is None and not out.exists():
+            time.sleep(0.002)
+        process.send_signal(number)
+        assert process.wait(timeout=30) != 0
+    finally:
+        process.kill()
+    assert [file.name for file in tmp_path.iterdir()] == ["other.usdc"]
 
 
 def test_a_killed_run_with_workers_leaves_no_process_and_no_folder(
@@ -131,8 +186,8 @@ def _alive(group: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize("megabytes", [0.02, 0.5, 2.0])
-def test_a_full_disk_is_a_clear_error(shot: Path, tmp_path: Path, megabytes: float):
+@pytest.mark.parametrize(("megabytes", "workers"), [(0.005, "1"), (0.005, "2"), (0.5, "1"), (2.0, "1")])
+def test_a_full_disk_is_a_clear_error(shot: Path, tmp_path: Path, megabytes: float, workers: str):
     """Files may not grow beyond a limit, as on a disk that fills up early, in the middle and late."""
     limit = int(megabytes * 1e6)
 
@@ -140,13 +195,28 @@ def test_a_full_disk_is_a_clear_error(shot: Path, tmp_path: Path, megabytes: flo
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     out = tmp_path / "fine.usdc"
-    done = command("refine", shot, "-o", out, *LINE, preexec_fn=fill)
+    done = command("refine", shot, "-o", out, *LINE, "--workers", workers, preexec_fn=fill)
     assert done.returncode == 1, done.stderr
     lines = done.stderr.strip().splitlines()
     assert lines[-1].startswith("error: "), done.stderr
     assert "Traceback" not in done.stderr
     assert str(out.name) in lines[-1]
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+def test_memory_that_runs_out_is_a_clear_error(tmp_path: Path):
+    """A billion fine vertices where a few gigabytes may be had."""
+    shot = cloth_shot(tmp_path / "shot.usdc", times=(1.0, 2.0), size=(400, 400))
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (6_000_000_000, 6_000_000_000))
+
+    done = command("refine", shot, "-o", tmp_path / "fine.usdc", "--level", "5", preexec_fn=limit)
+    assert (done.returncode, "Traceback" in done.stderr) == (1, False), done.stderr
+    assert "memory" in done.stderr.strip().splitlines()[-1], done.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["shot.usdc"]
 
 
 def test_a_folder_that_may_not_be_written(shot: Path, tmp_path: Path):

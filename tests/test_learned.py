@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -252,6 +253,14 @@ def test_weights_come_back_as_they_were(tmp_path: Path):
         assert save_network(again, tmp_path / "again.safetensors") == digest
 
 
+CONFIGURATIONS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "other width": lambda config: json.dumps(config | {"width": 17}),
+    "unknown vector": lambda config: json.dumps(config | {"vectors": ["metric", "moon"]}),
+    "empty configuration": lambda _: "{}",
+    "endless configuration": lambda _: "[" * 100_000,
+}
+
+
 def spoilt(file: Path, how: str) -> None:
     """Spoil a weights file."""
     with safe_open(str(file), framework="pt") as opened:
@@ -272,12 +281,9 @@ def spoilt(file: Path, how: str) -> None:
         save_file(tensors, file, metadata=about | {"version": "0"})
     elif how == "no metadata":
         save_file(tensors, file)
-    elif how == "other width":
-        config = json.loads(about["config"]) | {"width": 17}
-        save_file(tensors, file, metadata=about | {"config": json.dumps(config)})
-    elif how == "unknown vector":
-        config = json.loads(about["config"]) | {"vectors": ["metric", "moon"]}
-        save_file(tensors, file, metadata=about | {"config": json.dumps(config)})
+    elif how in CONFIGURATIONS:
+        config = CONFIGURATIONS[how](json.loads(about["config"]))
+        save_file(tensors, file, metadata=about | {"config": config})
     else:
         network = make_network(PLAIN)
         network.decode.bias.data.fill_(torch.nan)
@@ -295,6 +301,8 @@ def spoilt(file: Path, how: str) -> None:
         ("other version", "version '0'"),
         ("no metadata", "version None"),
         ("other width", "does not fit"),
+        ("empty configuration", "'vectors' is missing"),
+        ("endless configuration", "does not fit"),
         ("unknown vector", "moon"),
         ("NaN", "not finite"),
     ],

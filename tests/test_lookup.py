@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdPhysics, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from stages import add_sheet, author, new_stage
 
 from physgraph_usd.errors import SchemaError, UsageError
 from physgraph_usd.fabric import PRESETS
 from physgraph_usd.usd.lookup import check_overrides, find_value, parse_overrides
 from physgraph_usd.usd.materials import Values, find_values
+from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.schema import GARMENT
 from physgraph_usd.usd.stage import read_units
 
@@ -136,7 +138,14 @@ def test_animated_sources_are_told(stage: Usd.Stage) -> None:
     ("text", "message"),
     [
         ("bendStiffness", "cannot read 'bendStiffness'"),
-        ("bendStifness=1", "unknown attribute 'bendStifness'; known attributes: bendScale, bendStiffness"),
+        (
+            "bendStifness=1",
+            "unknown attribute 'bendStifness'; did you mean bendStiffness\\? known attributes: bendScale, ",
+        ),
+        ("physgraph:material:bendingStiffness=1", "did you mean bendStiffness"),
+        ("stiffness=4", "may mean stretchStiffness, shearStiffness, bendStiffness, guide:stiffness; write one"),
+        ("offset=0.1", "may mean contact:offset, collider:offset; write one"),
+        ("side=1", "unknown attribute 'side'"),
         ("bendStiffness=soft", "cannot use"),
         ("bendStiffness=-1", r"must be finite and in \[0, inf\]"),
         ("level=1.5", "whole number"),
@@ -161,3 +170,59 @@ def test_a_fallback_of_the_table_is_given_where_nothing_is_authored(stage: Usd.S
         if row.type != "rel" and not row.interpolation:
             expected = None if row.fallback is None else float(row.fallback)
             assert find_value(cloth(stage), row).at(None) == expected
+
+
+def told(stage: Usd.Stage) -> list[str]:
+    stage.GetRootLayer().Save()
+    with contextlib.closing(open_shot(stage.GetRootLayer().realPath)) as shot:
+        return [str(notice) for notice in shot.warnings]
+
+
+def test_misspelt_attributes_are_named_with_the_nearest_that_exists(stage: Usd.Stage) -> None:
+    assert told(stage) == []
+    material = bind(stage, "m")
+    author(material, "physgraph:material:bendingStiffness", 1.0)
+    author(cloth(stage), "physgraph:guide:stifness", 1.0)
+    author(stage.GetPrimAtPath("/World"), "userProperties:physgraph:material:densty", 1.0)
+    author(cloth(stage), "primvars:physgraph:bendscale", [1.0], kind="float[]")
+    author(cloth(stage), "physgraph:colour", 1.0)
+    ball = UsdGeom.Sphere.Define(stage, "/World/ball").GetPrim()
+    ball.AddAppliedSchema("PhysGraphColliderAPI")
+    author(ball, "physgraph:collider:offsets", 0.01)
+    said = "is no attribute that refining reads;"
+    assert sorted(told(stage)) == [
+        f"</World/ball>: physgraph:collider:offsets {said} did you mean physgraph:collider:offset?",
+        f"</World/m>: physgraph:material:bendingStiffness {said} did you mean physgraph:material:bendStiffness?",
+        f"</World/rig/cloth>: physgraph:colour {said} docs/attributes.md lists all",
+        f"</World/rig/cloth>: physgraph:guide:stifness {said} did you mean physgraph:guide:stiffness?",
+        f"</World/rig/cloth>: primvars:physgraph:bendscale {said} did you mean primvars:physgraph:bendScale?",
+        f"</World>: userProperties:physgraph:material:densty {said} did you mean physgraph:material:density?",
+    ]
+
+
+def test_a_garment_s_value_on_a_material_is_named(stage: Usd.Stage) -> None:
+    author(bind(stage, "m"), "physgraph:guide:stiffness", 1.0)
+    assert told(stage) == ["</World/m>: physgraph:guide:stiffness is not read on a material; author it on the garment"]
+
+
+def test_a_connection_is_followed_one_step(stage: Usd.Stage) -> None:
+    material = bind(stage, "m")
+    shared = author(material, "inputs:bend", 3e-5)
+    density = author(material, "inputs:weight", 0.4)
+    author(material, BEND, 1e-5).SetConnections([shared.GetPath()])
+    material.CreateAttribute("physgraph:material:density", Sdf.ValueTypeNames.Float).SetConnections([density.GetPath()])
+    found = values(stage)
+    assert found.found["bendStiffness"].source == "</World/m>.inputs:bend"
+    fabric = found.fabric(None)
+    assert (fabric.bend, fabric.density) == (pytest.approx(3e-5), pytest.approx(0.4))
+    assert told(stage) == []
+
+
+def test_a_connection_that_leads_to_no_value_is_named(stage: Usd.Stage) -> None:
+    material = bind(stage, "m")
+    shader = UsdShade.Shader.Define(stage, "/World/m/noise")
+    output = shader.CreateOutput("r", Sdf.ValueTypeNames.Float).GetAttr()
+    author(material, BEND, 2e-5).SetConnections([output.GetPath()])
+    assert values(stage).fabric(None).bend == pytest.approx(2e-5)
+    (said,) = told(stage)
+    assert said.startswith(f"</World/m>: {BEND} is connected to </World/m/noise.outputs:r>, which gives no value")

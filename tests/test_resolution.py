@@ -14,6 +14,7 @@ from sheets import garment_of
 
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.level import build_levels
+from physgraph_usd.mesh.subdivide import fine_count, subdivide_times
 from physgraph_usd.resolution import (
     AUTO,
     EDGES_PER_WAVE,
@@ -21,7 +22,9 @@ from physgraph_usd.resolution import (
     MOST,
     SHARP_SHARE,
     LevelChoice,
+    carries_none,
     choose_levels,
+    sample_frames,
     sharp_folds,
     too_coarse,
 )
@@ -43,7 +46,7 @@ def choose(
         return frame_of((1.0 - squeeze) * rest, time, fabric=fabric)
 
     scene = Scene((replace(garment_of(MESH, rest), level=level),), DOWN, times)
-    return choose_levels(scene, frame_at)[0], read
+    return choose_levels(scene, sample_frames(scene, frame_at))[0], read
 
 
 @pytest.mark.parametrize("squeeze", [0.02, 0.1, 0.3])
@@ -82,7 +85,42 @@ def test_no_more_than_the_most():
 def test_a_level_that_was_asked_for_is_kept():
     choice, _ = choose(0.3, level=1, fabric=replace(FABRIC, bend=1e-7))
     assert choice.level == 1
-    assert choice.reason == "as authored or asked for"
+    assert choice.reason.startswith("as authored or asked for")
+
+
+@pytest.mark.parametrize("level", [0, 1, 3])
+def test_what_is_said_of_a_level_names_the_one_that_would_do_and_its_cost(level: int):
+    choice, _ = choose(0.1, level=level, fabric=replace(FABRIC, bend=4e-4))
+    enough, _ = choose(0.1, fabric=replace(FABRIC, bend=4e-4))
+    assert choice.needed == enough.level == 2
+    points = [len(build_levels([garment_of(MESH, REST)], [subdivide_times(MESH, n)])[-1].rest) for n in (level, 2)]
+    assert choice.vertices == tuple(points)
+    said = f"level 2 resolves them: {points[1]:,} vertices, up to {points[1] / points[0]:.0f} times the time"
+    assert (said in choice.reason) == (level < 2)
+    assert f"edges of {1e3 * choice.edge:.1f} mm resolve wrinkles of {5e3 * choice.edge:.1f} mm" in choice.reason
+
+
+@pytest.mark.parametrize("bend", np.geomspace(1e-7, 1e-3, 9))
+def test_a_warning_where_two_edges_are_longer_than_a_wave(bend: float):
+    choice, _ = choose(0.1, level=1, fabric=replace(FABRIC, bend=bend))
+    said = carries_none("/coat", choice)
+    assert bool(said) == (choice.wavelength < 2 * choice.edge)
+    assert not said or f"level {choice.needed} resolves them" in said
+
+
+def test_auto_that_stops_short_says_so():
+    choice, _ = choose(0.3, fabric=replace(FABRIC, bend=1e-9))
+    assert f"resolve wrinkles of {5e3 * choice.edge:.1f} mm" in choice.reason
+    assert f"level {choice.needed} resolves them" in choice.reason
+    assert "(5 is the most)" in choice.reason
+
+
+@pytest.mark.parametrize("kind", ["triangles", "quads"])
+@pytest.mark.parametrize("level", [0, 1, 3])
+def test_vertices_are_counted_without_making_them(kind: str, level: int):
+    mesh, _ = grid(4, 3, kind)
+    refined = subdivide_times(mesh, level)
+    assert fine_count(mesh, level) == (refined[-1].mesh if refined else mesh).vertex_count
 
 
 def pleated(fold: float) -> float:
@@ -117,7 +155,7 @@ def test_few_frames_are_read_first_and_last_among_them():
 @pytest.mark.parametrize("level", [AUTO, 0, 2])
 def test_a_garment_without_faces(level: int):
     scene = Scene((replace(garment_of(mesh_of([], 3), np.zeros((3, 3))), level=level),), DOWN, ())
-    choice = choose_levels(scene, lambda time: frame_of(np.zeros((3, 3)), time))[0]
+    choice = choose_levels(scene, [frame_of(np.zeros((3, 3)), None)])[0]
     assert choice.level == max(level, 0)
 
 

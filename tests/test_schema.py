@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 from pxr import Plug, Sdf, Usd, UsdGeom, UsdShade
-from stages import sheet_shot, value_type
+from stages import author, sheet_shot, value_type
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.fabric import PRESETS
+from physgraph_usd.usd.lookup import find_value
 from physgraph_usd.usd.schema import (
+    COLLIDER,
     COLLIDER_API,
     GARMENT,
     GARMENT_API,
@@ -66,11 +68,36 @@ def test_every_row_is_what_the_registered_schema_says(prims: dict[str, Usd.Prim]
     assert not attribute.HasAuthoredValue()
     if row.interpolation:
         assert UsdGeom.Primvar(attribute).GetInterpolation() == row.interpolation
-    elif row.fallback is None:
-        assert attribute.Get() is None
-    else:
-        assert attribute.Get() == pytest.approx(row.fallback)
-        assert type(attribute.Get()) is type(row.fallback)
+    said = attribute.GetDocumentation()
+    assert ("Where nothing gives it" in said) == (row.fallback is not None)
+
+
+GIVERS = {"nobody": (), "a material": ("material",), "an ancestor": ("rig",), "the prim": ("cloth", "rig", "material")}
+"""Who authors a value, the one that counts first."""
+
+
+@pytest.mark.parametrize("givers", GIVERS.values(), ids=GIVERS)
+def test_an_editor_shows_what_refining_takes_or_nothing(prims: dict[str, Usd.Prim], givers: tuple[str, ...]) -> None:
+    stage = Usd.Stage.CreateInMemory()
+    found = {
+        "rig": UsdGeom.Xform.Define(stage, "/rig").GetPrim(),
+        "cloth": UsdGeom.Mesh.Define(stage, "/rig/cloth").GetPrim(),
+    }
+    found["material"] = UsdShade.Material.Define(stage, "/m").GetPrim()
+    UsdShade.MaterialBindingAPI.Apply(found["cloth"]).Bind(UsdShade.Material(found["material"]))
+    for schema in (GARMENT_API, COLLIDER_API):
+        found["cloth"].ApplyAPI(schema)
+    rows = [
+        row
+        for row in (*GARMENT.values(), *COLLIDER.values())
+        if row.type not in {"rel", "token"} and not row.interpolation
+    ]
+    for row in rows:
+        for value, giver in enumerate(givers):
+            author(found[giver], row.name, value != bool(row.fallback) if row.type == "bool" else value + 1.0)
+        shown = found["cloth"].GetAttribute(row.name).Get()
+        assert shown is None or shown == find_value(found["cloth"], row).at(None), row.name
+        assert shown is not None or "cloth" not in givers, row.name
 
 
 @pytest.mark.parametrize("row", [row for row in PROPERTIES if row.minimum is not None and not row.interpolation])

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from physgraph_usd.errors import (
 )
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.shot import inspect_shot, refine_shot
+from physgraph_usd.usd.validate import validate_layer
 
 BEND = "physgraph:material:bendStiffness"
 
@@ -81,6 +83,20 @@ class TestDone:
         assert asked["physgraph"].modelled["network"].startswith(f"physgraph made {share:.0%} of the steps")
         assert "network" not in asked["physgraph"].left_out
 
+    def test_the_level_that_would_do_and_its_cost_are_told_before_the_first_frame(self, shot: Path, tmp_path: Path):
+        told: list[object] = []
+        options: dict[str, Any] = {"overrides": (f"{BEND}=1e-6",), "level": 1}
+        report = refine(
+            shot, tmp_path / "fine.usdc", say=told.append, progress=lambda *done: told.append(done), **options
+        )
+        garment = inspect_shot(shot, **options)["garments"][0]
+        said = f"level {garment['level_needed']} resolves them: {garment['fine_points_needed']:,} vertices"
+        assert said in str(told[0])
+        assert said in garment["level_reason"]
+        assert report.garments[0] == garment
+        assert told[0] in report.warnings
+        assert (1, len(TIMES)) in told[1:]
+
     def test_progress_counts_up(self, shot: Path, tmp_path: Path):
         seen: list[tuple[int, int]] = []
         refine(shot, tmp_path / "fine.usdc", progress=lambda done, total: seen.append((done, total)))
@@ -89,6 +105,45 @@ class TestDone:
     def test_frames_range(self, shot: Path, tmp_path: Path):
         refine(shot, tmp_path / "fine.usdc", frames=(2.0, 4.0))
         assert sample_times(tmp_path / "fine.usdc") == (2.0, 3.0, 4.0)
+
+    def test_a_range_that_leaves_out_samples_is_told_everywhere(self, shot: Path, tmp_path: Path):
+        out = tmp_path / "fine.usdc"
+        report = refine(shot, out, frames=(2.0, 3.0))
+        said = "4 of 6 samples, 1 and 4 to 6"
+        assert report.garments[0]["samples_left_out"] == 4
+        assert said in report.left_out["samples"]
+        assert len([warning for warning in report.warnings if said in warning]) == 1
+        record = Sdf.Layer.FindOrOpen(str(out)).customLayerData["physgraph"]
+        assert dict(record["left_out"]) == {CLOTH: said}
+        (problem,) = validate_layer(out)
+        assert (problem.severity, problem.path, problem.rule) == ("warning", CLOTH, "whole_range")
+        assert said in problem.message
+
+    def test_a_range_that_holds_all_samples_leaves_no_trace(self, shot: Path, tmp_path: Path):
+        out = tmp_path / "fine.usdc"
+        report = refine(shot, out, frames=(0.0, 100.0))
+        assert report.garments[0]["samples_left_out"] == 0
+        assert not any("the frame range" in warning for warning in report.warnings)
+        assert "left_out" not in Sdf.Layer.FindOrOpen(str(out)).customLayerData["physgraph"]
+        assert validate_layer(out) == []
+
+    def test_velocities_are_written_where_the_shot_has_them(self, shot: Path, tmp_path: Path):
+        out = tmp_path / "fine.usdc"
+        assert refine(shot, out, overwrite=True).garments[0]["velocities"] == "none"
+        assert not Sdf.Layer.FindOrOpen(str(out)).GetAttributeAtPath(f"{CLOTH}.velocities")
+        stage = Usd.Stage.Open(str(shot))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+        for time in TIMES:
+            count = len(mesh.GetPointsAttr().Get(time))
+            mesh.CreateVelocitiesAttr().Set([(0, 0, 1)] * count, time)
+            mesh.CreateAccelerationsAttr().Set([(0, 0, 1)] * count, time)
+        stage.Save()
+        report = refine(shot, out, overwrite=True)
+        assert report.garments[0]["velocities"] == "written anew, as the shot has them"
+        assert f"<{CLOTH}>: its velocities are written anew, from the refined points" in report.warnings
+        assert any("accelerations are blocked" in warning for warning in report.warnings)
+        assert tuple(Sdf.Layer.FindOrOpen(str(out)).ListTimeSamplesForPath(f"{CLOTH}.velocities")) == TIMES
+        assert faults(out, shot) == []
 
     def test_s31_a_still_garment_has_a_default_and_no_samples(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc", times=())
@@ -230,7 +285,8 @@ class TestOptions:
         record = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc")).customLayerData["physgraph"]
         plain = RefineOptions(level=1, steps=3, heat_map=True).plain()
         assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
-            "progress", "report", "overwrite", "dry_run", "workers", "root", "weights",
+            "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths", "resume",
+            "keep_frames",
         }  # fmt: skip
         assert json.loads(json.dumps(record, default=str))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +114,32 @@ class TestS5:
             assert same == (time != 3.0), time
         assert np.isfinite(fine(dirty, tmp_path / "d.usdc", 3.0)).all()
         assert np.abs(fine(clean, tmp_path / "c.usdc", 3.0) - fine(dirty, tmp_path / "d.usdc", 3.0)).max() < EDGE
+
+
+CUT = """
+import os, sys
+from pathlib import Path
+from physgraph_usd import PhysGraphError, RefineOptions, refine_shot
+shot = Path(sys.argv[1])
+def cut(done, total):
+    os.truncate(shot, int(float(sys.argv[2]) * shot.stat().st_size))
+try:
+    refine_shot(shot, shot.with_name("fine.usdc"), RefineOptions(level=1, steps=2, progress=cut))
+except PhysGraphError as error:
+    sys.stdout.write(str(error))
+"""
+
+
+@pytest.mark.parametrize("part", [0.0, 0.6])
+def test_a_shot_that_is_cut_short_while_it_is_read_is_named(tmp_path: Path, part: float):
+    """In a process of its own: where layers are mapped into memory, it dies of SIGBUS."""
+    shot = cloth_shot(tmp_path / "shot.usdc", size=(40, 40))
+    line = [sys.executable, "-c", CUT, str(shot), str(part)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "shot.usdc" in done.stdout
+    assert "\n" not in done.stdout
+    assert only(tmp_path, "shot.usdc")
 
 
 class TestBrokenShots:

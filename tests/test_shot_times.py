@@ -113,8 +113,16 @@ def test_garments_outside_the_frame_range_are_left_out(tmp_path: Path) -> None:
     shot = open_shot(path, frames=(9.0, 20.0))
     assert [garment.path for garment in shot.scene.garments] == ["/World/late"]
     assert "authored time codes run from 1 to 3" in said(shot)
-    with pytest.raises(StageError, match="no garment is left to refine"):
+    with pytest.raises(StageError, match="no sample of the shot lies in frames 4:5; its 5 samples run from 1 to 11"):
         open_shot(path, frames=(4.0, 5.0))
+
+
+def test_a_still_garment_does_not_make_up_for_a_range_outside_the_shot(tmp_path: Path) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage)
+    add_sheet(stage, "/World/still", times=())
+    with pytest.raises(StageError, match="its 3 samples run from 1 to 3"):
+        open_shot(save(stage), frames=(4.0, 5.0))
 
 
 @pytest.mark.parametrize("frames", [(5.0, 1.0), (float("nan"), 2.0), (1.0, float("inf"))])

@@ -40,6 +40,14 @@ def test_a_tagged_shot_can_be_refined_as_it_is(untagged: Path, tmp_path: Path) -
     assert untagged.read_bytes() == before
 
 
+def test_a_tagged_layer_names_its_shot_as_asked(untagged: Path, tmp_path: Path) -> None:
+    for form, named in (("relative", "./shot.usda"), ("absolute", str(untagged.resolve()))):
+        out = tag(untagged, tmp_path / f"{form}.usda", garments=[COAT], asset_paths=form)
+        assert Sdf.Layer.FindOrOpen(str(out)).subLayerPaths == [named]
+    with pytest.raises(UsageError, match="known asset paths: relative, absolute"):
+        tag(untagged, tmp_path / "x.usda", garments=[COAT], asset_paths="short")
+
+
 def test_a_preset_is_authored_on_garments_only(untagged: Path, tmp_path: Path) -> None:
     out = tag(untagged, tmp_path / "tagged.usda", garments=[COAT], colliders=["/World/ball"], preset="denim")
     stage = Usd.Stage.Open(str(out))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -317,6 +318,9 @@ def test_resume_and_fresh_runs_are_not_confused(tmp_path: Path):
     again = run("--config", config, "-o", tmp_path / "out")
     assert again.exit_code == 2
     assert "holds a run" in again.stderr
+    (tmp_path / "out" / record.CHECKPOINT).rename(tmp_path / record.CHECKPOINT)
+    assert "holds a run" in run("--config", config, "-o", tmp_path / "out").stderr  # its weights are there
+    (tmp_path / record.CHECKPOINT).rename(tmp_path / "out" / record.CHECKPOINT)
     assert run("--config", configured(tmp_path, iterations=6), "-o", tmp_path / "out", "--resume").exit_code == 0
 
 
@@ -328,6 +332,8 @@ def test_resume_and_fresh_runs_are_not_confused(tmp_path: Path):
         ("[network]\nvectors = ['moon']", "unknown vectors moon"),
         ("[patches]\nnumber = 3", "unknown number"),
         ("seed = ", "is not TOML"),
+        ("a = " + "[" * 100_000, "is not TOML"),
+        ("network = 3", "is 3, no table"),
     ],
 )
 def test_wrong_configurations_are_refused_by_name(tmp_path: Path, text: str, word: str):
@@ -336,6 +342,41 @@ def test_wrong_configurations_are_refused_by_name(tmp_path: Path, text: str, wor
     with pytest.raises(UsageError, match=word):
         record.read_config(file)
     assert run("--config", tmp_path / "none.toml", "-o", tmp_path / "out").exit_code == 2
+
+
+def test_a_configuration_that_is_no_utf8_is_refused_by_name(tmp_path: Path):
+    (tmp_path / "wrong.toml").write_bytes(b"kind = '\xff'")
+    result = run("--config", tmp_path / "wrong.toml", "-o", tmp_path / "out")
+    assert (result.exit_code, "is not TOML" in result.stderr) == (2, True), result.stderr
+
+
+class Crafted:
+    """What makes a file when it is unpickled."""
+
+    def __init__(self, made: Path) -> None:
+        self.made = made
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return Path.touch, (self.made,)  # pyright: ignore[reportReturnType]
+
+
+@pytest.mark.parametrize("how", ["crafted", "plain pickle", "cut", "of another network"])
+def test_a_checkpoint_that_is_not_ours_is_refused_and_runs_nothing(tmp_path: Path, how: str):
+    config, out, made = configured(tmp_path), tmp_path / "out", tmp_path / "made"
+    out.mkdir()
+    checkpoint = out / record.CHECKPOINT
+    if how == "plain pickle":
+        checkpoint.write_bytes(pickle.dumps(Crafted(made)))
+    elif how == "of another network":
+        Trainer(replace(record.read_config(config), network=PhysgraphConfig(width=9))).save(checkpoint)
+    else:
+        torch.save({"network": Crafted(made) if how == "crafted" else torch.zeros(9)}, checkpoint)
+    if how == "cut":
+        checkpoint.write_bytes(checkpoint.read_bytes()[:-200])
+    result = run("--config", config, "-o", out, "--resume")
+    assert result.exit_code == 2, result.output
+    assert str(checkpoint) in result.stderr
+    assert not made.exists()
 
 
 def test_the_committed_configurations_can_be_read():

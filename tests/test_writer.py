@@ -65,7 +65,7 @@ def test_all_that_depends_on_topology_is_there(dressed: Path, tmp_path: Path) ->
     assert mesh.GetNormalsInterpolation() == "vertex"
     for name in ("cornerIndices", "cornerSharpnesses", "creaseIndices", "creaseLengths", "creaseSharpnesses"):
         assert len(prim.GetAttribute(name).Get()) == 0
-    assert not mesh.GetVelocitiesAttr().HasAuthoredValue()
+    assert {len(mesh.GetVelocitiesAttr().Get(time)) for time in TIMES} == {vertices}
     assert not mesh.GetAccelerationsAttr().HasAuthoredValue()
     words = primvars.GetPrimvar("label").ComputeFlattened()
     assert list(words) == [f"f{face // 4}" for face in range(faces)]

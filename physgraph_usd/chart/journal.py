@@ -10,6 +10,9 @@ from typing import Any
 from ..errors import UsageError
 
 NAME = "chart.rows.jsonl"
+KINDS = ("problem", "plan", "reference", "point", "failed", "term")
+"""What a row can be."""
+REMEDY = "take that line out, or measure anew with --overwrite"
 
 
 class Journal:
@@ -24,7 +27,7 @@ class Journal:
             overwrite: Drop such rows instead.
 
         Raises:
-            UsageError: The folder holds the rows of another problem.
+            UsageError: The folder holds the rows of another problem, or a row is damaged.
         """
         self._file = folder / NAME
         self._rows: list[dict[str, Any]] = []
@@ -56,9 +59,15 @@ class Journal:
 
     def _read(self) -> Iterator[dict[str, Any]]:
         """The whole rows of the file; a last line that was cut off is dropped from it."""
-        text = self._file.read_text(encoding="utf-8")
-        whole = text[: text.rfind("\n") + 1]
-        if whole != text:
-            self._file.write_text(whole, encoding="utf-8")
-        for line in whole.splitlines():
-            yield json.loads(line)
+        data = self._file.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if whole != data:
+            self._file.write_bytes(whole)
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError) as error:
+                raise UsageError(f"{self._file}, line {number}, is damaged; {REMEDY}") from error
+            if not isinstance(row, dict) or row.get("row") not in KINDS:
+                raise UsageError(f"{self._file}, line {number}, is no row of a chart; {REMEDY}")
+            yield row

@@ -52,7 +52,7 @@ class ChartOptions:
         colliders: Prim paths, globs or collections; empty finds applied schemas.
         level: Subdivisions; -1 chooses, None takes the stage's.
         overrides: "</Prim>.attribute=value" or "attribute=value".
-        rest_frame: Time code whose points are the rest shape, or None.
+        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
         device: "cpu" or "cuda".
         clock: "wall", or "cpu" to count one core's own time, which other programs do not change.
         methods: Names of `integrate.METHODS` to measure; empty takes all.
@@ -70,7 +70,7 @@ class ChartOptions:
     colliders: Sequence[str] = ()
     level: int | None = None
     overrides: Sequence[str] = ()
-    rest_frame: float | None = None
+    rest_frame: float | str | None = None
     device: str = "cpu"
     clock: str = "wall"
     methods: Sequence[str] = ()

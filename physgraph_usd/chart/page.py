@@ -23,7 +23,7 @@ HOW = (
     "turns, in which all methods take one budget before any takes the next: what else a machine does only ever adds to "
     "a time. Reading and writing are left out. A budget is a number of steps at the finest level; a nested method may "
     "take four times as many at each coarser one. Energies, strain and contact are judged in float64, by one ruler for "
-    "all. Phi0 is plain upsampling's energy, Phi* the least that anybody found."
+    "all. Phi0 is plain upsampling's energy, Phi* the least that anybody found, from several starts."
 )
 
 
@@ -139,14 +139,25 @@ def _notes(chart: Chart) -> str:
     """How it was measured."""
     plan, longer = chart.about["plan"] or {}, chart.about.get("long_minutes")
     rows = [
-        ("-" if r["frame"] is None else f"{r['frame']:g}", f"{r['start']:.5g}", f"{r['least']:.5g}", r["by"])
+        (
+            "-" if r["frame"] is None else f"{r['frame']:g}",
+            f"{r['start']:.5g}",
+            f"{r['least']:.5g}",
+            r["by"],
+            "-" if r["apart"] is None else f"{r['apart']:.2%}",
+        )
         for r in chart.references
     ]
     failed = [(r["method"], str(r["steps"]), r["error"]) for r in chart.failed]
     return "".join(
         [
             f"<h2>How it was measured</h2><p>{HOW.format(repeats=plan.get('repeats', '?'))}</p>",
-            table("references", ("frame", "Phi0 [J]", "Phi* [J]", "found by"), rows, numbers=(0, 1, 2)),
+            table(
+                "references",
+                ("frame", "Phi0 [J]", "Phi* [J]", "found by", "next best above, of the fall"),
+                rows,
+                numbers=(0, 1, 2),
+            ),
             table("outside", ("solver outside", "was given"), list(chart.notes.items())) if chart.notes else "",
             "<h2>Runs that failed</h2>" + table("failed", ("method", "steps", "error"), failed) if failed else "",
             f"<p class='note'>The long form would take about {longer:.0f} minutes here.</p>" if longer else "",

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..contact.settings import ContactSettings
 from ..detail import Carried
 from ..level import Level
 from ..options import RefineOptions
@@ -24,6 +25,8 @@ DEFAULT = RefineOptions().solve_settings()
 """What `refine` does by default."""
 COLD = replace(DEFAULT, temporal="off")
 """The same, each frame by itself."""
+ALONE = replace(COLD, contact=ContactSettings("off", cloth="off"))
+"""The same of cloth that touches nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +128,9 @@ class Problem:
             carried.append(solved.carried)
         return tuple(points[index] for index in sorted(points)), carried
 
-    def judge(self, frame: Frame, points: Sequence[np.ndarray]) -> Judgement:
-        """Energy, strain and contact of fine world positions [m], one array a garment."""
-        self.refiner.use(COLD)
+    def judge(self, frame: Frame, points: Sequence[np.ndarray], settings: SolveSettings = COLD) -> Judgement:
+        """Energy, strain and contact of fine world positions [m], one array a garment, in a potential and a contact."""
+        self.refiner.use(settings)
         return judge(self.refiner, frame, points)
 
     def upsampled(self, frame: Frame, *, smooth: bool) -> tuple[np.ndarray, ...]:

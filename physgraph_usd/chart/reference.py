@@ -1,14 +1,16 @@
-"""Phi*: the least energy known for a frame (DESIGN 4.5).
+"""Phi*: the least energy known for a frame (DESIGN 4.5). One function for all charts and benchmarks.
 
-Nested quasi-Newton in float64 with twice as many steps each time, then Newton from the best of them, for as long as
-that lowers the energy or until the time is spent. Where a method of the chart finds less, that is Phi* in the end.
+Cloth buckles in many ways, and a descent ends in the one that its start lies nearest to. So several are begun, in
+float64: each integrator of `STARTS` with its steps, then quasi-Newton at the finest level, for as long as that lowers
+the energy; last, Newton from the best two. Where a method that is measured finds less, that is Phi* in the end.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +19,30 @@ import numpy as np
 from ..detail import Carried
 from ..integrate import METHODS
 from ..scene import Frame
-from .judge import Judgement
+from ..solve_settings import SolveSettings
 from .problem import COLD, Problem
 
-FIRST_STEPS = 24
-MOST_STEPS = 800
-SETTLED = 1e-3
-"""Fall of the energy, over the whole fall, under which a longer run is not worth it."""
-POLISH_STEPS = 4
-POLISHES = 8
+STARTS = (
+    ("quasi-newton", 6),
+    ("quasi-newton-flat", 48),
+    ("physgraph", 48),
+    ("quasi-newton", 24),
+    ("lbfgs", 48),
+    ("quasi-newton", 3),
+    ("quasi-newton", 96),
+)
+"""Integrators and steps: unlike one another, and what found the least first, for a short search ends early."""
+SHORT, LEAST = 3, 2
+"""How many of them a short search takes, and one whose time is out: with one alone nobody knows how good it is."""
+ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10
+"""How a start goes on, how often at most, and how often more where it is one of the finalists."""
+NEWTON, POLISHES = ("newton", 8), 6
+FINALISTS = 2
+SETTLED = 2e-4
+"""Fall of the energy, over the whole fall, under which going on is not worth it: gaps are told to a thousandth."""
 SOLUTION = "chart.solution.{}.npz"
 DESCENT = 0.6
-"""Part of the time after which the polish begins."""
+"""Part of the time after which no start is begun."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +54,7 @@ class Reference:
         least: The least energy [J].
         energies: The same by term [J].
         by: Who found it.
-        gained: What the last longer run still gained of the whole fall.
+        apart: How far the least of the other starts lies above it, over the whole fall; None where there was no other.
         seconds: Time spent [s].
         points: Fine world positions [m] of each garment that have it.
     """
@@ -49,13 +63,35 @@ class Reference:
     least: float
     energies: dict[str, float]
     by: str
-    gained: float
-    seconds: float
-    points: tuple[np.ndarray, ...] = field(repr=False)
+    apart: float | None = None
+    seconds: float = 0.0
+    points: tuple[np.ndarray, ...] = field(repr=False, default=())
+
+    @staticmethod
+    def of(plain: dict[str, Any]) -> Reference:
+        """What `plain` gave."""
+        return Reference(**{each.name: plain[each.name] for each in fields(Reference) if each.name in plain})
 
     def plain(self) -> dict[str, Any]:
         """Ready for JSON, without the positions."""
         return {name: value for name, value in vars(self).items() if name != "points"}
+
+    def gap(self, energy: float) -> float:
+        """(Phi - Phi*) / (Phi0 - Phi*) of an energy [J]."""
+        return (energy - self.least) / max(self.start - self.least, 1e-30)
+
+    def lowered(self, energies: dict[str, float], by: str) -> Reference:
+        """What is known when a method came to energies by term [J]: itself, unless those are less."""
+        energy = sum(energies.values())
+        if not energy < self.least:
+            return self
+        apart = (self.least - energy) / max(self.start - energy, 1e-30)
+        return replace(self, least=energy, by=by, apart=apart, energies=energies, points=())
+
+    def __str__(self) -> str:
+        """Phi*, who found it, and how well it is known."""
+        other = "nobody else looked" if self.apart is None else f"the next best ends {self.apart:.2%} of the fall above"
+        return f"Phi* {1e3 * self.least:.5g} mJ by {self.by}; {other}"
 
 
 class Solutions:
@@ -75,6 +111,7 @@ class Solutions:
 
     def keep(self, time: float | None, points: Sequence[np.ndarray]) -> None:
         """Keep the fine world positions [m] of a frame, one array a garment."""
+        self._known.pop(time, None)
         np.savez(self._file(time), *points)
 
     def apart_mm(self, frame: Frame, points: Sequence[np.ndarray]) -> float | None:
@@ -96,60 +133,58 @@ def rms_mm(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
     return 1e3 * float(np.sqrt(np.square(apart).sum(axis=1).mean()))
 
 
-class _Search:
-    """The best result so far."""
+class _Descent:
+    """Ever longer runs from one start; the best is kept."""
 
-    def __init__(self, problem: Problem, frame: Frame) -> None:
-        self.problem, self.frame = problem, frame
-        self.start = problem.judge(frame, problem.upsampled(frame, smooth=False)).energy
-        self.best: Judgement | None = None
+    def __init__(self, problem: Problem, frame: Frame, settings: SolveSettings, *, start: float) -> None:
+        self._problem, self._frame, self._settings, self._start = problem, frame, settings, start
+        self._kept: Sequence[Carried | None] = [None] * len(problem.refiner.parts_of(frame))
+        self.by, self.energy = "", math.inf
+        self.energies: dict[str, float] = {}
         self.points: tuple[np.ndarray, ...] = ()
-        self.kept: Sequence[Carried | None] = [None] * len(problem.refiner.parts_of(frame))
-        self.by, self.gained = "", 1.0
 
-    def take(self, name: str, points: Any, kept: list[Carried]) -> None:
-        """Judge a run and keep it when it is the best."""
-        found = self.problem.judge(self.frame, points)
-        known = self.start if self.best is None else self.best.energy
-        self.gained = max(known - found.energy, 0.0) / max(self.start - min(known, found.energy), 1e-30)
-        if self.best is None or found.energy < self.best.energy:
-            self.best, self.by, self.kept, self.points = found, name, kept, points
+    def go_on(self, name: str, method: tuple[str, int], *, most: int, until: float = math.inf) -> _Descent:
+        """Make so many runs at most, while there is time and each lowers the energy by much."""
+        for _ in range(most):
+            if time.perf_counter() > until:
+                break
+            settings = replace(self._settings, method=METHODS[method[0]], steps=method[1], tolerance=0.0)
+            points, kept = self._problem.go_on(self._frame, settings, self._kept)
+            found, before = self._problem.judge(self._frame, points, self._settings), self.energy
+            if found.energy < before:
+                self.by += name if not self.by.endswith(name) else ""
+                self.energy, self.energies, self.points, self._kept = found.energy, found.energies, points, kept
+            if not before - found.energy > SETTLED * (self._start - found.energy):
+                break
+        return self
 
 
-def find_reference(problem: Problem, frame: Frame, *, seconds: float) -> Reference:
+def find_reference(
+    problem: Problem, frame: Frame, *, settings: SolveSettings = COLD, seconds: float = math.inf, short: bool = False
+) -> Reference:
     """Look for the least energy of a frame.
 
     Args:
         problem: The problem in float64.
         frame: The frame.
-        seconds: Time to spend; one run may take longer.
+        settings: Its potential and contact.
+        seconds: Time to spend; one run may take longer. Without an end the answer depends on no machine's speed.
+        short: Whether to try fewer starts.
     """
     began = time.perf_counter()
-    search = _Search(problem, frame)
-    settled = 0
-    for steps in _doubling():
-        run = time.perf_counter()
-        settings = replace(COLD, method=METHODS["quasi-newton"], steps=steps, tolerance=0.0)
-        search.take(f"nested quasi-newton, {steps} steps", *problem.go_on(frame, settings, [None] * len(search.kept)))
-        settled = settled + 1 if search.gained < SETTLED else 0
-        now = time.perf_counter()
-        if settled == 2 or now + 2.0 * (now - run) - began > DESCENT * seconds:
+    start = problem.judge(frame, problem.upsampled(frame, smooth=False), settings).energy
+    runs: list[_Descent] = []
+    for method in STARTS[: SHORT if short else None]:
+        if len(runs) >= LEAST and time.perf_counter() - began > DESCENT * seconds:
             break
-    polish = replace(COLD, method=METHODS["newton"], steps=POLISH_STEPS, tolerance=0.0)
-    for _ in range(POLISHES):
-        if time.perf_counter() - began > seconds:
-            break
-        search.take(f"{search.by.partition(' +')[0]} + Newton", *problem.go_on(frame, polish, search.kept))
-        if search.gained < SETTLED:
-            break
-    assert search.best is not None
+        descent = _Descent(problem, frame, settings, start=start).go_on(
+            f"{method[0]}, {method[1]} steps", method, most=1
+        )
+        runs.append(descent.go_on(", and on", ON, most=ROUNDS, until=began + DESCENT * seconds))
+    for each in sorted(runs, key=lambda run: run.energy)[:FINALISTS]:
+        each.go_on(", and on", ON, most=MORE, until=began + seconds)
+        each.go_on(", and Newton", NEWTON, most=POLISHES, until=began + seconds)
+    best, *others = sorted(runs, key=lambda run: run.energy)
+    apart = (others[0].energy - best.energy) / max(start - best.energy, 1e-30) if others else None
     spent = round(time.perf_counter() - began, 3)
-    least = search.best
-    return Reference(search.start, least.energy, least.energies, search.by, search.gained, spent, search.points)
-
-
-def _doubling() -> Iterator[int]:
-    steps = FIRST_STEPS
-    while steps <= MOST_STEPS:
-        yield steps
-        steps *= 2
+    return Reference(start, best.energy, best.energies, best.by, apart, spent, best.points)

@@ -15,12 +15,16 @@ import numpy as np
 import torch
 
 from .. import __version__
+from ..errors import UsageError
 from ..options import RefineOptions
-from ..resolution import choose_levels
+from ..resolution import choose_levels, sample_frames
 from ..scene import Frame, Scene
 from ..shot import MOST_LANES, prepare_device
+from ..usd.atomic import check_place
+from ..usd.files import check_targets, files_of
 from ..usd.provenance import file_hashes
 from ..usd.reader import Shot, open_shot
+from .journal import NAME as JOURNAL
 from .journal import Journal
 from .measure import measure_curves, rungs
 from .methods import Curve, find_curves
@@ -35,6 +39,8 @@ from .table import Chart, collate
 from .terms import RUN, Bench, measure_terms
 
 DEFAULTS = ChartOptions()
+WRITTEN = ("chart.png", "chart.svg", "chart.html", "chart.csv", "chart.json")
+"""What a chart leaves beside its rows."""
 MOST_PEER_STEPS = 1024
 """Largest budget of a solver outside."""
 
@@ -60,7 +66,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
     parse_peers(options.peers)
     prepare_device(options.device)
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    _check_folder(folder, shot, overwrite=options.overwrite)
     opened = open_shot(
         str(shot),
         garments=options.garments,
@@ -71,6 +77,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
         rest_frame=options.rest_frame,
     )
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         journal = _measure(opened, folder, options)
     finally:
         opened.close()
@@ -81,11 +88,21 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
     return chart
 
 
+def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
+    """Refuse to write over what the shot is made of, and over a chart whose rows are gone."""
+    files = [folder / name for name in (*WRITTEN, JOURNAL)]
+    check_targets([("the chart", file) for file in files], files_of(shot))
+    there = next((file for file in files if file.exists()), None)
+    if there is not None and not overwrite and not files[-1].exists():
+        raise UsageError(f"{there} exists; choose another folder or allow overwriting")
+    check_place(files[0])
+
+
 def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
     """Measure what is not yet in the folder."""
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
-    levels = tuple(choice.level for choice in choose_levels(opened.scene, opened.frame))
+    levels = tuple(choice.level for choice in choose_levels(opened.scene, sample_frames(opened.scene, opened.frame)))
 
     def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:
         lanes = min(MOST_LANES, os.cpu_count() or 1) if options.clock == "wall" else 1

@@ -14,6 +14,7 @@ from typing import Any
 
 from .journal import Journal
 from .methods import DEFAULT
+from .reference import Reference
 
 GAPS = (0.1, 0.03, 0.01)
 """Gaps to which the time is told."""
@@ -86,7 +87,7 @@ class Chart:
     Attributes:
         about: The shot, the machine, the plan and refine's default.
         points: Every method with every budget, curve by curve, in the order of the budgets.
-        references: Per frame, Phi0, Phi*, who found it and by how much it was still falling.
+        references: Per frame, Phi0, Phi*, who found it and how far the next best ended above it.
         terms: What each term, the last frame's detail and each level cost and buy.
         failed: Runs that ended in an error.
     """
@@ -201,6 +202,9 @@ class Chart:
                 f"refine's default: {place['gap']:.2%} in {place['ms']:.0f} ms, {place['ratio']:.2f} times the "
                 f"{place['fastest_ms']:.0f} ms of the fastest to that gap ({place['fastest']}): {where}"
             )
+        for each in self.references:
+            where = "" if each["frame"] is None else f"frame {each['frame']:g}: "
+            yield f"{where}{Reference.of(each)}"
         if self.busy:
             yield self.busy
         yield from (f"{name} was given {note}" for name, note in self.notes.items())
@@ -236,11 +240,11 @@ def typical(times: Sequence[float]) -> float:
 def collate(journal: Journal) -> Chart:
     """Put a journal's rows together."""
     rows = journal.rows("point")
-    found = {row["frame"]: dict(row) for row in journal.rows("reference")}
+    found = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
     for row in rows:
-        known = found.get(row["frame"])
-        if known and "energies" in row and (energy := sum(row["energies"].values())) < known["least"]:
-            known |= {"least": energy, "by": f"{row['method']}, {row['steps']} steps", "energies": row["energies"]}
+        if row["frame"] in found and "energies" in row:
+            by = f"{row['method']}, {row['steps']} steps"
+            found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
     keys = dict.fromkeys((row["method"], row["steps"]) for row in rows)
     points = [_point([r for r in rows if (r["method"], r["steps"]) == key], found) for key in keys]
     plan = journal.one("plan") or {}
@@ -249,13 +253,13 @@ def collate(journal: Journal) -> Chart:
     return Chart(
         about,
         tuple(point for point in points if point is not None),
-        tuple(_without_kind(each) for each in found.values()),
+        tuple({"frame": frame, **each.plain()} for frame, each in found.items()),
         tuple(_without_kind(each) for each in journal.rows("term")),
         tuple(_without_kind(each) for each in journal.rows("failed")),
     )
 
 
-def _point(rows: Sequence[dict[str, Any]], references: dict[Any, dict[str, Any]]) -> Point | None:
+def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point | None:
     """One budget of one method; None while a frame of it is missing."""
     judged = {row["frame"]: row for row in rows if "energies" in row}
     if set(judged) != set(references):
@@ -263,8 +267,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, dict[str, Any]]
     times = [[row["ms"] for row in rows if row["frame"] == frame] for frame in judged]
     first, values = rows[0], list(judged.values())
     energies = {name: statistics.fmean(v["energies"].get(name, 0.0) for v in values) for name in values[0]["energies"]}
-    least = sum(each["least"] for each in references.values())
-    start = sum(each["start"] for each in references.values())
+    least, start = (sum(getattr(each, name) for each in references.values()) for name in ("least", "start"))
     energy = sum(energies.values())
     apart = [each for v in values if (each := v.get("apart_mm")) is not None]
     return Point(

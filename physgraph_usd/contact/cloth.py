@@ -146,8 +146,7 @@ class ClothView:
         """
         self.keeps_sides, self._settings = settings.cloth == "pairs", settings
         self._lasting, self._level, self._base = lasting, level, base
-        self._mesh, self._regions, self._seam = lasting.mesh(level), lasting.regions(level), seam
-        self._mesh.sew(np.zeros((0, 2), np.int64) if seam is None else seam.pairs)
+        self._regions, self._seam = lasting.regions(level), seam
         self._gap_finder = GapFinder(
             self._mesh, base, lasting.order, lasting.outward, thickness=thickness, stiffness=settings.cloth_stiffness
         )
@@ -158,6 +157,13 @@ class ClothView:
         self.allowed: ClothState | None = None
         self._in_folds = False
         self._reach = float(thickness.max()) + (AHEAD if level.index else 1.0) * float(level.spacing.mean())
+
+    @property
+    def _mesh(self) -> ClothMesh:
+        """The level's hierarchy, which all frames share, sewn as in this one."""
+        mesh = self._lasting.mesh(self._level)
+        mesh.sew(np.zeros((0, 2), np.int64) if self._seam is None else self._seam.pairs)
+        return mesh
 
     @cached_property
     def before(self) -> ClothState:

@@ -89,7 +89,9 @@ def load_network(file: Path, *, kind: str, device: str = "cpu") -> Network:
     try:
         network = make_network(_config(kind, json.loads(about.get("config", ""))))
         network.load_state_dict(tensors)
-    except (ValueError, TypeError, RuntimeError) as error:
+    except KeyError as error:
+        raise WeightsError(f"{file} does not fit its own configuration: {error} is missing from it") from error
+    except (ValueError, TypeError, RuntimeError) as error:  # RuntimeError: also what is nested without end
         raise WeightsError(f"{file} does not fit its own configuration: {error}") from error
     if not all(bool(value.isfinite().all()) for value in tensors.values() if value.is_floating_point()):
         raise WeightsError(f"{file} holds numbers that are not finite")

@@ -71,6 +71,23 @@ def subdivide(mesh: PolygonMesh) -> Refinement:
     return Refinement(child, _linear(mesh), parent_face, half.edges)
 
 
+def fine_count(mesh: PolygonMesh, levels: int) -> int:
+    """Number of vertices after some subdivisions, counted without making them.
+
+    Args:
+        mesh: The cage.
+        levels: Number of subdivisions.
+    """
+    vertices, edges = mesh.vertex_count, len(mesh.half_edges.edges)
+    larger = mesh.counts >= 4
+    triangles, polygons, corners = int((mesh.counts == 3).sum()), int(larger.sum()), int(mesh.counts[larger].sum())
+    for _ in range(levels):
+        vertices += edges + polygons
+        edges = 2 * edges + 3 * triangles + corners
+        triangles, polygons, corners = 4 * triangles, corners, 4 * corners
+    return vertices
+
+
 def _place_triangles(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> None:
     """Write the children of triangles into ``indices``."""
     faces = np.flatnonzero(mesh.counts == 3)

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LayerError, StageError
-from ..options import REPORT_NAME
+from ..options import PAGE_NAME, REPORT_NAME
 from ..report import RefineReport
+from ..usd.atomic import write_text
 from ..usd.reader import Shot
 from .document import document, table
 from .plot import SCRIPT, plot
 from .series import Series, add_jerk, read_series
 
-PAGE_NAME = "report.html"
 PICTURES = 3
 """Time codes that are drawn, at most."""
 SIZE = (1280, 640)
@@ -41,14 +41,15 @@ def write_folder(report: RefineReport, folder: Path, shot: Shot) -> None:
         report: The report of a run that wrote a layer.
         folder: Where it goes; made where it is not there.
         shot: The shot, open.
+
+    Raises:
+        LayerError: It cannot be written.
     """
     report.write(folder / REPORT_NAME)
     series = [read_series(report, index) for index in range(len(report.garments))]
     assert report.out is not None
     add_jerk(series, report, shot, report.out)
-    partial = folder / (PAGE_NAME + ".part")
-    partial.write_text(page(report, series), encoding="utf-8")
-    partial.replace(folder / PAGE_NAME)
+    write_text(folder / PAGE_NAME, page(report, series))
 
 
 def page(report: RefineReport, series: Sequence[Series]) -> str:
@@ -100,7 +101,7 @@ def _pictures(report: RefineReport) -> str:
     picks = sorted({round(i * (len(written) - 1) / (PICTURES - 1)) for i in range(PICTURES)}) if written else []
     try:
         return title + "".join(_picture(report, written[i]) for i in picks)
-    except (StageError, LayerError) as error:
+    except (StageError, LayerError, OSError) as error:  # a full temporary disk too
         return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"
 
 

@@ -31,18 +31,20 @@ SAMPLES: dict[str, str] = {
 """Sample names and what each one is."""
 
 
-def write_sample(name: str, directory: Path) -> Path:
+def write_sample(name: str, directory: Path, *, overwrite: bool = False) -> Path:
     """Write one sample shot.
 
     Args:
         name: One of ``SAMPLES``.
         directory: Folder to write into; created when missing.
+        overwrite: Whether an existing file may be replaced.
 
     Returns:
         The file written, ``<directory>/<name>.usdc``.
 
     Raises:
-        UsageError: When no sample has that name.
+        UsageError: When no sample has that name, or the file exists and may not be replaced.
+        LayerError: When the file cannot be written.
     """
     if name not in SAMPLES:
         raise UsageError(f"unknown sample {name!r}; known samples: {', '.join(SAMPLES)}")
@@ -51,4 +53,4 @@ def write_sample(name: str, directory: Path) -> Path:
     record = build(variant) if variant else build()
     from ..usd.sample_stage import write_stage  # noqa: PLC0415
 
-    return write_stage(record, Path(directory) / f"{name}.usdc")
+    return write_stage(record, Path(directory) / f"{name}.usdc", overwrite=overwrite)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import pickle
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..errors import UsageError
 from ..integrate.base import Integrator
 from ..integrate.learned import integrator_of
 from ..integrate.network import Physgraph, PhysgraphConfig
@@ -252,8 +255,24 @@ class Trainer:
         part.replace(file)
 
     def resume(self, file: Path) -> None:
-        """Go on from a checkpoint of the same configuration."""
-        state = torch.load(file, map_location=self.device, weights_only=False)
+        """Go on from a checkpoint of the same configuration.
+
+        Raises:
+            UsageError: The file is damaged, or holds anything but tensors and plain values.
+        """
+        try:
+            with warnings.catch_warnings(action="ignore"):  # of what is refused anyway
+                # Anything else in a pickle could run a command.
+                state = torch.load(file, map_location=self.device, weights_only=True)
+        except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+            raise UsageError(f"{file} is no checkpoint of ours or is damaged: {str(error).splitlines()[0]}") from error
+        try:
+            self._take(state)
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise UsageError(f"{file} does not fit this configuration: {error}") from error
+
+    def _take(self, state: dict[str, Any]) -> None:
+        """Take over what `save` wrote."""
         self.network.load_state_dict(state["network"])
         self._mean.load_state_dict(state["mean"])
         self._optimiser.load_state_dict(state["optimiser"])

@@ -61,7 +61,8 @@ def run_training(
     checkpoint, log = out / CHECKPOINT, out / LOG
     if resume and not checkpoint.exists():
         raise UsageError(f"nothing to resume in {out}: there is no {CHECKPOINT}")
-    if not resume and checkpoint.exists():
+    weights = out / f"{config.kind}.safetensors"
+    if not resume and any(file.exists() for file in (checkpoint, log, weights, weights.with_suffix(".json"))):
         raise UsageError(f"{out} holds a run; resume it or choose another folder")
     out.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(config, device=device)
@@ -75,7 +76,6 @@ def run_training(
             say(line)
 
     trainer.train(say=note, keep=checkpoint)
-    weights = out / f"{config.kind}.safetensors"
     digest = save_network(trainer.averaged(), weights)
     card = card_of(trainer, digest, config_file=config_file, out=out)
     weights.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
@@ -92,7 +92,7 @@ def read_config(file: Path) -> TrainConfig:
         values = tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"no configuration at {file}") from error
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or nested without end
         raise UsageError(f"{file} is not TOML: {error}") from error
     kind = values.get("kind", "physgraph")
     if kind not in NETWORKS:
@@ -128,6 +128,8 @@ def card_of(trainer: Trainer, digest: str, *, config_file: Path, out: Path) -> d
 
 
 def _filled(kind: type[T], values: dict[str, Any], *, where: str) -> T:
+    if not isinstance(values, dict):
+        raise UsageError(f"{where} is {values!r}, no table")
     known = {field.name for field in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]
     unknown = sorted(set(values) - known)
     if unknown:

@@ -1,7 +1,8 @@
 """A file that is either complete under its final name or not there at all.
 
-A file is written next to its target under a temporary name that carries the process id, flushed to the disk, and moved
-over the target in one step. A killed process can leave only the temporary file; the next run removes it.
+A file is written next to its target under a temporary name that carries the host and the process id, flushed to the
+disk, and moved over the target in one step. A killed process can leave only the temporary file; the next run on the
+same host removes it. Those of other hosts, whose processes cannot be asked, are never removed.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,6 +19,11 @@ from pathlib import Path
 from types import FrameType
 
 from ..errors import LayerError, UsageError
+
+ASSET_PATHS = ("relative", "absolute")
+"""How one file may name another: from its own folder, or from the root of the file system."""
+HOST = re.sub(r"[^\w-]", "_", socket.gethostname()) or "host"
+"""This machine in the names of temporary files."""
 
 
 def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
@@ -26,9 +34,9 @@ def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
         suffix: Format of the temporary file.
 
     Returns:
-        ``<target>.<pid>.tmp<suffix>``.
+        ``<target>.<host>.<pid>.tmp<suffix>``.
     """
-    return target.with_name(f"{target.name}.{os.getpid()}.tmp{suffix}")
+    return target.with_name(f"{target.name}.{HOST}.{os.getpid()}.tmp{suffix}")
 
 
 def prepare_target(target: Path, *, overwrite: bool) -> None:
@@ -54,7 +62,7 @@ def prepare_target(target: Path, *, overwrite: bool) -> None:
 
 
 def remove_stale(target: Path) -> list[Path]:
-    """Remove the temporary files of this target whose process is gone, and this process's own.
+    """Remove this host's temporary files of this target whose process is gone, and this process's own.
 
     Args:
         target: Final path.
@@ -62,7 +70,7 @@ def remove_stale(target: Path) -> list[Path]:
     Returns:
         The files removed.
     """
-    pattern = re.compile(re.escape(target.name) + r"\.(\d+)\.tmp\.usd[ac]?")
+    pattern = re.compile(re.escape(f"{target.name}.{HOST}.") + r"(\d+)\.tmp(\.\w+)?")
     removed = []
     for path in sorted(target.parent.iterdir()):
         match = pattern.fullmatch(path.name)
@@ -85,6 +93,47 @@ def _is_other_process(pid: int) -> bool:
     except (PermissionError, OverflowError):
         return True
     return True
+
+
+def write_text(target: Path, text: str) -> None:
+    """Write a text, whole or not at all; its folder is made where it is not there.
+
+    Args:
+        target: Final path.
+        text: What to write, as UTF-8.
+
+    Raises:
+        LayerError: The file cannot be written.
+    """
+    temporary = temporary_path(target, suffix="")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(text, encoding="utf-8")
+        publish(temporary, target)
+    except OSError as error:
+        raise LayerError(f"cannot write {target}: {error.strerror}") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def check_place(target: Path) -> None:
+    """Refuse a place where no file can be made; leaves nothing there.
+
+    Args:
+        target: A file to write later; its folder may be missing.
+
+    Raises:
+        UsageError: The target is a folder, or a file stands where a folder is needed.
+        LayerError: The folder cannot be written.
+    """
+    folder = next(each for each in target.absolute().parents if each.exists())
+    if target.is_dir() or not folder.is_dir():
+        raise UsageError(f"cannot write {target}: it is a folder, or {folder} is none")
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise LayerError(f"cannot write {target}: {error.strerror} in {folder}") from error
 
 
 def publish(temporary: Path, target: Path) -> None:

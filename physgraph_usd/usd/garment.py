@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,6 +10,9 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
+from ..errors import GarmentError
+from ..mesh.fit import median_shape
+from ..mesh.topology import PolygonMesh, edges_of
 from ..scene import Garment, GarmentFrame
 from .cage import read_cage
 from .lookup import Override, find_value
@@ -16,13 +20,15 @@ from .materials import Values, find_values
 from .painted import read_painted
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
 from .points import PointReader
-from .rest import Rest, checked, read_rest, rests_bent
+from .rest import AUTO, Rest, checked, read_rest, rests_bent
 from .schema import GARMENT
 from .skinning import Bake
 from .stage import GarmentSource, Notice, Units
 from .times import garment_times, merge, transform_times, within
 
 _SMALL, _LARGE = 0.01, 100.0
+_MEDIAN_FRAMES = 9
+"""Time codes that `--rest auto` takes medians of: an edge that is odd in four of them does not count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +41,7 @@ class Request:
         frames: First and last time code, or None.
         level: Number of subdivisions for all, -1 for auto, or None.
         overrides: What ``--set`` gave.
-        rest_frame: Time code whose points are the rest shape, or None.
+        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to all, or None.
         assumed_units: Whether metersPerUnit is not authored.
     """
 
@@ -44,7 +50,7 @@ class Request:
     frames: tuple[float, float] | None = None
     level: int | None = None
     overrides: tuple[Override, ...] = ()
-    rest_frame: float | None = None
+    rest_frame: float | str | None = None
     assumed_units: bool = False
 
 
@@ -110,8 +116,10 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     notices = [*cage.notices, *check_placement(prim, request.units.metres, times)]
     matrix = to_metres(prim, request.units.metres, first)
     start = place(points.read(first, edges)[0], matrix)
-    rest = _rest_at(prim, points, request, edges=edges, start=start) if request.rest_frame is not None else None
-    rest = rest or _rest_on_stage(prim, matrix, request, edges=edges, start=start, first=first)
+    if request.rest_frame is None:
+        rest = _rest_on_stage(prim, matrix, request, edges=edges, start=start, first=first)
+    else:
+        rest = checked(prim, edges, _rest_asked(prim, points, request, mesh=cage.mesh, every=every), first=start)
     values = find_values(prim, request.units, request.overrides)
     level, level_source = _level(prim, request)
     (own, own_source), (layer, layer_source) = _feels_itself(prim, request), _layer(prim, request)
@@ -127,21 +135,56 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         **_painted(prim, points.count, notices),
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
-    skinned = prim.GetPath() in request.bake.skinned
     named = {"contact:selfCollision": own_source, "contact:layer": layer_source, "rest": rest.source}
     named |= values.sources | {"refine:level": level_source}
-    place_on_stage = (prim.GetPath(), cage.kept_faces, skinned, tuple(roots), times)
-    return GarmentReader(
-        garment, GarmentSource(*place_on_stage, named, values.animated), values, points, edges, notices
+    place_on_stage = (prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times)
+    source = GarmentSource(
+        *place_on_stage,
+        named,
+        values.animated,
+        left_out=tuple(time for time in every if time not in times),
+        velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
+        subsets=_subsets(prim, cage.kept_faces),
     )
+    return GarmentReader(garment, source, values, points, edges, notices + _range_notices(source))
 
 
-def _rest_at(prim: Usd.Prim, points: PointReader, request: Request, *, edges: np.ndarray, start: np.ndarray) -> Rest:
-    """Rest shape: the points at the time code that the user asked for."""
-    time = request.rest_frame
-    local, notices = points.read(time, edges)
+def _rest_asked(
+    prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
+) -> Rest:
+    """Rest shape that the user asked for: the points at a time code, or one fitted to all."""
+    if request.rest_frame == AUTO:
+        return _rest_auto(prim, points, request, mesh=mesh, every=every)
+    time = float(request.rest_frame or 0.0)
+    local, notices = points.read(time, mesh.half_edges.edges)
     placed = place(local, to_metres(prim, request.units.metres, time))
-    return checked(prim, edges, Rest(placed, f"points at time code {time:g} (--rest)", notices), first=start)
+    return Rest(placed, f"points at time code {time:g} (--rest)", notices)
+
+
+def _rest_auto(
+    prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
+) -> Rest:
+    """Rest shape: fitted to the median lengths that the edges have over the whole shot, whatever part is refined."""
+    poses: dict[float | None, np.ndarray] = {}
+    picks = np.linspace(0, len(every) - 1, min(_MEDIAN_FRAMES, len(every))).round().astype(int)
+    for time in [every[pick] for pick in picks] or [None]:
+        with contextlib.suppress(GarmentError):  # The frame's own turn to be refined names what is wrong with it.
+            local = points.read(time, mesh.half_edges.edges)[0]
+            poses[time] = place(local, to_metres(prim, request.units.metres, time))
+    found = list(poses.values())
+    shape, nearest = median_shape(edges_of(mesh.triangulate(found[0]).triangles, mesh.vertex_count).vertices, found)
+    at = [*poses][nearest]
+    said = f"median edge lengths of {len(poses)} time codes" + ("" if at is None else f", from the points at {at:g}")
+    return Rest(shape, f"auto: {said} (--rest)")
+
+
+def _subsets(prim: Usd.Prim, kept: np.ndarray) -> dict[str, np.ndarray]:
+    """Faces of the cage in each of the mesh's subsets of faces, by name."""
+    named = {}
+    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
+        faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
+        named[subset.GetPrim().GetName()] = np.flatnonzero(np.isin(kept, [] if faces is None else np.asarray(faces)))
+    return named
 
 
 def _rest_on_stage(
@@ -182,6 +225,12 @@ def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, Any
         arrays[name], odd = read_painted(prim, short, count)
         notices.extend(odd)
     return arrays
+
+
+def _range_notices(source: GarmentSource) -> list[Notice]:
+    """Tell of samples that the frame range leaves out."""
+    said = f"the frame range leaves out {source.left_out_said}: there the layer holds it still"
+    return [Notice(str(source.path), None, said)] if source.left_out else []
 
 
 def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:

@@ -33,6 +33,12 @@ def time_scale(layer: Sdf.Layer) -> Iterator[Problem]:
         yield _error("timeCodesPerSecond is not authored; USD would take 24 and rescale the samples")
 
 
+def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
+    """All samples of the shot were refined: outside those that were, the cloth stands still."""
+    for path, said in (read_record(layer) or {}).get("left_out", {}).items():
+        yield Problem("warning", path, None, f"was refined without {said}, where it stands still (--frames)", "")
+
+
 def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:
     """The layer brings no other layer and authors in no variant."""
     if len(layer.subLayerPaths):

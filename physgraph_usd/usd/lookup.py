@@ -116,12 +116,23 @@ def with_ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:
 
 
 def authored(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
-    """Return the attribute of this prim that authors a value under a name, or under Blender's name for it."""
+    """Return the attribute that gives a prim's value under a name, or under Blender's name for it.
+
+    It is the prim's own, or the one that its own is connected to, as a material's interface is.
+    """
     for full in (name, USER_PROPERTIES + name):
         attribute = prim.GetAttribute(full)
+        attribute = connected(attribute) or attribute
         if attribute and attribute.HasAuthoredValue():
             return attribute
     return None
+
+
+def connected(attribute: Usd.Attribute) -> Usd.Attribute | None:
+    """Return the attribute with a value of its own that a single connection leads to in one step, if any."""
+    sources = attribute.GetConnections() if attribute else []
+    found = attribute.GetStage().GetAttributeAtPath(sources[0]) if len(sources) == 1 else None
+    return found if found and found.HasAuthoredValue() and not found.HasAuthoredConnections() else None
 
 
 def nearest(prim: Usd.Prim, name: str) -> Usd.Attribute | None:

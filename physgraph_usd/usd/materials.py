@@ -15,17 +15,18 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from ..fabric import Fabric
 from .lookup import Found, Override, authored, bound_materials, find_value, read_number, source_name
-from .schema import GARMENT, MATERIAL, Property
+from .schema import GARMENT, Property
 from .stage import Units
 
-_PROPOSAL = {
+PROPOSAL = {
     "stretchStiffness": "physics:surfaceStretchStiffness",
     "shearStiffness": "physics:surfaceShearStiffness",
     "bendStiffness": "physics:surfaceBendStiffness",
     "density": "physics:density",
     "thickness": "physics:surfaceThickness",
 }
-_FRAME_VALUES = (*_PROPOSAL, "guide:stiffness", "refine:detail", "contact:offset")
+"""Attributes of the UsdPhysics proposal by the short names of ours."""
+_FRAME_VALUES = (*PROPOSAL, "guide:stiffness", "refine:detail", "contact:offset")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +71,12 @@ class Values:
 def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> Values:
     """Find the source of every fabric value, the guide's stiffness and the detail's gain."""
     materials = bound_materials(prim)
-    found = {}
-    for name in _FRAME_VALUES:
-        value = find_value(prim, GARMENT[name], overrides)
-        if value.source == "fallback" and name in _PROPOSAL:
-            value = _from_proposal(materials, GARMENT[name], units) or value
-        found[name] = value
-    density = found["density"].attribute
-    return Values(found, density is not None and not density.GetName().endswith(MATERIAL + "density"))
+    found = {name: find_value(prim, GARMENT[name], overrides) for name in _FRAME_VALUES}
+    given = {
+        name: _from_proposal(materials, GARMENT[name], units) for name in PROPOSAL if found[name].source == "fallback"
+    }
+    proposed = {name: value for name, value in given.items() if value is not None}
+    return Values(found | proposed, volumetric="density" in proposed)
 
 
 def _from_proposal(materials: Sequence[Usd.Prim], row: Property, units: Units) -> Found | None:
@@ -85,7 +84,7 @@ def _from_proposal(materials: Sequence[Usd.Prim], row: Property, units: Units) -
     metres, kilograms = units.metres, units.kilograms
     scale = {"bendStiffness": kilograms * metres**2, "density": kilograms / metres**3, "thickness": metres}
     for material in materials:
-        attribute = authored(material, _PROPOSAL[row.short])
+        attribute = authored(material, PROPOSAL[row.short])
         if attribute is not None and read_number(attribute, None) > 0:
             return Found(row, source_name(attribute), attribute, None, scale.get(row.short, kilograms))
     return None

@@ -10,8 +10,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from ..errors import StageError
 from .find import has_schema, traverse
-from .provenance import read_record, root_over
-from .stage import list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
+from .provenance import recorded_shot, root_over
+from .stage import check_there, list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
 from .times import garment_times, merge
 
 NEUTRAL = (0.55, 0.54, 0.52)
@@ -135,9 +135,8 @@ def shot_of(layer: Path) -> Path | None:
     Returns:
         The shot's file, or None when the layer does not name one.
     """
-    opened = _open_layer(layer)
-    shot = (read_record(opened) or {}).get("shot")
-    return Path(opened.ComputeAbsolutePath(str(shot))) if shot else None
+    shot = recorded_shot(_open_layer(layer))
+    return Path(shot) if shot else None
 
 
 def refined_in(layer: Path) -> tuple[str, ...]:
@@ -161,10 +160,11 @@ def _refined_times(layer: Path) -> tuple[float, ...]:
 
 def _open_layer(path: Path) -> Sdf.Layer:
     """Open a layer or say that it cannot be read."""
+    check_there(path)
     with pxr_errors(f"cannot open {path}"), quiet():
         layer = Sdf.Layer.FindOrOpen(str(path)) if path.is_file() else None
     if not layer:
-        raise StageError(f"cannot open {path}: no such USD file")
+        raise StageError(f"cannot open {path}: it is no USD file")
     return layer
 
 

@@ -52,6 +52,21 @@ def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine:
             stream.block(target.AppendProperty(name), _TYPES.Vector3fArray)
 
 
+def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
+    """Tell what becomes of the velocities and accelerations of a coarse mesh.
+
+    Args:
+        prim: Coarse mesh as composed.
+        written: Whether velocities are written for the fine mesh.
+    """
+    blocked = "are blocked: they belong to the coarse points"
+    said = {"velocities": "are written anew, from the refined points" if written else blocked, "accelerations": blocked}
+    path = str(prim.GetPath())
+    return [
+        Notice(path, None, f"its {name} {s}") for name, s in said.items() if prim.GetAttribute(name).HasAuthoredValue()
+    ]
+
+
 def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> list[Notice]:
     """Refine the rest shape of the deformable-body schema; name other arrays that may no longer fit.
 

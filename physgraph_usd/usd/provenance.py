@@ -1,7 +1,7 @@
 """Where a layer comes from: stage metadata that it must repeat, its record, and the root that shows it.
 
-The record lies in ``customLayerData["physgraph"]``. It holds no clock and no absolute path of this machine, so the same
-input gives the same bytes.
+The record lies in ``customLayerData["physgraph"]``. It holds no clock and, unless asked for, no absolute path of this
+machine, so the same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Tf, Usd, Vt
+from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError
 from .atomic import prepare_target, publish, temporary_path
-from .stage import reason_of
+from .stage import TRAVERSAL, USD_ERRORS, reason_of
 
 RECORD = "physgraph"
 _COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
@@ -58,6 +58,12 @@ def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
     return dict(record) if isinstance(record, Mapping) else None
 
 
+def recorded_shot(layer: Sdf.Layer) -> str | None:
+    """The shot that a layer's record names, seen from where the layer is; None where it names none."""
+    named = (read_record(layer) or {}).get("shot")
+    return layer.ComputeAbsolutePath(str(named)) if named else None
+
+
 def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
     """Layers of a stage that hold refined garments: mute them to find the coarse shot below."""
     found = (layer for layer in stage.GetUsedLayers() if (read_record(layer) or {}).get("garments"))
@@ -81,19 +87,25 @@ def mute_refined(stage: Usd.Stage) -> list[str]:
     return identifiers
 
 
-def file_hashes(stage: Usd.Stage, folder: Path) -> dict[str, str]:
-    """SHA-256 of every file that a stage is composed from.
+def file_hashes(stage: Usd.Stage, folder: Path, *, absolute: bool = False) -> dict[str, str]:
+    """SHA-256 of every layer that a stage is composed from, value clips included.
 
     Args:
         stage: The shot.
         folder: Folder to name the files from.
+        absolute: Whether to name them by absolute paths.
 
     Returns:
-        Hash by path relative to the folder, with forward slashes, sorted.
+        Hash by path, with forward slashes, sorted.
     """
     files = {Path(layer.realPath) for layer in stage.GetUsedLayers() if layer.realPath}
+    for prim in Usd.PrimRange.Stage(stage, TRAVERSAL):
+        if prim.HasAuthoredMetadata("clips"):
+            clips = Usd.ClipsAPI(prim)
+            named = [found for name in clips.GetClips() for found in clips.ComputeClipAssetPaths(name)]
+            files |= {Path(found.resolvedPath) for found in named if found.resolvedPath}
     paths = sorted(path for path in files if path.is_file())
-    return {relative_path(path, folder): _sha256(path) for path in paths}
+    return {asset_path(path, folder, absolute=absolute): _sha256(path) for path in paths}
 
 
 def _sha256(path: Path) -> str:
@@ -102,9 +114,11 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def relative_path(path: str | Path, folder: Path) -> str:
-    """A path as seen from a folder, as USD writes it; absolute where there is no relative one."""
+def asset_path(path: str | Path, folder: Path, *, absolute: bool = False) -> str:
+    """A path as seen from a folder, as USD writes it; absolute on request and where there is no relative one."""
     full = Path(path).resolve()
+    if absolute:
+        return full.as_posix()
     try:
         relative = Path(os.path.relpath(full, folder.resolve())).as_posix()
     except ValueError:
@@ -132,7 +146,7 @@ def _plain_list(items: list[Any]) -> Any:
     return Vt.StringArray([str(item) for item in items])
 
 
-def write_root(path: Path, *, layer: Path, shot: Path, overwrite: bool = False) -> Path:
+def write_root(path: Path, *, layer: Path, shot: Path, absolute: bool = False, overwrite: bool = False) -> Path:
     """Write a small root layer that shows a refined layer over its shot.
 
     It repeats the shot's stage metadata, expression variables included: those are read from a root layer alone.
@@ -141,6 +155,7 @@ def write_root(path: Path, *, layer: Path, shot: Path, overwrite: bool = False) 
         path: Root to write, ``.usda`` by custom.
         layer: The refined layer.
         shot: The shot file, a ``.usdz`` too.
+        absolute: Whether it names them by absolute paths.
         overwrite: Whether an existing file may be replaced.
 
     Returns:
@@ -154,7 +169,7 @@ def write_root(path: Path, *, layer: Path, shot: Path, overwrite: bool = False) 
     source = Sdf.Layer.FindOrOpen(str(shot))
     if not source:
         raise LayerError(f"cannot read {shot}")
-    below = [relative_path(layer, path.parent), relative_path(shot, path.parent)]
+    below = [asset_path(file, path.parent, absolute=absolute) for file in (layer, shot)]
     return export_layer(root_over(source, below), path)
 
 
@@ -189,7 +204,7 @@ def export_layer(layer: Sdf.Layer, path: Path) -> Path:
         if not layer.Export(str(temporary)):
             raise LayerError(f"cannot write {path}")
         publish(temporary, path)
-    except Tf.ErrorException as error:
+    except USD_ERRORS as error:
         raise LayerError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -27,6 +27,7 @@ from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .placement import to_metres
 from .provenance import mute_refined
+from .rest import AUTO
 from .schema import GARMENT
 from .skinning import Bake
 from .stage import (
@@ -40,6 +41,8 @@ from .stage import (
     root_metadata,
 )
 from .times import merge, snap, within
+from .unread import unread
+from .variants import selections
 
 
 class Shot:
@@ -51,6 +54,7 @@ class Shot:
         scene: What stays the same over the shot.
         sources: How each garment sits on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
+        selections: Variant selections in force on what the garments depend on, as paths `/World/coat{fit=loose}`.
         warnings: What the user should know; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
     """
@@ -59,6 +63,7 @@ class Shot:
         """Put together what ``open_shot`` read."""
         self.path, self.stage = path, stage
         self.colliders: tuple[str, ...] = ()
+        self.selections: tuple[str, ...] = ()
         self.warnings: list[Notice] = []
         self.metres_per_unit = request.units.metres
         times = merge(time for reader in readers for time in reader.source.times)
@@ -143,7 +148,7 @@ def open_shot(
     frames: tuple[float, float] | None = None,
     level: int | None = None,
     overrides: Sequence[str] = (),
-    rest_frame: float | None = None,
+    rest_frame: float | str | None = None,
     skip_invisible: bool = False,
 ) -> Shot:
     """Open a shot for refining.
@@ -157,7 +162,8 @@ def open_shot(
         frames: First and last time code in composed stage time; None: every authored one.
         level: Number of subdivisions, -1 for auto; None: what each garment's schema says.
         overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
-        rest_frame: Time code whose points are the rest shape of every garment; it goes before authored rest shapes.
+        rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to all of
+            the shot; it goes before authored rest shapes.
         skip_invisible: Leave out garments that are invisible at all their time codes.
 
     Returns:
@@ -179,23 +185,28 @@ def open_shot(
         found = find_colliders(stage, prims, colliders)
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
+        notices += unread([*prims, *found])
         units, odd = read_units(stage)
         assumed = root_metadata(stage, "metersPerUnit") is None
         prims = [
             prim for prim in prims if is_on(prim, ENABLED, asked) or notices.append(_left_out(prim, "is disabled"))
         ]
-        request = Request(units, Bake(stage), frames, level, asked, rest_frame, assumed)
+        bake = Bake(stage)
+        request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
         shot = Shot(str(path), stage, request, readers=readers)
         _add_colliders(shot, bodies, colliders, notices=notices)
+        shot.selections = selections(
+            map(stage.GetPrimAtPath, [*(s.path for s in shot.sources), *bodies, *bake.prims()])
+        )
     shot.colliders = tuple(str(path) for path in bodies)
     read_notices = [notice for reader in readers for notice in reader.notices]
     shot.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
     return shot
 
 
-def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | None) -> None:
+def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:
     """Refuse options that no stage could satisfy."""
     if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
         raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
@@ -204,8 +215,8 @@ def _check_options(frames: tuple[float, float] | None, level: int | None, rest_f
             check_limits(GARMENT["refine:level"], level, "--level")
         except SchemaError as error:
             raise UsageError(str(error)) from error
-    if rest_frame is not None and not math.isfinite(rest_frame):
-        raise UsageError(f"rest frame {rest_frame} is no time code")
+    if not (rest_frame in (None, AUTO) or (isinstance(rest_frame, int | float) and math.isfinite(rest_frame))):
+        raise UsageError(f"rest frame {rest_frame!r} is neither a time code nor '{AUTO}'")
 
 
 def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) -> list[Usd.Prim]:
@@ -263,6 +274,9 @@ def _read(
             notices.append(_left_out(prim, "is invisible"))
         else:
             readers.append(read_garment(prim, held, request))
+    if request.frames and every and not within(every, request.frames):
+        said = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
+        raise StageError(f"{said}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")

@@ -1,6 +1,7 @@
 """A garment's rest shape in metres, and where it came from.
 
-The order: the frame that the user asked for, ``physics:restShapePoints``, ``primvars:rest``, ``primvars:Pref``, the
+The order: what the user asked for (a frame, or `--rest auto`: the shape fitted to the median length that each edge has
+over the shot), ``physics:restShapePoints``, ``primvars:rest``, ``primvars:Pref``, the
 points' default value, the points' first sample. It is scaled as the garment is placed in the world at its first time
 code; a skinned garment's rest shape is placed by its bind transform.
 """
@@ -18,6 +19,8 @@ from .lookup import nearest, source_name
 from .points import as_points, repair
 from .stage import Notice
 
+AUTO = "auto"
+"""In place of a time code: a rest shape fitted to the animation."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
 _BENT = "restShapeDefault"
 _TINY = 1e-9
@@ -93,7 +96,9 @@ def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray)
     if len(short):
         low, high = edges[short[0]]
         said = f"the rest shape ({rest.source}) has no length between points[{low}] and points[{high}]"
-        raise GarmentError(path, said, remedy="merge these vertices, author primvars:rest, or choose --rest FRAME")
+        raise GarmentError(
+            path, said, remedy="merge these vertices, author primvars:rest, or choose --rest FRAME or --rest auto"
+        )
     now = float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean()) if len(edges) else 0.0
     ratio = mean / now if now > 0 else 1.0
     if 1 / _MOST_SCALED <= ratio <= _MOST_SCALED:

@@ -7,19 +7,27 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
+from .atomic import prepare_target
 from .plain import Look, PlainMesh, PlainStage, Skeleton
+from .provenance import export_layer
 
 
-def write_stage(record: PlainStage, path: Path) -> Path:
+def write_stage(record: PlainStage, path: Path, *, overwrite: bool = False) -> Path:
     """Write a shot to a new layer.
 
     Args:
         record: The shot.
-        path: File to write; its suffix chooses the format. An existing file is replaced.
+        path: File to write; its suffix chooses the format.
+        overwrite: Whether an existing file may be replaced.
 
     Returns:
         The path written.
+
+    Raises:
+        UsageError: The file exists and may not be replaced.
+        LayerError: The file cannot be written.
     """
+    prepare_target(path, overwrite=overwrite)
     layer = Sdf.Layer.CreateAnonymous(path.suffix)
     stage = Usd.Stage.Open(layer)
     stage.SetMetadata("documentation", record.doc)
@@ -37,9 +45,7 @@ def write_stage(record: PlainStage, path: Path) -> Path:
         _write_skeleton(stage, record, record.skeleton)
     for mesh in record.meshes:
         _write_mesh(stage, record, mesh)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    layer.Export(str(path))
-    return path
+    return export_layer(layer, path)
 
 
 def _write_mesh(stage: Usd.Stage, record: PlainStage, mesh: PlainMesh) -> None:

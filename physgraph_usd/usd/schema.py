@@ -6,7 +6,9 @@ Everything reads attributes by the names in this table, so it also works where t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 from ..errors import UsageError
@@ -34,7 +36,8 @@ class Property:
         schema: API schema that has it.
         name: Full attribute name.
         type: Sdf type name; "rel" is a relationship.
-        fallback: Value when nothing authors it; None when that means something else, told in ``doc``.
+        fallback: Value that refining takes where nothing gives one; None when that means something else, told in
+            ``doc``. The schema files have none: an ancestor, a material or ``--set`` may give what the prim does not.
         unit: SI unit, "" when it has none.
         minimum: Least value allowed, or None.
         maximum: Greatest value allowed, or None.
@@ -59,11 +62,15 @@ class Property:
     @property
     def short(self) -> str:
         """Name used in reports: without ``physgraph:`` and ``material:``."""
-        return self.name.removeprefix("primvars:").removeprefix(MATERIAL).removeprefix(NAMESPACE)
+        return _short(self.name)
+
+
+def _short(name: str) -> str:
+    return name.removeprefix("primvars:").removeprefix(MATERIAL).removeprefix(NAMESPACE)
 
 
 def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
-    """Rows of the fabric values; a material has no fallbacks, so that only what it authors counts."""
+    """Rows of the fabric values; what a material leaves out is the garment's to take from elsewhere."""
 
     def row(name: str, fallback: float | None, unit: str, minimum: float, doc: str) -> Property:
         return Property(
@@ -146,16 +153,29 @@ COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.sch
 
 
 def find_property(text: str) -> Property:
-    """Find a garment property by full name, by name without ``physgraph:``, or by its last word when only one has it.
+    """Find a garment property by full name, by name without ``physgraph:`` and ``material:``, or by its last word.
 
     Raises:
-        UsageError: When there is none; the message lists the names.
+        UsageError: When there is none, or a word may mean several; the message lists the names.
     """
     rows = [row for row in GARMENT.values() if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}]
-    rows = rows or [row for row in GARMENT.values() if row.name.rsplit(":", 1)[-1] == text]
-    if len(rows) != 1:
-        raise UsageError(f"unknown attribute {text!r}; known attributes: {', '.join(sorted(GARMENT))}")
-    return rows[0]
+    if rows:
+        return rows[0]
+    # "stiffness" is the last word of the guide's alone, and as well what a fabric has three of.
+    meant = [row for row in (*GARMENT.values(), *COLLIDER.values()) if row.short.lower().endswith(text.lower())]
+    if len(meant) == 1 and meant[0].short in GARMENT and meant[0].name.rsplit(":", 1)[-1] == text:
+        return meant[0]
+    if len(meant) > 1:
+        raise UsageError(f"attribute {text!r} may mean {', '.join(row.short for row in meant)}; write one of them out")
+    near = nearest_property(text, GARMENT.values())
+    said = f"did you mean {near.short}? " if near else ""
+    raise UsageError(f"unknown attribute {text!r}; {said}known attributes: {', '.join(sorted(GARMENT))}")
+
+
+def nearest_property(text: str, rows: Iterable[Property]) -> Property | None:
+    """The property whose short name is spelt most like a text's; None when none is like it."""
+    by_name = {row.short: row for row in rows}
+    return next((by_name[name] for name in get_close_matches(_short(text), by_name, n=1)), None)
 
 
 def schema_path() -> Path:

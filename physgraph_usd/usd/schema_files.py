@@ -43,6 +43,11 @@ def _number(row: Property, value: float | str) -> str:
     return str(value).lower() if isinstance(value, bool) else str(int(value)) if row.type == "int" else f"{value:g}"
 
 
+def _otherwise(row: Property) -> str:
+    """What is taken where nothing gives a property, in words; "" when that means something else."""
+    return "" if row.fallback is None else _number(row, row.fallback).strip('"')
+
+
 def _limits(row: Property) -> str:
     """The values allowed, in usda."""
     if row.tokens:
@@ -59,14 +64,14 @@ def _limits(row: Property) -> str:
 
 
 def _property(row: Property) -> str:
-    """One property in usda."""
-    doc = f'        doc = "{row.doc}{f" [{row.unit}]" if row.unit else ""}"\n'
+    """One property in usda, without a fallback: an editor would show it although something else gives the value."""
+    otherwise = f" Where nothing gives it: {_otherwise(row)}." if _otherwise(row) else ""
+    doc = f'        doc = "{row.doc}{f" [{row.unit}]" if row.unit else ""}{otherwise}"\n'
     if row.type == "rel":
         return f"    rel {row.name} (\n{doc}    )\n"
     kind = f"{'uniform ' if row.uniform else ''}{row.type}"
-    value = "" if row.fallback is None or row.interpolation else f" = {_number(row, row.fallback)}"
     extra = f'        interpolation = "{row.interpolation}"\n' if row.interpolation else _limits(row)
-    return f"    {kind} {row.name}{value} (\n{doc}{extra}    )\n"
+    return f"    {kind} {row.name} (\n{doc}{extra}    )\n"
 
 
 def _class(schema: str, *, generated: bool) -> str:
@@ -104,7 +109,7 @@ def schema_files() -> dict[str, str]:
 
 def attribute_table() -> str:
     """Every property of the schemas as the table of docs/attributes.md."""
-    lines = ["| attribute | type | fallback | unit, limits | |", "|---|---|---|---|---|"]
+    lines = ["| attribute | type | where nothing gives it | unit, limits | |", "|---|---|---|---|---|"]
     for schema in APPLIES_TO:
         lines.append(f"| **{schema}** | | | | |")
         lines += [_table_row(row) for row in PROPERTIES if row.schema == schema]
@@ -114,11 +119,10 @@ def attribute_table() -> str:
 def _table_row(row: Property) -> str:
     """One property as a line of Markdown."""
     kind = f"uniform {row.type}" if row.uniform else row.type
-    fallback = "" if row.fallback is None else _number(row, row.fallback).strip('"')
     low, high = ("" if value is None else _number(row, value) for value in (row.minimum, row.maximum))
     limits = f"{low} .. {high}".strip() if low or high else ", ".join(row.tokens)
     unit = ", ".join(part for part in (row.unit, limits) if part)
-    return f"| `{row.name}` | {kind} | {fallback} | {unit} | {row.doc.removesuffix(SI)} |"
+    return f"| `{row.name}` | {kind} | {_otherwise(row)} | {unit} | {row.doc.removesuffix(SI)} |"
 
 
 def main(folder: Path | None = None) -> None:

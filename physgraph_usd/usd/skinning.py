@@ -89,6 +89,11 @@ class Bake:
         self.skinned.update(found)
         return [notice for path in paths if path not in found for notice in _unskinned(self._stage.GetPrimAtPath(path))]
 
+    def prims(self) -> list[Sdf.Path]:
+        """Paths of the skeletons and animations that move what was baked."""
+        found = [path for skinned in self.skinned.values() for path in (skinned.skeleton, skinned.animation)]
+        return [path for path in dict.fromkeys(found) if path is not None]
+
     def rest_transform(self, path: Sdf.Path, time: float | None) -> Gf.Matrix4d:
         """Matrix (row vectors) from a skinned mesh's rest points to world: geomBindTransform, then the skeleton's."""
         skinned = self.skinned[path]

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
@@ -18,6 +19,8 @@ from ..errors import PhysGraphError, StageError
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
 """The name of a rule of USD's own parser, which tells a user nothing."""
+USD_ERRORS: tuple[type[Exception], ...] = (Tf.ErrorException, *filter(None, [getattr(Tf, "CppException", None)]))
+"""What pxr raises; it has the second, for files that end too early, since 24.11."""
 MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 STANDARD_GRAVITY = 9.81
@@ -63,6 +66,9 @@ class GarmentSource:
         sources: Which source won, by short name of the value.
         animated: Short names of the values whose source has time samples.
         apart_from: What it never touches though it would, by path: colliders and garments, and what says so.
+        left_out: Its own authored times outside the range, where the layer holds it still.
+        velocities: Whether the shot has velocities for it.
+        subsets: Faces of the cage in each GeomSubset, by its name.
     """
 
     path: Sdf.Path
@@ -73,6 +79,16 @@ class GarmentSource:
     sources: dict[str, str]
     animated: frozenset[str] = field(default=frozenset())
     apart_from: dict[str, str] = field(default_factory=dict)
+    left_out: tuple[float, ...] = ()
+    velocities: bool = False
+    subsets: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def left_out_said(self) -> str:
+        """How many of its samples are outside the range, and where; "" when none is."""
+        before, after = ([f"{t:g}" for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
+        spans = " and ".join(" to ".join(dict.fromkeys([span[0], span[-1]])) for span in (before, after) if span)
+        return f"{len(self.left_out)} of {len(self.left_out) + len(self.times)} samples, {spans}" if spans else ""
 
 
 @contextlib.contextmanager
@@ -88,18 +104,20 @@ def pxr_errors(what: str, kind: type[PhysGraphError] = StageError) -> Iterator[N
     """
     try:
         yield
-    except Tf.ErrorException as error:
+    except USD_ERRORS as error:
         raise kind(f"{what}: {reason_of(error)}") from error
     except UnicodeDecodeError as error:  # a damaged crate hands out names that are no text
         raise kind(f"{what}: a name in the file is no text; the file is damaged") from error
 
 
-def reason_of(error: Tf.ErrorException) -> str:
-    """Give the first reasons inside a USD error, without its C++ places."""
+def reason_of(error: Exception) -> str:
+    """Give the first reasons inside a USD error, without its C++ places and calls."""
     try:
         text = str(error)
     except UnicodeDecodeError:
         return "the file has bytes that are no text; it is damaged"
+    if not isinstance(error, Tf.ErrorException):
+        return f"the file is damaged or was cut short while it was read: {in_brief(text.partition(' - ')[0])}"
     reasons = [part.split(" : ", 1)[-1].strip().strip("'").strip() for part in text.split("\n\tError in ")]
     kept = list(dict.fromkeys(in_brief(reason) for reason in reasons if reason))
     return "; ".join(kept[:MOST_REASONS]) + _others(max(len(kept) - MOST_REASONS, 0)) or "USD gave no reason"
@@ -209,6 +227,21 @@ def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
         delegate.TakeUncoalescedDiagnostics()
 
 
+def is_there(path: str | Path) -> bool:
+    """Whether the resolver of assets finds a file; layers in memory are there."""
+    return Sdf.Layer.IsAnonymousLayerIdentifier(str(path)) or bool(Ar.GetResolver().Resolve(str(path)))
+
+
+def check_there(path: str | Path, kind: type[PhysGraphError] = StageError) -> None:
+    """Refuse a file that is not there; what USD says of one tells neither what nor where.
+
+    Raises:
+        PhysGraphError: Of that kind.
+    """
+    if not is_there(path):
+        raise kind(f"no such file: {path}")
+
+
 def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     """Open a stage with all payloads, for reading.
 
@@ -221,6 +254,7 @@ def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     Raises:
         StageError: When the file or a layer that it needs cannot be read, or references run in a circle.
     """
+    check_there(path)
     with pxr_errors(f"cannot open {path}"), quiet() as diagnostics:
         stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
         if not stage:

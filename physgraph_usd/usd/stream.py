@@ -11,8 +11,9 @@ from typing import Any
 
 from pxr import Sdf, Tf
 
-from ..errors import LayerError, UsageError
+from ..errors import LayerError
 from .atomic import leave_if_asked, prepare_target, publish, temporary_path
+from .files import LAYER_SUFFIXES, check_suffix
 from .stage import reason_of
 
 FLUSH_BYTES = 16_000_000
@@ -37,8 +38,7 @@ class LayerStream:
             UsageError: The extension is not a layer's, or the target exists and may not be replaced.
             LayerError: The folder cannot be written, or this process is writing the same layer already.
         """
-        if target.suffix not in {".usdc", ".usda", ".usd"}:
-            raise UsageError(f"cannot write {target}: the extension must be .usdc, .usda or .usd")
+        check_suffix("the layer", target, LAYER_SUFFIXES)
         if Sdf.Layer.Find(str(temporary_path(target))):
             raise LayerError(f"{target} is being written by this process already")
         prepare_target(target, overwrite=overwrite)

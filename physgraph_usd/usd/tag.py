@@ -10,9 +10,10 @@ from pxr import Sdf, Usd, UsdGeom
 from ..errors import StageError, UsageError
 from ..fabric import PRESETS, Fabric
 from ..sides import SIDES
-from .atomic import prepare_target
+from .atomic import ASSET_PATHS, prepare_target
+from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .find import find_colliders, find_garments
-from .provenance import export_layer, relative_path, root_over
+from .provenance import asset_path, export_layer, root_over
 from .schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, Property
 from .stage import open_stage
 
@@ -26,6 +27,7 @@ def tag(
     preset: str | None = None,
     layer: int | None = None,
     side: str | None = None,
+    asset_paths: str = "relative",
     overwrite: bool = False,
 ) -> Path:
     """Apply the schemas to prims of a shot, in a new layer that shows the shot and can be refined.
@@ -38,6 +40,7 @@ def tag(
         preset: Name of a fabric whose values are authored on the garments, or None.
         layer: Place of the garments in the order of garments, lower is nearer to the body, or None.
         side: Where cloth belongs at the colliders, one of `SIDES`, or None.
+        asset_paths: "relative" or "absolute": how the layer names the shot.
         overwrite: Whether an existing file may be replaced.
 
     Returns:
@@ -53,16 +56,17 @@ def tag(
         raise UsageError("nothing to tag; name a garment or a collider")
     _check_word("preset", preset, sorted(PRESETS))
     _check_word("side", side, SIDES)
+    _check_word("asset path", asset_paths, ASSET_PATHS)
     if (layer is not None and not garments) or (side is not None and not colliders):
         raise UsageError("a layer is for garments and a side for colliders; name one")
     target = Path(out)
-    if target.resolve() == Path(shot).resolve():
-        raise UsageError(f"{out} is the shot itself; the input is never edited, choose another name")
+    check_suffix("the layer", target, LAYER_SUFFIXES)
+    check_targets([("the layer", target)], files_of(shot))
     prepare_target(target, overwrite=overwrite)
     stage, _ = open_stage(str(shot))
     cloth = find_garments(stage, garments) if garments else []
     solid = find_colliders(stage, cloth, colliders) if colliders else []
-    root = root_over(stage.GetRootLayer(), [relative_path(shot, target.parent)])
+    root = root_over(stage.GetRootLayer(), [asset_path(shot, target.parent, absolute=asset_paths == "absolute")])
     for prim in (*cloth, *solid):
         _check_editable(prim)
     for prim in cloth:

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pxr import Sdf, Tf, Usd
+from pxr import Sdf, Usd
 
 from ..errors import LayerError
 from . import layer_rules
-from .provenance import read_record, root_over
+from .provenance import read_record, recorded_shot, root_over
 from .rules import RULES, Fine, Problem, subsets
-from .stage import pxr_errors, reason_of
+from .stage import USD_ERRORS, check_there, is_there, pxr_errors, reason_of
+from .variants import same_variants
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
 _COUNTS = "InvalidSubsetFamily"
@@ -25,23 +27,24 @@ def validate_layer(path: str | Path, shot: str | Path | None = None) -> list[Pro
 
     Args:
         path: The layer.
-        shot: The shot that it goes over; by default the one named in its record, where that file is there.
+        shot: The shot that it goes over; by default the one named in its record.
 
     Returns:
-        Problems, errors first; each names its path and time.
+        Problems, errors first; each names its path and time. A recorded shot that is not there is one of them.
 
     Raises:
         LayerError: The layer or the shot cannot be opened or read.
     """
-    layer = _open(Path(path))
-    below = shot if shot is not None else _recorded_shot(layer)
-    root = None if below is None else _open(Path(below))
+    layer = _open(path)
+    below = shot if shot is not None else recorded_shot(layer)
+    lost = shot is None and below is not None and not is_there(below)
+    root = None if below is None or lost else _open(below)
     with pxr_errors(f"cannot read {path} over {below}", LayerError):
         problems = check_layer(layer, root)
-        if root is None:
-            said = "the shot is not where the record says; only the layer itself was checked"
-            problems.append(Problem("warning", "/", None, said, "record"))
-        elif not any(problem.rule == "composition" for problem in problems):
+        if lost:
+            said = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
+            problems.append(Problem("error", "/", None, said, "record"))
+        elif root is not None and not any(problem.rule == "composition" for problem in problems):
             problems += _own_validators(layer, root)
     return sorted(problems, key=lambda problem: problem.severity != "error")
 
@@ -59,7 +62,7 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
     """
     problems = [
         replace(problem, rule=rule.__name__)
-        for rule in (layer_rules.record, layer_rules.time_scale, layer_rules.self_contained)
+        for rule in (layer_rules.record, layer_rules.time_scale, layer_rules.whole_range, layer_rules.self_contained)
         for problem in rule(layer)
     ]
     if shot is None:
@@ -67,6 +70,7 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
     paths = _garments(layer)
     # Only the garments are composed: a set around them may be large.
     mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
+    problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
     composed = Usd.Stage.OpenMasked(root_over(shot, [layer.identifier, shot.identifier]), mask)
     alone = Usd.Stage.OpenMasked(shot, mask)
     problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
@@ -121,39 +125,31 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
     return str(references[0].primPath) if references else path
 
 
-def _open(path: Path) -> Sdf.Layer:
+def _open(path: str | Path) -> Sdf.Layer:
     """Open a layer."""
+    check_there(path, LayerError)
     try:
         layer = Sdf.Layer.FindOrOpen(str(path))
-    except Tf.ErrorException as error:
+    except USD_ERRORS as error:
         raise LayerError(f"cannot read {path}: {reason_of(error)}") from error
     if not layer:
         raise LayerError(f"cannot read {path}")
     return layer
 
 
-def _recorded_shot(layer: Sdf.Layer) -> Path | None:
-    """The shot named in a layer's record, if it is there."""
-    named = (read_record(layer) or {}).get("shot")
-    if not named or not layer.realPath:
-        return None
-    path = Path(layer.realPath).parent / str(named)
-    return path if path.is_file() else None
-
-
 def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
-    """Run USD's validators; what the shot itself already has is left out."""
+    """Run USD's validators, as many as there are here; what the shot itself already has is left out."""
     try:
         from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
     except ImportError:
         return []
     if not hasattr(UsdValidation, "ValidationContext"):
         return []
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     # Both under an anonymous root, whose name the messages repeat and `_without_names` drops.
-    before = _findings(UsdValidation, validators, Usd.Stage.Open(root_over(shot, [shot.identifier])))
-    composed = Usd.Stage.Open(root_over(shot, [layer.identifier, shot.identifier]))
-    after = _findings(UsdValidation, validators, composed)
+    stages = [
+        Usd.Stage.Open(root_over(shot, below)) for below in ([shot.identifier], [layer.identifier, shot.identifier])
+    ]
+    (before, after), missing = _findings(UsdValidation, stages)
     fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
     sites = {key[:2] for key in before}
     new = [
@@ -162,7 +158,7 @@ def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
         if _on_coarse(key, fine) not in before
         and not (problem.rule.endswith(_COUNTS) and _on_coarse(key, fine)[:2] in sites)
     ]
-    return [problem for problem in new if not _is_meant(problem, fine)]
+    return missing + [problem for problem in new if not _is_meant(problem, fine)]
 
 
 def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]:
@@ -181,19 +177,35 @@ def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
     return problem.path in fine and (emptied or problem.rule.endswith("MissingSkelBindingAPI"))
 
 
-def _findings(module: object, validators: list, stage: Usd.Stage) -> dict[tuple[str, str, str], Problem]:
-    """Findings on one stage by validator, place and message."""
-    findings = {}
-    context = module.ValidationContext(validators)  # type: ignore[attr-defined]
-    for found in context.Validate(stage):
-        sites = found.GetSites()
-        path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
-        if sites and not path:
-            path = str(sites[0].GetPrim().GetPath()) if sites[0].IsPrim() else "/"
-        severity = "error" if found.GetType() == module.ValidationErrorType.Error else "warning"  # type: ignore[attr-defined]
-        problem = Problem(severity, path or "/", None, found.GetMessage(), str(found.GetIdentifier()))
-        findings[(problem.rule, problem.path, _without_names(problem.message))] = problem
-    return findings
+def _findings(
+    module: Any, stages: Sequence[Usd.Stage]
+) -> tuple[list[dict[tuple[str, str, str], Problem]], list[Problem]]:
+    """Findings on each stage by validator, place and message, and a warning that names the validators that fail.
+
+    Some builds of USD lack the libraries of validators, or what those read: each one runs by itself.
+    """
+    registry, found, failed = module.ValidationRegistry(), [{} for _ in stages], []
+    for name in sorted(metadata.name for metadata in registry.GetAllValidatorMetadata()):
+        try:
+            context = module.ValidationContext([registry.GetOrLoadValidatorByName(name)])
+            own = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]
+        except USD_ERRORS:
+            failed.append(name)
+            continue
+        for findings, problems in zip(found, own, strict=True):
+            findings.update({(p.rule, p.path, _without_names(p.message)): p for p in problems})
+    said = f"{len(failed)} of USD's own validators do not run with this USD: {', '.join(failed)}"
+    return found, [Problem("warning", "/", None, said, "validators")] if failed else []
+
+
+def _as_problem(module: Any, found: Any) -> Problem:
+    """One finding of USD's as ours."""
+    sites = found.GetSites()
+    path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
+    if sites and not path:
+        path = str(sites[0].GetPrim().GetPath()) if sites[0].IsPrim() else "/"
+    severity = "error" if found.GetType() == module.ValidationErrorType.Error else "warning"
+    return Problem(severity, path or "/", None, found.GetMessage(), str(found.GetIdentifier()))
 
 
 def _without_names(message: str) -> str:

@@ -20,6 +20,7 @@ from ..mesh.subdivide import Refinement
 from . import overs, provenance
 from .atomic import termination_raises
 from .carry import FineMap
+from .files import check_targets, files_of
 from .heat import HeatTrack
 from .hints import ModelHints
 from .material_opinions import author_used_values
@@ -60,7 +61,7 @@ class LayerWriter:
             refinements: Per garment, coarse to fine; none keeps the cage.
             out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``.
             mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
-            velocities: Whether to author velocities, by finite differences.
+            velocities: Whether to author velocities, by finite differences, where the shot has none too.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
 
@@ -73,10 +74,10 @@ class LayerWriter:
             raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
-        _check_not_input(shot.stage, out)
+        check_targets([("the layer", out)], files_of(shot.path))
         _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
-        self._rate = _rate(shot.stage) if velocities else None
+        self._rate, self._velocities = _rate(shot.stage), velocities
         self._open = True
         self._record = dict(provenance or {})
         self.notices: list[Notice] = []
@@ -98,10 +99,8 @@ class LayerWriter:
         with pxr_errors(f"cannot read {self._shot.path}"):
             for index, steps in enumerate(refinements):
                 self._author_garment(index, steps, span)
-        shot_path = provenance.relative_path(self._shot.path, self._stream.target.parent)
-        garments = [str(path) for path in self.targets]
-        record = {"shot": shot_path, "mode": self._mode, **self._record, "garments": garments}
-        provenance.author_record(self._stream.layer, record)
+        named = {"shot": provenance.asset_path(self._shot.path, self._stream.target.parent), "mode": self._mode}
+        provenance.author_record(self._stream.layer, named | self._record | _facts(self._shot, self.targets))
 
     def _author_garment(self, index: int, steps: Sequence[Refinement], span: tuple[float, float] | None) -> None:
         """Author one garment's defaults and start its track."""
@@ -122,7 +121,9 @@ class LayerWriter:
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         rest = None if source.skinned or not source.times else _refined_default(prim, fine)
         normals = VertexNormals(fine.fine, left_handed=left)
-        track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=self._rate)
+        rate = self._rate if self._velocities or source.velocities else None
+        self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
+        track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
         self._tracks.append(track)
         self._heat.append(HeatTrack(stream, target, normals.vertex_count, still=not source.times))
         purpose = "render" if self._mode == "sibling" else UsdGeom.Imageable(prim).ComputePurpose()
@@ -233,18 +234,20 @@ class LayerWriter:
             self._cleanup.close()
 
 
+def _facts(shot: Shot, targets: Sequence[Sdf.Path]) -> dict[str, Any]:
+    """What the record says of the garments, and of what they were read from."""
+    held = zip(targets, shot.sources, strict=True)
+    return {
+        "garments": [str(path) for path in targets],
+        "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
+        "variants": shot.selections or None,
+    }
+
+
 def _rate(stage: Usd.Stage) -> float:
     """Time codes per second; USD's fallback of 24 where the stage's cannot be a rate."""
     rate = stage.GetTimeCodesPerSecond()
     return rate if rate > 0 else 24.0
-
-
-def _check_not_input(stage: Usd.Stage, out: Path) -> None:
-    """Refuse to write over a file that the shot is composed from."""
-    target = out.resolve()
-    for layer in stage.GetUsedLayers():
-        if layer.realPath and Path(layer.realPath).resolve() == target:
-            raise UsageError(f"{out} is part of the shot; the input is never edited, choose another name")
 
 
 def _check_not_refined(shot: Shot) -> None:

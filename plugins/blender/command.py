@@ -117,7 +117,7 @@ def command_lines(
     refine += ["--frames", "{}:{}".format(*settings.frames), "--level", str(settings.level).replace("-1", "auto")]
     refine += [word for value in given for word in ("--set", value)]
     refine += ["--report", str(files.report)] if settings.report else []
-    return [*lines, [*refine, "--progress", *shlex.split(settings.more)]]
+    return [*lines, [*refine, "--progress", "--no-keep-frames", *shlex.split(settings.more)]]
 
 
 def progress_in(text: str) -> tuple[float, str] | None:

@@ -1,0 +1,187 @@
+"""Finished frames of a run in a folder beside its layer: they outlive the run when it is interrupted.
+
+One file a frame, whole or not there, and one that says what decides the frames. The folder goes when the layer is done.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from .errors import LayerError, UsageError
+from .usd.atomic import temporary_path
+
+RUN = "run.json"
+"""The file that says what decides the frames."""
+_DONE, _FAILED, _TEMPORARY = ".npz", ".failed.npz", ".tmp"
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of one time code.
+
+    Attributes:
+        time: The time code; None for a shot without samples.
+        points: Fine world positions [m] of each garment, None where it has no sample; () when the solve failed.
+        reused: For each garment, True when it kept the previous frame's points.
+        record: Telemetry, or {"error": message}, ready for JSON.
+        heat: Heat maps of each garment by name, None where it has no sample; () when none was asked for.
+    """
+
+    time: float | None
+    points: tuple[np.ndarray | None, ...]
+    reused: tuple[bool, ...]
+    record: dict[str, object]
+    heat: tuple[dict[str, np.ndarray] | None, ...] = ()
+
+
+def frames_folder(layer: Path) -> Path:
+    """Where the finished frames of a layer are."""
+    return layer.with_name(layer.name + ".frames")
+
+
+class FrameFolder:
+    """The folder; a context manager that is left with finished frames inside only by what interrupts a run.
+
+    Attributes:
+        kept: Numbers of the frames that an interrupted run had finished and that are used.
+        dropped: How many of the same run were there and are solved anew.
+    """
+
+    def __init__(
+        self, folder: Path, run: Mapping[str, Any], *, resume: bool = False, drop: bool = False, keep: bool = True
+    ) -> None:
+        """Take a folder for a run, with what an interrupted run left in it or empty.
+
+        Args:
+            folder: Where; made where it is not there.
+            run: What decides the frames, ready for JSON.
+            resume: Use finished frames that are there.
+            drop: Remove finished frames that are there, whatever run they are of.
+            keep: Leave finished frames there when the run is interrupted.
+
+        Raises:
+            UsageError: The folder holds finished frames of another run, or is not ours.
+            LayerError: The folder cannot be made.
+        """
+        self.folder, self._resumed, self._keep = folder, resume, keep
+        wanted = json.loads(json.dumps(run))
+        try:
+            found = self._found()
+            different = self._differences(wanted) if found else []
+            if different and (resume or not drop):
+                raise UsageError(
+                    f"{folder} holds {len(found)} finished frames of a run with other {', '.join(different[:3])}; "
+                    "refine as then, or drop them by --overwrite without --resume"
+                )
+            self.kept = frozenset(found if resume else ())
+            self.dropped = 0 if resume or different else len(found)
+            if not self.kept:
+                self.remove()
+            folder.mkdir(exist_ok=True)
+            (folder / RUN).write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise LayerError(f"cannot write {folder}: {error.strerror}") from error
+
+    def _found(self) -> list[int]:
+        """Numbers of the whole frames that are there."""
+        if not self.folder.is_dir():
+            return []
+        names = [file.name for file in self.folder.iterdir()]
+        if names and RUN not in names:
+            raise UsageError(f"{self.folder} is no folder of finished frames; choose another name for the layer")
+        numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
+        return [number for number in numbers if zipfile.is_zipfile(self._file(number))]
+
+    def _differences(self, wanted: dict[str, Any]) -> list[str]:
+        """Names of what decides the frames there, and is another here."""
+        try:
+            there = json.loads((self.folder / RUN).read_text(encoding="utf-8"))
+        except ValueError:
+            there = {}
+        return sorted(_different(there, wanted))
+
+    def _file(self, index: int, suffix: str = _DONE) -> Path:
+        return self.folder / f"{index}{suffix}"
+
+    def write(self, index: int, outcome: Outcome) -> None:
+        """Write what came of a frame.
+
+        Raises:
+            LayerError: The disk is full, or the folder is gone.
+        """
+        arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
+        maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
+        arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
+        arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
+        temporary = temporary_path(self._file(index), suffix="")
+        try:
+            with temporary.open("wb") as stream:
+                np.savez(stream, **arrays)
+            temporary.replace(self._file(index, _DONE if outcome.points else _FAILED))
+        except OSError as error:
+            raise LayerError(f"cannot write {self._file(index)}: {error.strerror}") from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def read(self, index: int, time: float | None) -> Outcome | None:
+        """What came of a frame, or None where it is not there yet.
+
+        Raises:
+            LayerError: The file is damaged.
+        """
+        file = next((f for f in (self._file(index), self._file(index, _FAILED)) if f.exists()), None)
+        if file is None:
+            return None
+        try:
+            with np.load(file) as data:
+                record = json.loads(str(data["record"]))
+                reused = tuple(bool(value) for value in data["reused"])
+                names = [f"points{k}" for k in range(len(reused))]
+                points = tuple(data[name] if name in data.files else None for name in names)
+                heat = tuple(_heat_of(data, k) if points[k] is not None else None for k in range(int(data["heated"])))
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise LayerError(f"{file} is damaged; remove it and --resume") from error
+        return Outcome(time, points, reused, record, heat)
+
+    def remove(self) -> None:
+        """Remove our files, and the folder where nothing else is in it."""
+        if self.folder.is_dir():
+            for file in self.folder.iterdir():
+                if file.name == RUN or file.name.endswith(_DONE) or file.name.endswith(_TEMPORARY):
+                    file.unlink(missing_ok=True)
+            with suppress(OSError):
+                self.folder.rmdir()
+
+    def __enter__(self) -> FrameFolder:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Keep the frames of a run that was interrupted, and those that were there before it."""
+        unwritten = isinstance(error, LayerError) and not self._resumed
+        if kind is None or unwritten or not (self._keep or self.kept) or not self._found():
+            self.remove()
+
+
+def _heat_of(data: Mapping[str, np.ndarray], index: int) -> dict[str, np.ndarray]:
+    """The heat maps of one garment in a frame's file."""
+    prefix = f"heat{index}."
+    return {name.removeprefix(prefix): data[name] for name in data if name.startswith(prefix)}
+
+
+def _different(there: Any, wanted: Any, name: str = "") -> list[str]:
+    """Names of the entries in which two records differ."""
+    if isinstance(there, dict) and isinstance(wanted, dict):
+        return [each for key in {*there, *wanted} for each in _different(there.get(key), wanted.get(key), key)]
+    return [] if there == wanted else [name]

@@ -1,0 +1,157 @@
+"""Calls in processes of their own: one that dies is an error that says how, one that is not wanted any more ends."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+from .errors import PhysGraphError, SolveError
+
+POLL_SECONDS = 0.02
+PATIENCE_SECONDS = 10.0
+"""How long a process that was asked to end may clear up."""
+_MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
+
+
+class Call:
+    """A function at work in a process of its own; it must be picklable, and its arguments and result too."""
+
+    def __init__(self, function: Callable[..., Any], *args: Any) -> None:
+        """Start it."""
+        context = multiprocessing.get_context("spawn")
+        self._here, there = context.Pipe(duplex=False)
+        self._process = context.Process(target=_answer, args=(there, function, args), daemon=True)
+        self._process.start()
+        there.close()
+        self._answer: tuple[Any, PhysGraphError | None] | None = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has returned, failed or died."""
+        return self._answer is not None or self._here.poll()
+
+    def result(self) -> Any:
+        """What the function returned; waits for it.
+
+        Raises:
+            PhysGraphError: What it raised; what was not foreseen is named, and its traceback is on stderr.
+            SolveError: The process died.
+        """
+        if self._answer is None:
+            self._answer = self._received()
+        value, error = self._answer
+        if error is not None:
+            raise error
+        return value
+
+    def _received(self) -> tuple[Any, PhysGraphError | None]:
+        try:
+            return self._here.recv()
+        except EOFError:
+            self._process.join()
+            return None, SolveError(_obituary(self._process.exitcode or 0))
+
+    def end(self) -> None:
+        """End it, with time to clear up."""
+        self._process.terminate()
+        self._process.join(PATIENCE_SECONDS)
+        self._process.kill()
+        self._here.close()
+
+
+def call_each(function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: int) -> Iterator[Any]:
+    """Call a function once a job, each call in a process of its own, and yield results in order.
+
+    Args:
+        function: What to call.
+        jobs: Arguments of each call.
+        workers: Most calls at a time.
+
+    Returns:
+        Per job its result, or the `PhysGraphError` that it ended with.
+    """
+    calls: list[Call] = []
+    try:
+        for index in range(len(jobs)):
+            while not (index < len(calls) and calls[index].ready):
+                if len(calls) < len(jobs) and sum(not call.ready for call in calls) < workers:
+                    calls.append(Call(function, *jobs[len(calls)]))
+                else:
+                    time.sleep(POLL_SECONDS)
+            try:
+                yield calls[index].result()
+            except PhysGraphError as error:
+                yield error
+    finally:
+        for call in calls:
+            call.end()
+
+
+@contextlib.contextmanager
+def memory_is_named() -> Iterator[None]:
+    """Turn what libraries raise when memory runs out into an error of ours.
+
+    Raises:
+        SolveError: Memory ran out.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not _MEMORY.search(str(error)):
+            raise
+        raise SolveError("out of memory; a lower --level or fewer --workers needs less") from error
+
+
+def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    """Call the function and send what came of it; Ctrl-C is the business of the process that started this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_outlast_parent, daemon=True).start()
+    with _Sent(there), memory_is_named():
+        there.send((function(*args), None))
+
+
+class _Sent:
+    """Sends what is raised inside, and what nobody foresaw as an error of ours with its traceback on stderr."""
+
+    def __init__(self, there: Connection) -> None:
+        self._there = there
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        if not isinstance(error, Exception):
+            return False
+        if not isinstance(error, PhysGraphError):
+            traceback.print_exception(error)
+            error = PhysGraphError(f"unexpected {type(error).__name__}: {error}")
+        self._there.send((None, error))
+        return True
+
+
+def _outlast_parent() -> None:
+    """End this process when the one that started it is gone, even if it was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)  # lets a layer being written clear up
+        time.sleep(PATIENCE_SECONDS)
+        os._exit(1)
+
+
+def _obituary(code: int) -> str:
+    """How a process died, by its exit code."""
+    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    why = ", perhaps for lack of memory; use fewer --workers or a lower --level" if code == -signal.SIGKILL else ""
+    return f"a worker process died ({how}){why}"

@@ -1,0 +1,109 @@
+"""Which parts of a garment the animation holds at another size than the rest shape's.
+
+Where the rest shape is not the cloth's, refined cloth goes back to its size: a puffed sleeve deflates. Cloth that is
+pushed together in most frames is reported only, since folding it is what refining is for; a warning tells of the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .mesh.topology import joined_by
+from .scene import Garment
+
+STRAINED = 1.1
+"""Area over rest area, or its inverse, from which a face is strained."""
+LEAST_SHARE = 0.01
+"""Of the garment's rest area; smaller parts, such as single faces in a fold, are passed over."""
+COVERED = 0.9
+"""Share of a part's faces inside a subset that gives it its name."""
+MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class StrainedPart:
+    """Connected faces whose area differs from their rest area in most frames.
+
+    Attributes:
+        where: Which part, in words: its subset, or its place in the rest shape's bounding box.
+        faces: Number of faces.
+        area_ratio: Area over rest area, median over the frames.
+        share: Of the garment's rest area.
+    """
+
+    where: str
+    faces: int
+    area_ratio: float
+    share: float
+
+
+def strained_parts(
+    garment: Garment, frames: Sequence[np.ndarray], subsets: Mapping[str, np.ndarray]
+) -> list[StrainedPart]:
+    """Find the parts that are larger, or smaller, than at rest by more than a tenth in most frames.
+
+    Args:
+        garment: The garment.
+        frames: Positions of its cage [m], each of shape (V, 3).
+        subsets: Faces of each named subset of the cage.
+
+    Returns:
+        The parts, largest first.
+    """
+    rest = _face_areas(garment, garment.rest)
+    if not frames or not rest.sum() > 0:
+        return []
+    areas = np.array([_face_areas(garment, points) for points in frames])
+    ratio = np.median(areas, axis=0) / np.maximum(rest, np.finfo(float).tiny)
+    parts = []
+    for strained in (ratio > STRAINED, ratio < 1.0 / STRAINED):
+        for faces in _connected(garment, np.flatnonzero(strained & (rest > 0))):
+            share = float(rest[faces].sum() / rest.sum())
+            if share >= LEAST_SHARE:
+                size = float(np.median(areas[:, faces].sum(axis=1)) / rest[faces].sum())
+                parts.append(StrainedPart(_where(garment, faces, subsets), len(faces), round(size, 3), round(share, 4)))
+    return sorted(parts, key=lambda part: -part.share)
+
+
+def stretched(path: str, source: str, parts: Sequence[StrainedPart]) -> str:
+    """A warning where parts are larger than their rest shape in most frames, or ""."""
+    large = [part for part in parts if part.area_ratio > 1.0]
+    if not large:
+        return ""
+    named = "; ".join(f"{part.area_ratio:.2f} times on {part.faces} faces {part.where}" for part in large[:MOST_NAMED])
+    more = f"; and {len(large) - MOST_NAMED} smaller parts" if len(large) > MOST_NAMED else ""
+    return (
+        f"<{path}>: in most frames the cage is larger than its rest shape ({source}), to which refined cloth shrinks: "
+        f"{named}{more}; give --rest auto or --rest FRAME, or author primvars:rest"
+    )
+
+
+def _face_areas(garment: Garment, points: np.ndarray) -> np.ndarray:
+    """Area of each face of the cage [m^2], shape (F,)."""
+    split = garment.mesh.triangulate(garment.rest)
+    a, b, c = (points[split.triangles[:, corner]] for corner in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.bincount(split.face, area, garment.mesh.face_count)
+
+
+def _connected(garment: Garment, faces: np.ndarray) -> list[np.ndarray]:
+    """Groups of faces that hang together by their vertices."""
+    mesh = garment.mesh
+    corners = np.flatnonzero(np.isin(mesh.corner_face, faces))
+    sides = np.stack([mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]], axis=1)
+    label = joined_by(sides, mesh.vertex_count)[mesh.indices[mesh.starts[faces]]]
+    return [faces[label == each] for each in np.unique(label)]
+
+
+def _where(garment: Garment, faces: np.ndarray, subsets: Mapping[str, np.ndarray]) -> str:
+    """The smallest subset that covers the faces, or where their centre is in the rest shape's bounding box."""
+    covering = [name for name, own in subsets.items() if np.isin(faces, own).mean() >= COVERED]
+    if covering:
+        return f"in GeomSubset {min(covering, key=lambda name: len(subsets[name]))}"
+    corners = garment.mesh.indices[np.isin(garment.mesh.corner_face, faces)]
+    low, size = garment.rest.min(axis=0), np.ptp(garment.rest, axis=0)
+    at = (garment.rest[corners].mean(axis=0) - low) / np.maximum(size, np.finfo(float).tiny)
+    return "at " + " ".join(f"{axis} {part:.0%}" for part, axis in zip(at, "xyz", strict=True)) + " of its box"

@@ -1,0 +1,111 @@
+"""Which files a shot is made of, and which files may be written: never one of those, and never two results in one."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+from pxr import Ar, Sdf, Usd, UsdUtils
+
+from ..errors import UsageError
+from .provenance import read_record
+from .stage import USD_ERRORS, quiet
+
+LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
+"""Suffixes of the layers that we write."""
+_UDIM = "<UDIM>"
+
+Target = tuple[str, Path]
+"""What is to be written, in words, and where."""
+
+
+def files_of(shot: str | Path) -> set[Path]:
+    """Every file that a shot is made of, or would be with other variants.
+
+    Sublayers, references, payloads, value clips and assets such as textures, through all layers. A refined layer in it
+    is left out with what it needs: it is a result, which is not read and may be written again.
+
+    Args:
+        shot: Any file that USD opens; one that it cannot open is its only file.
+    """
+    found: set[Path] = set()
+    waiting = [str(shot)]
+    with quiet():
+        while waiting:
+            file = Path(Ar.SplitPackageRelativePathOuter(waiting.pop())[0])
+            if file not in found and not (found and _is_result(file)):
+                found.add(file)
+                waiting += _named_in(file)
+    return found
+
+
+def _layer_of(file: Path) -> Sdf.Layer | None:
+    """The layer in a file; None where USD cannot read one."""
+    try:
+        return Sdf.Layer.FindOrOpen(str(file)) if Usd.Stage.IsSupportedFile(str(file)) and file.is_file() else None
+    except (*USD_ERRORS, UnicodeDecodeError):
+        return None
+
+
+def _is_result(file: Path) -> bool:
+    layer = _layer_of(file)
+    return layer is not None and bool((read_record(layer) or {}).get("garments"))
+
+
+def _named_in(file: Path) -> Iterator[str]:
+    """Files that a layer names, selected or not, as absolute paths."""
+    layer = _layer_of(file)
+    if layer is None:
+        return
+    for name in chain(*UsdUtils.ExtractExternalReferences(str(file))):
+        path = Sdf.ComputeAssetPathRelativeToLayer(layer, name)
+        if _UDIM in path:
+            yield from glob.glob(glob.escape(path).replace(_UDIM, "[0-9]*"))
+        else:
+            yield str(Ar.GetResolver().Resolve(path)) or path
+
+
+def check_targets(targets: Sequence[Target], inputs: Iterable[Path]) -> None:
+    """Refuse to write over an input, or two results into one file; links count as the files that they lead to.
+
+    Args:
+        targets: What is to be written.
+        inputs: Files that are read.
+
+    Raises:
+        UsageError: A target is an input or another target.
+    """
+    read = {_identity(file): file for file in inputs}
+    written: dict[object, str] = {}
+    for what, path in targets:
+        key = _identity(path)
+        if key in read:
+            same = "" if path == read[key] else f" ({read[key]})"
+            raise UsageError(f"{what} {path} is part of the shot{same}; inputs are never edited, choose another name")
+        if key in written:
+            raise UsageError(f"{what} {path} is also {written[key]}; give each a name of its own")
+        written[key] = what
+
+
+def _identity(path: Path) -> object:
+    """What two paths to one file have in common, whether the file is there or not."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        whole = path.absolute()
+        return (_identity(whole.parent), whole.name) if whole.parent != whole else whole
+    return found.st_dev, found.st_ino
+
+
+def check_suffix(what: str, path: Path, known: Sequence[str]) -> None:
+    """Refuse a file's name whose suffix is none of those known.
+
+    Raises:
+        UsageError: The suffix is another one.
+    """
+    if path.suffix not in known:
+        said = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"
+        raise UsageError(f"{what} {path} has {said}; known suffixes: {', '.join(known)}")

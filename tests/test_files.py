@@ -1,0 +1,189 @@
+"""What a shot is made of is never written, whatever the command and the option, and under whatever name."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from pxr import Sdf, Usd, UsdGeom
+from shots import cloth_shot, refine
+from stages import clip_shot, save
+
+from physgraph_usd.cli import main
+from physgraph_usd.usd.files import files_of
+
+SMALL = ("--level", "1", "--steps", "2")
+PARTS = ("sub", "under", "reference", "payload", "chosen", "other", "deep", "inactive")
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+def asset(path: Path) -> Usd.Stage:
+    stage = Usd.Stage.CreateNew(str(path))
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Asset").GetPrim())
+    stage.Save()
+    return stage
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    """A shot with every arc that USD has, two variants of which one is selected, value clips and textures."""
+    shot = Path(clip_shot(tmp_path))
+    stages = {name: asset(tmp_path / f"{name}.usda") for name in PARTS}
+    stages["sub"].GetRootLayer().subLayerPaths.append("./under.usda")
+    stages["other"].GetDefaultPrim().GetReferences().AddReference("./deep.usda")
+    for name in ("sub", "other"):
+        stages[name].Save()
+    for name in ("cloth.png", "udim.1001.png", "udim.1002.png"):
+        (tmp_path / name).write_bytes(b"picture")
+    (tmp_path / "broken.usda").write_text("no layer")
+    stage = Usd.Stage.Open(str(shot))
+    stage.GetRootLayer().subLayerPaths.append("./sub.usda")
+    prim = stage.DefinePrim("/World/set")
+    prim.GetReferences().AddReference("./reference.usda")
+    prim.GetPayloads().AddPayload("./payload.usda")
+    variants = prim.GetVariantSets().AddVariantSet("look")
+    for name in ("broken", "other", "chosen"):
+        variants.AddVariant(name)
+        variants.SetVariantSelection(name)
+        with variants.GetVariantEditContext():
+            prim.GetReferences().AddReference(f"./{name}.usda")
+    for name in ("cloth", "udim.<UDIM>"):
+        attribute = prim.CreateAttribute(name.partition(".")[0], Sdf.ValueTypeNames.Asset)
+        attribute.Set(f"./{name}.png")
+    off = stage.DefinePrim("/World/off")
+    off.GetReferences().AddReference("./inactive.usda")
+    off.SetActive(False)
+    return Path(save(stage))
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
+
+
+def test_every_file_of_a_shot_is_found(shot: Path) -> None:
+    assert {file.name for file in files_of(shot)} == {file.name for file in shot.parent.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["shot", "under", "payload", "deep", "inactive", "broken"])
+@pytest.mark.parametrize("option", ["-o", "--root"])
+def test_refine_writes_none_of_them(shot: Path, name: str, option: str) -> None:
+    before = contents(shot.parent)
+    targets = {"-o": shot.parent / "fine.usdc"} | {option: shot.parent / f"{name}.usda"}
+    result = run("refine", shot, *(w for pair in targets.items() for w in pair), "--overwrite", *SMALL)
+    assert (result.exit_code, "part of the shot" in result.stderr) == (2, True), result.stderr
+    assert contents(shot.parent) == before
+
+
+@pytest.mark.parametrize("how", ["symbolic", "hard", "relative", "folder"])
+def test_links_and_detours_lead_to_the_same_file(
+    shot: Path, tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, link = contents(shot.parent), tmp_path / "links" / "link.usda"
+    link.parent.mkdir()
+    if how == "symbolic":
+        link.symlink_to(shot)
+    elif how == "hard":
+        os.link(shot, link)
+    elif how == "folder":
+        (link.parent / "way").symlink_to(tmp_path)
+        link = link.parent / "way" / "shot.usda"
+    else:
+        monkeypatch.chdir(link.parent)
+        link = Path("../links/../shot.usda")
+    result = run("refine", shot, "-o", tmp_path / "fine.usdc", "--root", link, "--overwrite", *SMALL)
+    assert (result.exit_code, "part of the shot" in result.stderr) == (2, True), result.stderr
+    assert {name: value for name, value in before.items() if name != "links"} == {
+        file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in tmp_path.iterdir() if file.is_file()
+    }
+
+
+def test_a_report_is_no_clip_manifest_or_weights(shot: Path, tmp_path: Path) -> None:
+    stage = Usd.Stage.Open(str(shot))
+    stage.GetPrimAtPath("/World/set").CreateAttribute("notes", Sdf.ValueTypeNames.Asset).Set("./notes/report.html")
+    stage.Save()
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "report.html").write_text("mine")
+    result = run("refine", shot, "-o", tmp_path / "fine.usdc", "--report", tmp_path / "notes", "--overwrite", *SMALL)
+    assert (result.exit_code, "the report's page" in result.stderr) == (2, True), result.stderr
+    assert (tmp_path / "notes" / "report.html").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "targets",
+    [("-o", "fine.usda", "--root", "fine.usda"), ("-o", "a/fine.usdc", "--root", "b/fine.usdc")],
+)
+def test_two_results_are_not_one_file(tmp_path: Path, targets: tuple[str, ...]) -> None:
+    shot = cloth_shot(tmp_path / "shot.usdc")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    before = sorted(tmp_path.rglob("*"))
+    words = [word if word.startswith("-") else str(tmp_path / word) for word in targets]
+    result = run("refine", shot, *words, "--overwrite", *SMALL)
+    assert (result.exit_code, "the root" in result.stderr) == (2, True), result.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_no_result_of_a_batch_is_an_input_of_any_of_its_shots(tmp_path: Path, workers: str) -> None:
+    """A root of each, over the shots themselves, or over what another shot refers to."""
+    shots = [cloth_shot(tmp_path / f"{name}.usda") for name in ("a", "b")]
+    (tmp_path / "set").mkdir()
+    asset(tmp_path / "set" / "a.usda")
+    stage = Usd.Stage.Open(str(shots[1]))
+    stage.DefinePrim("/World/set").GetReferences().AddReference("./set/a.usda")
+    stage.Save()
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*.usda")}
+    for roots in (tmp_path, tmp_path / "set"):
+        line = ("refine", *shots, "-o", tmp_path / "out", "--root", roots, "--overwrite", "--workers", workers)
+        result = run(*line, *SMALL)
+        assert (result.exit_code, "a.usda is part of the shot" in result.stderr) == (2, True), result.stderr
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*.usd*")} == before
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["under.usda", "clip.1.usda", "deep.usda"])
+def test_tag_writes_none_of_them(shot: Path, name: str) -> None:
+    before = contents(shot.parent)
+    result = run("tag", shot, "-o", shot.parent / name, "--garment", "/World/cloth", "--overwrite")
+    assert (result.exit_code, "part of the shot" in result.stderr) == (2, True), result.stderr
+    assert contents(shot.parent) == before
+
+
+def test_preview_draws_over_no_texture(shot: Path) -> None:
+    pytest.importorskip("PIL")
+    before = contents(shot.parent)
+    result = run("preview", shot, "-o", shot.parent / "cloth.png")
+    assert (result.exit_code, "part of the shot" in result.stderr) == (2, True), result.stderr
+    assert contents(shot.parent) == before
+
+
+def test_sample_and_chart_write_over_nothing_unasked(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    mine = [tmp_path / name for name in ("swatch.usdc", "chart.png", "chart.json")]
+    for file in mine:
+        file.write_text("mine")
+    assert run("sample", "swatch", "-o", tmp_path).exit_code == 2
+    shot = cloth_shot(tmp_path / "shot.usdc")
+    result = run("chart", shot, "-o", tmp_path, "--short")
+    assert (result.exit_code, "chart.png exists" in result.stderr) == (2, True), result.stderr
+    assert [file.read_text() for file in mine] == ["mine"] * 3
+    assert run("sample", "swatch", "-o", tmp_path, "--overwrite").exit_code == 0
+
+
+def test_a_refined_layer_under_the_shot_may_be_refined_anew(tmp_path: Path) -> None:
+    """The root that shows it is what an artist goes on with; what is refined is left out of what is read."""
+    shot, out, root = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "fine.usdc", tmp_path / "root.usda"
+    refine(shot, out, root=root)
+    assert refine(root, out, overwrite=True, level=2).exit_code == 0
+
+
+def test_the_record_names_value_clips(tmp_path: Path) -> None:
+    refine(Path(clip_shot(tmp_path)), tmp_path / "fine.usdc")
+    record = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc")).customLayerData["physgraph"]
+    assert {"./clip.0.usda", "./clip.1.usda", "./clip.2.usda", "./shot.usda"} <= set(record["inputs"])

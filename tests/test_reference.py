@@ -1,0 +1,103 @@
+"""Phi*: below what any method finds, the same for all who ask, and lowered where somebody finds less after all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cloth import DOWN, frame_of, sheet, wave
+from sheets import garment_of
+
+pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
+
+from benchmarks.convergence import from_least
+from benchmarks.learned import FRONT, SCHEDULES, Runs, measured
+from physgraph_usd.chart.problem import ALONE, Problem
+from physgraph_usd.chart.reference import Reference, find_reference
+from physgraph_usd.integrate import METHODS
+from physgraph_usd.scene import Frame, Scene
+
+
+def squeezed() -> tuple[Problem, Frame]:
+    """A sheet of 6 by 4 cells that is squeezed by a fifth and buckles."""
+    mesh, rest = sheet(6, 4)
+    problem = Problem(Scene((garment_of(mesh, rest),), DOWN, ()), [2], device="cpu", lanes=1, dtype=torch.float64)
+    return problem, frame_of(wave(rest, squeeze=0.2))
+
+
+@pytest.fixture(scope="module")
+def found() -> Reference:
+    """Its reference."""
+    return find_reference(*squeezed(), settings=ALONE)
+
+
+@pytest.mark.parametrize("method", ["quasi-newton", "quasi-newton-flat", "physgraph", "lbfgs"])
+def test_no_method_with_any_budget_ends_below_it(found: Reference, method: str):
+    problem, frame = squeezed()
+    for steps in (12, 24, 48, 96):
+        points, _ = problem.go_on(frame, replace(ALONE, method=METHODS[method], steps=steps), [None])
+        assert found.gap(problem.judge(frame, points, ALONE).energy) > -1e-4
+
+
+def test_who_asks_again_gets_the_same(found: Reference):
+    again = find_reference(*squeezed(), settings=ALONE)
+    assert (again.least, again.by, again.apart) == (found.least, found.by, found.apart)
+    assert np.array_equal(again.points[0], found.points[0])
+
+
+def test_it_has_the_energy_of_its_own_positions_and_knows_another(found: Reference):
+    problem, frame = squeezed()
+    assert problem.judge(frame, found.points, ALONE).energy == found.least
+    assert found.apart is not None
+    assert 0.0 <= found.apart < 0.05
+    assert f"by {found.by}; the next best ends {found.apart:.2%} of the fall above" in str(found)
+
+
+@pytest.mark.parametrize("given", [{"short": True}, {"seconds": 0.0}])
+def test_a_bounded_search_compares_two_starts_at_least(found: Reference, given: dict[str, bool | float]):
+    less = find_reference(*squeezed(), settings=ALONE, **given)  # pyright: ignore[reportArgumentType]
+    assert less.seconds < found.seconds
+    assert less.apart is not None
+    assert 0.0 <= found.gap(less.least) < 0.1
+
+
+def test_who_finds_less_lowers_it():
+    known = Reference(10.0, 2.0, {"stretch": 2.0}, "many steps", 0.001)
+    assert known.lowered({"stretch": 2.0}, "another") is known
+    less = known.lowered({"stretch": 1.5, "bending": -0.5}, "another, 3 steps")
+    assert (less.least, less.by, less.apart) == (1.0, "another, 3 steps", pytest.approx(1.0 / 9.0))
+    assert Reference.of(less.plain()) == less
+
+
+class Made(Runs):
+    """Descents whose energies are known beforehand."""
+
+    def __init__(self, energies: dict[tuple[int, ...], float]) -> None:
+        self._energies = energies
+        self._made = {}
+
+    def __call__(self, steps: tuple[int, ...]) -> tuple[float, float, float]:
+        self._made[steps] = self._energies[steps], float(sum(steps)), 0.0
+        return self._made[steps]
+
+
+def test_all_are_counted_from_the_least_that_any_finds():
+    """Who was within 3% of the reference that was known before goes on until within 3% of the one that was found."""
+    energies = {steps: 2.0 + 0.001 * n for n, steps in enumerate(reversed((*FRONT, *SCHEDULES)))}
+    ours = dict.fromkeys(energies, 1.0) | {SCHEDULES[0]: 1.0}
+    slow = energies | {FRONT[0]: 2.2, FRONT[3]: 1.1}
+    known, (base, other) = measured(Reference(10.0, 2.0, {}, "many steps"), {"slow": Made(slow), "ours": Made(ours)})
+    assert known.least == 1.0
+    assert known.by.startswith("ours, ")
+    assert min(base[f"gap {s}"] for s in SCHEDULES) > 0.1
+    assert other[f"gap {SCHEDULES[0]}"] == 0.0
+    assert base["reached"] == sum(FRONT[3])
+
+
+def test_curves_are_counted_from_the_least_of_them():
+    lines = from_least({"a": [1.0, 0.5, float("inf")], "b": [1.0, -0.25, float("nan")]})
+    assert lines["a"][:2] == [1.0, pytest.approx(0.6)]
+    assert lines["b"][1] == 0.0
+    assert from_least({"a": [1.0, 0.5]}) == {"a": [1.0, 0.5]}

@@ -1,0 +1,147 @@
+"""A rest shape that is not the cloth's: who is told, what `--rest auto` makes of it, and where it came from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import UsdGeom, Vt
+from shots import command, fine, refine, sample_times
+from stages import GARMENT_API, new_stage, save, vec3
+
+from physgraph_usd.errors import UsageError
+from physgraph_usd.mesh.fit import median_shape
+from physgraph_usd.shot import inspect_shot
+from physgraph_usd.usd.reader import open_shot
+
+SLEEVE = "/World/sleeve"
+AROUND, ROWS, RADIUS, LENGTH = 16, 13, 0.06, 0.4
+PUFFED = 1.5
+TIMES = tuple(float(time) for time in range(1, 8))
+
+
+def tube(puff: float, *, bend: float = 0.0) -> np.ndarray:
+    """Points of a sleeve [m], round in its lower half and `puff` times as wide in its upper one, bent to the side."""
+    row, turn = np.meshgrid(np.linspace(0.0, 1.0, ROWS), 2 * np.pi * np.arange(AROUND) / AROUND, indexing="ij")
+    radius = RADIUS * (1.0 + (puff - 1.0) * np.clip(6.0 * row - 3.0, 0.0, 1.0))
+    side = bend * LENGTH * row**2
+    return np.stack([radius * np.cos(turn) + side, LENGTH * row, radius * np.sin(turn)], axis=-1).reshape(-1, 3)
+
+
+def puffed_shot(
+    path: Path, *, puff: float = PUFFED, subset: bool = False, odd: dict[float, float] | None = None
+) -> str:
+    """A sleeve whose default points are a plain tube and whose animation is puffed; ``odd`` scales some samples."""
+    stage = new_stage(path)
+    mesh = UsdGeom.Mesh.Define(stage, SLEEVE)
+    ids = np.arange(AROUND * ROWS).reshape(ROWS, AROUND)
+    across = np.roll(ids, -1, axis=1)
+    quads = np.stack([ids[:-1], ids[1:], across[1:], across[:-1]], axis=-1).reshape(-1, 4)
+    mesh.CreateFaceVertexCountsAttr([4] * len(quads))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(quads.ravel().astype(np.int32)))
+    mesh.CreatePointsAttr(vec3(tube(1.0)))
+    for time in TIMES:
+        mesh.GetPointsAttr().Set(vec3((odd or {}).get(time, 1.0) * tube(puff, bend=0.03 * time)), time)
+    if subset:
+        upper = Vt.IntArray.FromNumpy(np.arange(len(quads) // 2, len(quads)).astype(np.int32))
+        UsdGeom.Subset.CreateGeomSubset(mesh, "puff", "face", upper)
+    mesh.GetPrim().AddAppliedSchema(GARMENT_API)
+    return save(stage)
+
+
+def radius(points: np.ndarray) -> float:
+    """Mean distance from the axis [m] of the upper third of a refined sleeve, its bend taken out."""
+    high = points[points[:, 1] > 0.7 * LENGTH]
+    height = np.round(high[:, 1] / LENGTH * 24)
+    centred = np.concatenate([high[height == each] - high[height == each].mean(axis=0) for each in np.unique(height)])
+    return float(np.linalg.norm(centred[:, [0, 2]], axis=1).mean())
+
+
+def test_stretched_parts_are_told_with_place_amount_and_remedy(tmp_path: Path):
+    found = inspect_shot(puffed_shot(tmp_path / "a.usda"))
+    (part,) = found["garments"][0]["strained"]
+    assert part["area_ratio"] == pytest.approx(PUFFED, rel=0.1)
+    assert 0.4 < part["share"] < 0.6
+    (said,) = [warning for warning in found["warnings"] if "--rest auto" in warning]
+    assert f"<{SLEEVE}>" in said
+    assert "(default points)" in said
+    assert f"{part['area_ratio']:.2f} times on {part['faces']} faces at x 50% y 7" in said
+
+
+def test_a_subset_that_covers_a_part_names_it(tmp_path: Path):
+    found = inspect_shot(puffed_shot(tmp_path / "a.usda", subset=True))
+    assert found["garments"][0]["strained"][0]["where"] == "in GeomSubset puff"
+    assert any("faces in GeomSubset puff" in warning for warning in found["warnings"])
+
+
+@pytest.mark.parametrize(("puff", "odd"), [(1.0, {}), (1.05, {}), (1.0, {1.0: 1.5, 7.0: 1.5})])
+def test_a_little_stretch_and_a_few_odd_frames_are_not_told(tmp_path: Path, puff: float, odd: dict[float, float]):
+    found = inspect_shot(puffed_shot(tmp_path / "a.usda", puff=puff, odd=odd))
+    assert not [warning for warning in found["warnings"] if "--rest" in warning]
+
+
+def test_cloth_pushed_together_is_reported_without_a_warning(tmp_path: Path):
+    found = inspect_shot(puffed_shot(tmp_path / "a.usda", puff=0.8))
+    assert found["garments"][0]["strained"][0]["area_ratio"] < 0.9
+    assert not [warning for warning in found["warnings"] if "--rest" in warning]
+
+
+def test_a_puffed_sleeve_stays_puffed_with_rest_auto(tmp_path: Path):
+    shot = Path(puffed_shot(tmp_path / "a.usda"))
+    plain, auto = tmp_path / "plain.usdc", tmp_path / "auto.usdc"
+    asked = {"level": 1, "steps": 24, "self_contact": "off"}
+    assert any("--rest auto" in warning for warning in refine(shot, plain, **asked).warnings)
+    report = refine(shot, auto, rest_frame="auto", **asked)
+    assert not [warning for warning in report.warnings if "--rest" in warning]
+    assert report.garments[0]["strained"] == []
+    assert report.garments[0]["sources"]["rest"].startswith("auto: median edge lengths of 7 time codes")
+    assert sample_times(auto, SLEEVE) == TIMES
+    deflated, kept = (radius(fine(shot, layer, 4.0, prim=SLEEVE)) for layer in (plain, auto))
+    assert deflated < 1.15 * RADIUS
+    assert kept == pytest.approx(PUFFED * RADIUS, rel=0.03)
+
+
+def test_rest_auto_has_the_median_lengths_and_no_single_frames(tmp_path: Path):
+    shot = puffed_shot(tmp_path / "a.usda", odd={3.0: 2.0, 6.0: 0.5})
+    rest = open_shot(shot, rest_frame="auto").scene.garments[0].rest.reshape(ROWS, AROUND, 3)
+    wanted = tube(PUFFED).reshape(ROWS, AROUND, 3)
+    around, expected = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (rest, wanted))
+    np.testing.assert_allclose(around, expected, rtol=0.02)
+
+
+def test_rest_auto_does_not_depend_on_the_frames_that_are_refined(tmp_path: Path):
+    shot = puffed_shot(tmp_path / "a.usda")
+    whole, part = (open_shot(shot, rest_frame="auto", frames=f).scene.garments[0].rest for f in (None, (6.0, 7.0)))
+    np.testing.assert_array_equal(whole, part)
+
+
+def test_a_fit_comes_near_medians_that_no_pose_has():
+    ends = np.array([[0, 1], [1, 2], [2, 3]])
+    poses = [
+        np.pad(np.cumsum([[0.0], *([length] for length in lengths)], axis=0), ((0, 0), (0, 2)))
+        for lengths in ((1.0, 2.0, 2.0), (2.0, 1.0, 2.0), (2.0, 2.0, 1.0))
+    ]
+    shape, _ = median_shape(ends, poses)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(shape, axis=0), axis=1), 2.0, rtol=1e-3)
+    np.testing.assert_allclose(median_shape(ends, poses[:1])[0], poses[0], atol=1e-6)
+
+
+def test_the_command_tells_before_the_first_frame_and_once(tmp_path: Path):
+    shot, out = puffed_shot(tmp_path / "a.usda"), tmp_path / "a.usdc"
+    report = tmp_path / "a.json"
+    done = command("refine", shot, "-o", out, "--level", "1", "--steps", "2", "--progress", "--report", report)
+    assert done.returncode == 0
+    assert done.stderr.count("--rest auto") == 1
+    assert done.stderr.index("--rest auto") < done.stderr.index("1 of 7 frames")
+    assert any("--rest auto" in warning for warning in json.loads(report.read_text())["warnings"])
+    done = command("refine", shot, "-o", out, "--level", "0", "--rest", "auto", "--overwrite")
+    assert done.returncode == 0
+    assert "--rest" not in done.stderr
+
+
+@pytest.mark.parametrize("asked", ["median", float("nan")])
+def test_a_rest_that_is_neither_a_time_nor_auto_is_refused(tmp_path: Path, asked: str | float):
+    with pytest.raises(UsageError, match="neither a time code nor 'auto'"):
+        open_shot(puffed_shot(tmp_path / "a.usda"), rest_frame=asked)
