@@ -113,7 +113,9 @@ def test_the_name_that_an_exporter_makes_of_a_colon(stage: Usd.Stage) -> None:
     np.testing.assert_allclose(read(stage, "pin"), RAMP, atol=1e-7)
 
 
-LIMITED = [row for row in PROPERTIES if row.schema != "PhysGraphMaterialAPI" and row.type in {"float", "int", "float[]"}]
+LIMITED = [
+    row for row in PROPERTIES if row.schema != "PhysGraphMaterialAPI" and row.type in {"float", "int", "float[]"}
+]
 
 
 def held(row: Property, number: float) -> object:
@@ -126,16 +128,18 @@ def held(row: Property, number: float) -> object:
 @pytest.mark.parametrize("row", LIMITED, ids=lambda row: row.name)
 def test_both_ends_of_each_limit_are_accepted_and_what_is_just_outside_is_named(tmp_path: Path, row: Property) -> None:
     for limit, outwards in ((row.minimum, -np.inf), (row.maximum, np.inf)):
-        for number in () if limit is None else (limit, np.nextafter(np.float32(limit), np.float32(outwards))):
+        if limit is None:
+            continue
+        beyond = np.nextafter(np.float32(limit), np.float32(outwards))
+        for number in (limit, limit + np.sign(outwards) if row.type == "int" else beyond):
             stage = new_stage(tmp_path / f"{limit}{number != limit}.usda")
             prim = add_sheet(stage, "/World/rig/cloth").GetPrim()
             prim = prim if row.name in {each.name for each in GARMENT.values()} else add_body(stage)
-            number = limit + np.sign(outwards) if row.type == "int" and number != limit else number
             attribute = prim.CreateAttribute(row.name, value_type(row.type))
             attribute.Set(held(row, number))
             if row.interpolation:
                 UsdGeom.Primvar(attribute).SetInterpolation("constant")
-            if number == limit or row.short == "pin" and number > limit:
+            if number == limit or (row.short == "pin" and number > limit):
                 open_shot(save(stage)).frame(1.0)
                 continue
             with pytest.raises(SchemaError, match=f"<{prim.GetPath()}>.{row.name}.*it must be finite and in"):

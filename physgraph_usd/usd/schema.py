@@ -37,8 +37,8 @@ class Property:
         fallback: Value when nothing authors it; None when that means something else, told in ``doc``.
         unit: SI unit, "" when it has none.
         minimum: Least value allowed, or None; of a primvar, of each of its values.
-        maximum: Greatest value allowed, or None. Painted stiffness may be a hundred times farther from the fabric's than
-            the stiffest preset is from the softest.
+        maximum: Greatest value allowed, or None. The stiffest preset is some hundred times the softest; paint may go a
+            hundred times farther.
         doc: What it is, for the schema's documentation.
         uniform: Whether it cannot be animated.
         interpolation: Of a primvar, else "".
