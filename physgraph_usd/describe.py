@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .errors import StageError
+from .estimate import cannot_fit, estimate
 from .integrate import LEARNED
 from .mesh.defects import defects
 from .options import RefineOptions
@@ -36,6 +37,8 @@ def begin_report(opened: Shot, choices: Sequence[LevelChoice], options: RefineOp
     first = _first_frame(opened)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
     report.garments = [_garment(*part) | {"colliders": _felt(opened, part[0])} for part in parts]
+    given = {"frames": max(len(opened.scene.times), 1), "workers": options.workers}
+    report.estimate = estimate(opened.scene.garments, [choice.level for choice in choices], **given).plain()
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.warnings = [str(notice) for notice in opened.warnings]
@@ -71,10 +74,13 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
 def describe(opened: Shot, choices: Sequence[LevelChoice], options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
     report = begin_report(opened, choices, options)
+    large = cannot_fit(opened.scene.garments, [choice.level for choice in choices], frames=len(opened.scene.times))
     return {
         "shot": opened.path,
+        **({"problem": str(large)} if large else {}),
         "metres_per_unit": opened.metres_per_unit,
         "times": list(opened.scene.times),
+        "estimate": report.estimate,
         "garments": report.garments,
         "colliders": list(opened.colliders),
         "modelled": report.modelled,

@@ -21,6 +21,7 @@ from .chunks import RUN_UP, Outcome, end_with_parent, solve_in_chunks
 from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
+from .estimate import cannot_fit
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
@@ -48,7 +49,7 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
 
     Raises:
         UsageError: An option is wrong or the output exists.
-        StageError: The stage cannot be read as asked.
+        StageError: The stage cannot be read as asked, or what it makes does not fit in memory.
         SolveError: No frame could be solved.
         LayerError: The layer cannot be written.
     """
@@ -62,9 +63,13 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         choices = choose_levels(opened.scene, opened.frame)
         report = begin_report(opened, choices, options)
         report.seconds["open"] = clock.perf_counter() - began
+        levels = [choice.level for choice in choices]
+        frames = len(opened.scene.times)
+        if large := cannot_fit(opened.scene.garments, levels, frames=frames, workers=options.workers):
+            raise large
         if options.dry_run:
             return report
-        solver = _ShotSolver(str(shot), [choice.level for choice in choices], options)
+        solver = _ShotSolver(str(shot), levels, options)
         solver.adopt(opened)
         _write_layer(opened, solver, out, options, report)
         report.seconds["total"] = clock.perf_counter() - began
