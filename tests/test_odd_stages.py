@@ -166,7 +166,7 @@ def test_a_garment_of_a_millimetre_is_refined_in_the_time_of_a_large_one(tmp_pat
     report = refine(shot, tmp_path / "out.usdc", frames=(1.0, 2.0))
     assert time.process_time() - began < 40.0
     assert report.exit_code == 0
-    assert any("a 20th of the cloth's size" in said for said in report.warnings)
+    assert any("a 10th of the cloth's size" in said for said in report.warnings)
 
 
 def test_a_body_scaled_to_nothing_holds_no_report_up(tmp_path: Path):

@@ -23,7 +23,7 @@ from .stage import GarmentSource, Notice, Units
 from .times import garment_times, merge, transform_times, within
 
 _SMALL, _LARGE = 0.01, 100.0
-_THICK = 20.0
+_THICK = 10.0
 """Part of its size beyond which cloth keeps no distance: where all of it is near all of it, a query asks for V^2 pairs,
 and what is pushed out by more than it measures is no shape that the shot had."""
 
