@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .errors import StageError
+from .errors import GarmentError, StageError
+from .estimate import cannot_fit, estimate
 from .integrate import LEARNED
 from .mesh.defects import defects
 from .options import RefineOptions
@@ -43,6 +44,7 @@ def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
         | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
         for part in parts
     ]
+    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options)).plain()
     known = [carries_none(garment.path, choice) for garment, choice in zip(opened.scene.garments, choices, strict=True)]
     known += _strained(opened, report, frames)
     report.modelled = _modelled(opened, report, options)
@@ -78,13 +80,27 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
         report.left_out["network"] = f"--integrator {asked}" + "".join(f"; {reason}" for reason in reasons)
 
 
+def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> GarmentError | None:
+    """The error that names what this machine's memory cannot hold, or None."""
+    return cannot_fit(opened.scene.garments, **_run(opened, report, options))
+
+
+def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
+    """What decides the size of a run beside its garments."""
+    levels = [garment["level"] for garment in report.garments]
+    return {"levels": levels, "frames": max(len(opened.scene.times), 1), "workers": options.workers}
+
+
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
     report = begin_report(opened, options)
+    large = too_large(opened, report, options)
     return {
         "shot": opened.path,
+        **({"problem": str(large)} if large else {}),
         "metres_per_unit": opened.metres_per_unit,
         "times": list(opened.scene.times),
+        "estimate": report.estimate,
         "garments": report.garments,
         "colliders": list(opened.colliders),
         "modelled": report.modelled,

@@ -17,10 +17,15 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 from jaxtyping import Float
+from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from .level import Level
+from .level import PIN_MARGIN, Level
 from .mesh.stencil import Stencil, add_at
+from .mesh.topology import PolygonMesh
+
+NEAREST = 1e-6
+"""Distance under which points count as at one place, in edge lengths."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +174,35 @@ class MovingFrames:
         turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
         first, last = (self._level.base.apply(turned[:, :, column].contiguous()) for column in (0, 2))
         return _orthonormal(last, first)
+
+
+class Followers:
+    """Corners of faces without area: no cloth carries them, so they move with what lies beside them, by nearness."""
+
+    def __init__(self, level: Level, meshes: Sequence[PolygonMesh]) -> None:
+        """Find them at a level; ``meshes`` are its garments' polygons."""
+        parts = zip(meshes, level.spans, strict=True)
+        edges = np.concatenate([mesh.half_edges.edges.astype(np.int64) + span.start for mesh, span in parts])
+        ends = np.concatenate([edges, edges[:, ::-1]])
+        idle = ((level.vertex_area == 0) & (level.pin < 1.0 - PIN_MARGIN)).cpu().numpy()
+        ends = ends[idle[ends[:, 0]] & (ends[:, 0] != ends[:, 1])]
+        self._which, row = np.unique(ends[:, 0], return_inverse=True)
+        rest = level.rest.double().cpu().numpy()
+        length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
+        near = 1.0 / np.maximum(length, NEAREST * float(level.spacing.mean()))
+        beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._which), level.vertex_count))
+        # What hangs together with no cloth at all stays: the margin makes its matrix one that can be inverted.
+        degree = sp.diags(np.bincount(row, near, len(self._which)) * (1.0 + 1e-9))
+        self._inverse = splu(sp.csc_matrix(degree - beside[:, self._which])) if len(row) else None
+        self._beside, self._from_coarse = sp.csr_matrix(beside @ sp.diags(1.0 - idle)), level.from_coarse
+
+    def placed(self, points: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+        """Positions [m], shape (V, 3), each follower moved off the upsampled cage as its neighbours are on the mean."""
+        if self._inverse is None:
+            return points
+        base, out = self._from_coarse @ coarse, points.copy()
+        out[self._which] = base[self._which] + self._inverse.solve(self._beside @ (points - base))
+        return out
 
 
 def _orthonormal(normal: Tensor, tangent: Tensor) -> Tensor:

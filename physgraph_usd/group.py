@@ -20,7 +20,7 @@ from .contact.frame import FrameContact, LevelContact, Touch
 from .contact.rounds import solve_rounds, solve_touching
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
-from .detail import Carried, MovingFrames, Solved
+from .detail import Carried, Followers, MovingFrames, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
 from .forces.guide import GuideMap
@@ -31,10 +31,10 @@ from .integrate.metric import Metric
 from .integrate.saddle import facets, leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
-from .level_forces import LevelForces, blame, build_forces
+from .level_forces import LevelForces, blame, build_forces, named
 from .mesh.subdivide import Refinement
 from .resolution import edge_strain, sharp_folds
-from .scene import Garment, GarmentFrame, recentred
+from .scene import FARTHEST, Garment, GarmentFrame, recentred
 from .solve_settings import SolveSettings
 from .start import Start, start_of
 
@@ -81,6 +81,8 @@ class Group:
         self._outward = torch.tensor([-1.0 if garment.flipped else 1.0 for garment in garments], device=device)
         self._fixed = np.flatnonzero(~finest.free.cpu().numpy().ravel())
         self._place_fixed = sp.csr_matrix(finest.from_coarse[self._fixed])
+        meshes = [chain[-1].mesh if chain else g.mesh for g, chain in zip(garments, refinements, strict=True)]
+        self._followers = Followers(finest, meshes)
         self._cloth = ClothContact(self.levels, self.garments)
         self._material: tuple[object, ...] = ()
         self._forces: list[LevelForces] = []
@@ -133,8 +135,7 @@ class Group:
             x, reports, module, told = self._descend(forces, aim, start, clock, contact=contact, anew=anew)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
-        gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
-        result = self._frames.scaled(aim, x, gain)
+        result = self._scaled(aim, x, frames, at=at)
         finished: dict[str, object] = {}
         if contact is not None:
             scaled = result is not x
@@ -155,6 +156,7 @@ class Group:
         }
         points = result.double().cpu().numpy() + origin
         points[self._fixed] = self._place_fixed @ world
+        points = self._followers.placed(points, world)
         crosses = np.zeros(len(points), bool) if crossing is None else crossing.cpu().numpy()
         own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
         # What the last push out of bodies stretches is not carried on.
@@ -226,6 +228,15 @@ class Group:
             self._forces = [build_forces(level, guide_map, self.garments, **given) for level, guide_map in pairs]
             self._material = material
         return self._forces
+
+    def _scaled(self, aim: Tensor, x: Tensor, frames: Sequence[GarmentFrame], *, at: float | None) -> Tensor:
+        """The result with its detail scaled as asked for, within bounds."""
+        gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(frames, self.garments, strict=True)])
+        result = self._frames.scaled(aim, x, gain)
+        if not bool((result.abs() <= FARTHEST).all()):
+            said = f"the refined cloth is not finite or beyond {FARTHEST:g} m; lower physgraph:refine:detail"
+            raise SolveError(f"{named(self.garments, at)}: {said} or detailScale")
+        return result
 
     def _start(
         self, kept: Carried | None, coarse: Tensor, world: np.ndarray, *, moved: float = np.inf, again: bool = False

@@ -135,6 +135,9 @@ def blame(
     """Name prims, time code and the terms that are not finite at the upsampled cage."""
     energies = lasting.module(coarse).energies(lasting.level.base.apply(coarse))
     broken = [name for name, value in energies.items() if not np.isfinite(value)] or ["none at the input"]
-    where = ", ".join(f"<{garment.path}>" for garment in garments)
-    when = "" if at is None else f" at time code {at:g}"
-    return f"{where}{when}: {error}; terms that are not finite: {', '.join(broken)}"
+    return f"{named(garments, at)}: {error}; terms that are not finite: {', '.join(broken)}"
+
+
+def named(garments: Sequence[Garment], at: float | None) -> str:
+    """Prims and time code, for errors."""
+    return ", ".join(f"<{garment.path}>" for garment in garments) + ("" if at is None else f" at time code {at:g}")

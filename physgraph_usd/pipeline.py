@@ -19,7 +19,7 @@ from .history import Known, bodies_moved, came_back
 from .level import refine_garments
 from .mesh.subdivide import Refinement
 from .mesh.topology import edges_of
-from .scene import Frame, GarmentFrame, Scene, State
+from .scene import Frame, GarmentFrame, Scene, State, out_of_bounds, refuse_far
 from .solve_settings import SolveSettings
 
 
@@ -58,7 +58,7 @@ class Refiner:
             GarmentError: A rest shape cannot be solved on.
         """
         for garment in scene.garments:
-            _require_solvable(garment.path, garment.mesh.indices, garment.mesh.counts, garment.rest)
+            _require_solvable(garment.path, garment.rest)
         chosen = levels if levels is not None else [garment.level for garment in scene.garments]
         self.refinements = self.subdivide(scene, chosen)
         self._settings = settings
@@ -131,7 +131,12 @@ class Refiner:
         Args:
             frame: The frame.
             wanted: For each garment, whether it is asked for; all when None.
+
+        Raises:
+            GarmentError: A position is out of bounds.
+            SolveError: A term of the potential is not finite.
         """
+        refuse_far(self._scene, frame)
         gap = self._is_gap(frame.time)
         if gap:
             self._passed.forget()
@@ -164,6 +169,7 @@ class Refiner:
 
     def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
         """Energy [J] of all garments at given world positions [m], what touches there found anew."""
+        refuse_far(self._scene, frame)
         self._bodies.pose(frame.colliders)
         total = 0.0
         for part in self._parts.of(frame.garments):
@@ -298,19 +304,7 @@ def _set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
     return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 
-def _require_solvable(path: str, indices: np.ndarray, counts: np.ndarray, rest: np.ndarray) -> None:
+def _require_solvable(path: str, rest: np.ndarray) -> None:
     """Refuse rest shapes that no length can be measured on."""
-    if not np.isfinite(rest).all():
-        vertex = int(np.flatnonzero(~np.isfinite(rest).all(axis=1))[0])
-        raise GarmentError(path, f"rest position {vertex} is not finite", remedy="give another frame with --rest")
-    if not len(indices):
-        return
-    ends = np.concatenate([[0], np.cumsum(counts)])
-    following = np.arange(len(indices)) + 1
-    following[ends[1:] - 1] = ends[:-1]
-    other = indices[following]
-    zero = np.flatnonzero((np.linalg.norm(rest[indices] - rest[other], axis=1) == 0.0) & (indices != other))
-    if len(zero):
-        a, b = int(indices[zero[0]]), int(other[zero[0]])
-        remedy = "merge the two points, or give another rest shape with --rest"
-        raise GarmentError(path, f"the rest edge between points {a} and {b} has no length", remedy=remedy)
+    if said := out_of_bounds(rest):
+        raise GarmentError(path, f"the rest shape's {said}", remedy="give another frame with --rest")

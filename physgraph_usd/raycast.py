@@ -105,6 +105,7 @@ def draw(surfaces: list[Surface], view: View, *, size: tuple[int, int], floor: f
         sRGB picture, shape (height, width, 3) uint8.
     """
     picture = np.broadcast_to(BACKGROUND.astype(np.float32), (size[1], size[0], 3)).copy()
+    surfaces = [each for each in surfaces if _has_area(each.points, each.triangles).any()]
     if surfaces:
         world = _World(surfaces, view)
         if view.eye[1] > floor:
@@ -126,10 +127,12 @@ class _World:
         counts = np.cumsum([0] + [len(s.points) for s in surfaces])
         self.points = np.concatenate([s.points for s in surfaces]).astype(np.float32)
         shifted = [s.triangles + start for s, start in zip(surfaces, counts, strict=False)]
-        self.triangles = np.concatenate(shifted).astype(np.int32)
-        self.colors = np.concatenate([s.colors for s in surfaces]).astype(np.float32)
+        triangles = np.concatenate(shifted).astype(np.int32)
+        seen = _has_area(self.points, triangles)
+        self.triangles = triangles[seen]
+        self.colors = np.concatenate([s.colors for s in surfaces]).astype(np.float32)[seen]
         blank = [np.zeros(s.triangles.shape, bool) if s.edges is None else s.edges for s in surfaces]
-        self.edges = np.concatenate(blank)
+        self.edges = np.concatenate(blank)[seen]
         self.normals = _vertex_normals(self.points, self.triangles)
         self.size = float(np.linalg.norm(np.ptp(self.points, axis=0)))
         self.key = _unit(KEY) @ view.axes
@@ -270,6 +273,12 @@ def _vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     spread = np.repeat(normal, 3, axis=0)
     total = np.stack([np.bincount(flat, spread[:, k], minlength=len(points)) for k in range(3)], axis=1)
     return _unit(total).astype(np.float32)
+
+
+def _has_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Which triangles can be seen: thousands in one place, which nothing shows, would each be tried for each ray."""
+    corners = points.astype(np.float32)[triangles].astype(np.float64)
+    return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any(axis=1))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ class RefineReport:
         shot: Input file.
         out: Layer written, or None after a dry run.
         options: The options used.
+        estimate: What it was expected to cost, as `Estimate.plain` gives it.
         garments: Per garment: path, counts, level and why, material values and their sources.
         modelled: Terms of the potential that were on, with the reason.
         left_out: What was left out, with the reason.
@@ -36,6 +37,7 @@ class RefineReport:
     shot: str
     out: Path | None
     options: dict[str, Any]
+    estimate: dict[str, float] = field(default_factory=dict)
     garments: list[dict[str, Any]] = field(default_factory=list)
     modelled: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)

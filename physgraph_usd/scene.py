@@ -10,8 +10,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .colliders.pose import Collider, Pose
+from .errors import GarmentError
 from .fabric import Fabric
 from .mesh.topology import PolygonMesh
+
+FARTHEST = 1e9
+"""Farthest that a point may be from the world's origin along an axis [m]. Products of four lengths below it, such as
+squared areas, are finite in float32; the hierarchies that kernels build end the process where a box is not."""
+_REMEDY = "check metersPerUnit and the transforms above it, cache that frame again, or leave it out with --frames"
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,3 +136,28 @@ def recentred(garment: Garment) -> Garment:
     if not len(garment.rest):
         return garment
     return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))
+
+
+def out_of_bounds(points: np.ndarray) -> str:
+    """Which of positions [m], shape (V, 3), no kernel may see, not finite or beyond `FARTHEST`, in words; or ""."""
+    beyond = ~(np.abs(points) <= FARTHEST).all(axis=1)
+    if not beyond.any():
+        return ""
+    index = int(beyond.argmax())
+    at = ", ".join(f"{value:g}" for value in points[index])
+    return f"point {index} is at ({at}) m; it must be finite and at most {FARTHEST:g} m from the origin"
+
+
+def refuse_far(scene: Scene, frame: Frame) -> None:
+    """Refuse a frame with garments or bodies out of bounds; faces of bodies with NaN are left out later.
+
+    Raises:
+        GarmentError: With the prim, the time code and the point.
+    """
+    for garment, own in zip(scene.garments, frame.garments, strict=True):
+        if said := out_of_bounds(own.points):
+            raise GarmentError(garment.path, said, time=frame.time, remedy=_REMEDY)
+    for collider, pose in zip(scene.colliders, frame.colliders, strict=False):
+        corners = np.zeros((0, 3)) if pose is None else pose.corners()
+        if said := out_of_bounds(corners[~np.isnan(corners).any(axis=1)]):
+            raise GarmentError(collider.path, said, time=frame.time, remedy=_REMEDY)

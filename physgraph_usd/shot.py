@@ -18,7 +18,7 @@ import warp as wp
 from . import __version__
 from .chunks import RUN_UP, solve_in_chunks
 from .contact.passed import told
-from .describe import begin_report, describe, describe_meshes, say_what_was
+from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
@@ -53,7 +53,7 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
 
     Raises:
         UsageError: An option is wrong or the output exists.
-        StageError: The stage cannot be read as asked.
+        StageError: The stage cannot be read as asked, or what it makes does not fit in memory.
         SolveError: No frame could be solved.
         LayerError: The layer cannot be written.
     """
@@ -71,6 +71,8 @@ def _refine(shot: str | Path, out: Path, options: RefineOptions, *, began: float
     try:
         report = begin_report(opened, options)
         report.seconds["open"] = clock.perf_counter() - began
+        if large := too_large(opened, report, options):
+            raise large
         if options.dry_run:
             return report
         _tell(report.warnings, options)

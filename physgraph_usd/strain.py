@@ -57,10 +57,10 @@ def strained_parts(
     if not frames or not rest.sum() > 0:
         return []
     areas = np.array([_face_areas(garment, points) for points in frames])
-    ratio = np.median(areas, axis=0) / np.maximum(rest, np.finfo(float).tiny)
+    ratio = np.divide(np.median(areas, axis=0), rest, out=np.ones_like(rest), where=rest > 0)
     parts = []
     for strained in (ratio > STRAINED, ratio < 1.0 / STRAINED):
-        for faces in _connected(garment, np.flatnonzero(strained & (rest > 0))):
+        for faces in _connected(garment, np.flatnonzero(strained)):
             share = float(rest[faces].sum() / rest.sum())
             if share >= LEAST_SHARE:
                 size = float(np.median(areas[:, faces].sum(axis=1)) / rest[faces].sum())

@@ -12,6 +12,7 @@ from stages import add_sheet, new_stage, save, value_type
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.usd.painted import read_painted
 from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.schema import GARMENT, PROPERTIES, Property
 
 RAMP = np.linspace(0.0, 1.0, 20)
 
@@ -87,8 +88,10 @@ def test_indexed_values_are_flattened(stage: Usd.Stage) -> None:
     [
         (RAMP[:-1].tolist(), "vertex", "19 values with vertex interpolation on 20 points"),
         (RAMP[:12].tolist(), "uniform", "12 values with uniform"),
-        ([*RAMP[:-1], float("nan")], "vertex", r"bendScale\[19\] is nan"),
-        ([-1.0, *RAMP[1:]], "vertex", r"bendScale\[0\] is -1"),
+        ([*RAMP[:-1], float("nan")], "vertex", r"bendScale\[19\].* is nan"),
+        ([-1.0, *RAMP[1:]], "vertex", r"bendScale\[0\].* is -1; it must be finite and in \[0, 10000\]"),
+        ([*RAMP[:-2], 1e24, 0.0], "vertex", r"bendScale\[18\].* is 1e\+24; it must be finite and in \[0, 10000\]"),
+        ([1e38], "constant", r"bendScale\[0\].* is 1e\+38"),
     ],
 )
 def test_values_that_cannot_be_used_are_named(stage: Usd.Stage, values: list[float], how: str, message: str) -> None:
@@ -108,3 +111,42 @@ def test_the_name_that_an_exporter_makes_of_a_colon(stage: Usd.Stage) -> None:
     prim = stage.GetPrimAtPath("/World/rig/cloth")
     UsdGeom.PrimvarsAPI(prim).CreatePrimvar("physgraph_pin", value_type("float[]"), "vertex").Set(RAMP.tolist())
     np.testing.assert_allclose(read(stage, "pin"), RAMP, atol=1e-7)
+
+
+LIMITED = [
+    row for row in PROPERTIES if row.schema != "PhysGraphMaterialAPI" and row.type in {"float", "int", "float[]"}
+]
+
+
+def held(row: Property, number: float) -> object:
+    """A number as the row's attribute holds it."""
+    if row.type == "int":
+        return int(number)
+    return [float(np.float32(number))] if row.interpolation else float(np.float32(number))
+
+
+@pytest.mark.parametrize("row", LIMITED, ids=lambda row: row.name)
+def test_both_ends_of_each_limit_are_accepted_and_what_is_just_outside_is_named(tmp_path: Path, row: Property) -> None:
+    for limit, outwards in ((row.minimum, -np.inf), (row.maximum, np.inf)):
+        if limit is None:
+            continue
+        beyond = np.nextafter(np.float32(limit), np.float32(outwards))
+        for number in (limit, limit + np.sign(outwards) if row.type == "int" else beyond):
+            stage = new_stage(tmp_path / f"{limit}{number != limit}.usda")
+            prim = add_sheet(stage, "/World/rig/cloth").GetPrim()
+            prim = prim if row.name in {each.name for each in GARMENT.values()} else add_body(stage)
+            attribute = prim.CreateAttribute(row.name, value_type(row.type))
+            attribute.Set(held(row, number))
+            if row.interpolation:
+                UsdGeom.Primvar(attribute).SetInterpolation("constant")
+            if number == limit or (row.short == "pin" and number > limit):
+                open_shot(save(stage)).frame(1.0)
+                continue
+            with pytest.raises(SchemaError, match=f"<{prim.GetPath()}>.{row.name}.*it must be finite and in"):
+                open_shot(save(stage)).frame(1.0)
+
+
+def add_body(stage: Usd.Stage) -> Usd.Prim:
+    body = UsdGeom.Sphere.Define(stage, "/World/ball").GetPrim()
+    body.AddAppliedSchema("PhysGraphColliderAPI")
+    return body

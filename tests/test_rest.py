@@ -81,7 +81,7 @@ def test_s16_a_rest_shape_of_another_topology_is_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("where", ["rest", "default"])
-def test_s16_a_rest_edge_without_length_is_refused_with_its_indices(tmp_path: Path, where: str) -> None:
+def test_s16_a_rest_edge_without_length_is_told_with_its_indices(tmp_path: Path, where: str) -> None:
     stage = new_stage(tmp_path / "s.usda")
     mesh, points = add_sheet(stage), FLAT.copy()
     points[6] = points[7]
@@ -89,8 +89,8 @@ def test_s16_a_rest_edge_without_length_is_refused_with_its_indices(tmp_path: Pa
         primvar(mesh, "rest", points)
     else:
         mesh.GetPointsAttr().Set(vec3(points))
-    with pytest.raises(GarmentError, match=r"</World/cloth>: .*no length between points\[6\] and points\[7\]; "):
-        open_shot(save(stage))
+    said = [str(notice) for notice in open_shot(save(stage)).warnings]
+    assert any("</World/cloth>: 1 edges of" in each and "points[6] and points[7]" in each for each in said)
 
 
 def test_a_rest_shape_that_is_not_finite_is_refused_with_its_index(tmp_path: Path) -> None:

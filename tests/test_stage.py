@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
-from stages import add_sheet, new_stage, save, sheet_shot
+from stages import add_sheet, add_skeleton, bind_skin, new_stage, save, sheet_shot
 
 from physgraph_usd.errors import StageError
 from physgraph_usd.usd.reader import open_shot
@@ -53,6 +53,16 @@ def test_an_up_axis_that_usd_does_not_know_is_told(tmp_path: Path, axis: str) ->
     units, notices = read_units(with_metadata(tmp_path / "s.usda", upAxis=axis, metersPerUnit=1.0))
     np.testing.assert_array_equal(units.up, [0, 1, 0])
     assert axis in str(notices[0])
+
+
+@pytest.mark.parametrize("rate", [float("inf"), float("-inf"), float("nan")])
+def test_a_rate_without_end_is_refused(tmp_path: Path, rate: float) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    add_skeleton(stage, "/World/rig", (1.0, 2.0))
+    bind_skin(add_sheet(stage, "/World/rig/cloth", times=()), "/World/rig", joints=[0] * 20)
+    stage.GetRootLayer().pseudoRoot.SetInfo("timeCodesPerSecond", rate)
+    with pytest.raises(StageError, match=r"timeCodesPerSecond of @s\.usda@ is .*author the shot's rate"):
+        open_shot(save(stage))
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0])

@@ -11,7 +11,7 @@ from pxr import UsdGeom, Vt
 from shots import command, fine, refine, sample_times
 from stages import GARMENT_API, new_stage, save, vec3
 
-from physgraph_usd.errors import UsageError
+from physgraph_usd.errors import GarmentError, UsageError
 from physgraph_usd.mesh.fit import median_shape
 from physgraph_usd.shot import inspect_shot
 from physgraph_usd.usd.reader import open_shot
@@ -117,6 +117,12 @@ def test_rest_auto_does_not_depend_on_the_frames_that_are_refined(tmp_path: Path
     np.testing.assert_array_equal(whole, part)
 
 
+def test_rest_auto_of_cloth_that_is_a_point_most_of_the_time_is_refused(tmp_path: Path):
+    shot = puffed_shot(tmp_path / "a.usda", odd=dict.fromkeys(TIMES[1:], 0.0))
+    with pytest.raises(GarmentError, match=r"all points of the rest shape \(auto: .*\) are at one place"):
+        open_shot(shot, rest_frame="auto")
+
+
 def test_a_fit_comes_near_medians_that_no_pose_has():
     ends = np.array([[0, 1], [1, 2], [2, 3]])
     poses = [
@@ -139,6 +145,15 @@ def test_the_command_tells_before_the_first_frame_and_once(tmp_path: Path):
     done = command("refine", shot, "-o", out, "--level", "0", "--rest", "auto", "--overwrite")
     assert done.returncode == 0
     assert "--rest" not in done.stderr
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_command_tells_once_of_each_of_several_shots(tmp_path: Path, workers: int):
+    shots = [puffed_shot(tmp_path / name) for name in ("a.usda", "b.usda")]
+    done = command("refine", *shots, "-o", tmp_path / "out", "--level", "0", "--workers", str(workers))
+    assert done.returncode == 0
+    told = [line for line in done.stderr.splitlines() if "--rest auto" in line]
+    assert sorted(line.partition(": <")[0] for line in told) == [f"warning: {shot}" for shot in shots]
 
 
 @pytest.mark.parametrize("asked", ["median", float("nan")])

@@ -41,6 +41,10 @@ class MeshPose:
     points: np.ndarray
     triangles: np.ndarray
 
+    def corners(self) -> np.ndarray:
+        """Points that hold all of it between them [m], shape (N, 3)."""
+        return self.points
+
     def equals(self, other: Pose) -> bool:
         """Whether both are the same to the bit."""
         return (
@@ -73,6 +77,11 @@ class ShapePose:
     turn: np.ndarray
     centre: np.ndarray
     size: np.ndarray
+
+    def corners(self) -> np.ndarray:
+        """Points that hold all of it between them [m], shape (N, 3); the centre of a plane, which nothing holds."""
+        reach = self.size.sum()
+        return self.centre + np.array([[-reach], [reach]])
 
     def equals(self, other: Pose) -> bool:
         """Whether both are the same to the bit."""

@@ -8,6 +8,8 @@ comparing corners with the vertex's ring takes most of a query's time.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
@@ -16,6 +18,8 @@ from .cluster_kernels import has
 
 wp.set_module_options({"enable_backward": False})
 
+BLOCK = 1 << 20
+"""Parts looked at together: round the middle of a face of 2,000 corners everything is beside everything."""
 BITS = 64
 """Parts of a cluster that bits tell of; those after them are compared by their corners."""
 
@@ -37,20 +41,37 @@ def beside_table(
     count, parts = beside.shape[0], len(corners)
     places = (corners.ravel(), np.repeat(np.arange(parts, dtype=np.int32), corners.shape[1]))
     of_vertex = sp.csr_matrix((np.ones(corners.size, np.int32), places), shape=(count, parts))
-    rows = sp.csr_matrix((beside + sp.identity(count, dtype=beside.dtype, format="csr")).astype(np.int32) @ of_vertex)
-    rows.sort_indices()
-    vertex, part = np.repeat(np.arange(count), np.diff(rows.indptr)), rows.indices
-    cluster = np.repeat(np.arange(len(first) - 1, dtype=np.int32), np.diff(first))[part]
-    place = part - first[cluster]
-    bits = np.where(place < BITS, np.uint64(1) << np.minimum(place, BITS - 1).astype(np.uint64), np.uint64(0))
-    begins = np.flatnonzero(np.diff(vertex, prepend=-1) | np.diff(cluster, prepend=-1))
-    masks = np.bitwise_or.reduceat(bits, begins) if len(begins) else bits
-    starts = np.searchsorted(vertex[begins], np.arange(count + 1)).astype(np.int32)
+    around = sp.csr_matrix((beside + sp.identity(count, dtype=beside.dtype, format="csr")).astype(np.int32))
+    cluster = np.repeat(np.arange(len(first) - 1, dtype=np.int32), np.diff(first))
+    found = np.cumsum(around @ np.diff(of_vertex.indptr))
+    ends = np.unique([*np.searchsorted(found, np.arange(BLOCK, found[-1] if count else 0, BLOCK)), count])
+    blocks = [_entries(around[a:b] @ of_vertex, cluster, first) for a, b in pairwise([0, *ends]) if b > a] or [
+        (np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0, np.uint64))
+    ]
+    entries, clusters, masks = (np.concatenate(each) for each in zip(*blocks, strict=True))
+    starts = np.concatenate([[0], np.cumsum(entries)]).astype(np.int32)
     return (
         wp.array(starts, dtype=wp.int32, device=device),
-        wp.array(cluster[begins].astype(np.int32), dtype=wp.int32, device=device),
+        wp.array(clusters, dtype=wp.int32, device=device),
         wp.array(masks, dtype=wp.uint64, device=device),
     )
+
+
+def _entries(rows: sp.csr_matrix, cluster: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The number of entries of each of some vertices; and of each entry the cluster, and the bits of its parts.
+
+    Args:
+        rows: Parts beside each of the vertices, shape (vertices, N).
+        cluster: The cluster of each part, shape (N,), int32.
+        first: The first part of each cluster.
+    """
+    rows.sort_indices()
+    vertex, of_part = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr)), cluster[rows.indices]
+    place = rows.indices - first[of_part]
+    bits = np.where(place < BITS, np.uint64(1) << np.minimum(place, BITS - 1).astype(np.uint64), np.uint64(0))
+    begins = np.flatnonzero(np.diff(vertex, prepend=-1) | np.diff(of_part, prepend=-1))
+    masks = np.bitwise_or.reduceat(bits, begins) if len(begins) else bits
+    return np.bincount(vertex[begins], minlength=rows.shape[0]), of_part[begins], masks
 
 
 @wp.kernel

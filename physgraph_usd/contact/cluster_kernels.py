@@ -47,6 +47,7 @@ def are_apart(
     """Whether two clusters cannot come nearer than a reach, by what feels what and by what does not turn over.
 
     Those of a ring that does not turn over do not touch. They may come near: there, no ring round one may turn over.
+    Rings are sorted: at a face of thousands of corners they hold all of its clusters.
     """
     if meets[garment[i] * garments + garment[j]] == 0:
         return True
@@ -55,9 +56,10 @@ def are_apart(
     for k in range(ring_starts[i], ring_starts[i + 1]):
         middle = ring[k]
         if turns[middle] == 0:
-            for m in range(ring_starts[middle], ring_starts[middle + 1]):
-                if ring[m] == j:
-                    return True
+            end = ring_starts[middle + 1]
+            place = wp.lower_bound(ring, ring_starts[middle], end, j)
+            if place < end and ring[place] == j:
+                return True
     return False
 
 

@@ -166,9 +166,11 @@ def _in_space(cluster: np.ndarray, level: Level) -> np.ndarray:
 
 
 def _rings(edges: np.ndarray, count: int) -> sp.csr_matrix:
-    """Which clusters are the same or joined by an edge."""
+    """Which clusters are the same or joined by an edge, those of each sorted."""
     both = np.concatenate([edges, edges[:, ::-1], np.repeat(np.arange(count), 2).reshape(-1, 2)])
-    return sp.csr_matrix((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), shape=(count, count))
+    rings = sp.csr_matrix((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), shape=(count, count))
+    rings.sort_indices()
+    return rings
 
 
 def _gathered(beside: sp.csr_matrix) -> np.ndarray:

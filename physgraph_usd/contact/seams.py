@@ -41,9 +41,9 @@ class Seams:
     def at(self, level: Level, base: Float[Tensor, "vertices 3"]) -> Seam | None:
         """What is sewn at a level, or None where nothing is; ``base`` is the upsampled cage [m]."""
         if level.index not in self._levels:
-            # A fine point lies on a seam if all that it is made of does.
+            # A fine point lies on a seam if all that it is made of does; one without area is no cloth to sew.
             share = np.asarray(level.from_coarse @ self.sewn.astype(np.float64)).ravel()
-            which = np.flatnonzero(share > 1.0 - 1e-9)
+            which = np.flatnonzero((share > 1.0 - 1e-9) & (level.vertex_area > 0).cpu().numpy())
             garment, rest = level.vertex_garment.cpu().numpy(), level.rest.double().cpu().numpy()
             pairs = self._pairs(base.double().cpu().numpy(), which, garment, rest)
             self._levels[level.index] = Seam(level, pairs) if len(pairs) else None

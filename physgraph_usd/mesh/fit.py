@@ -33,7 +33,7 @@ def median_shape(edges: np.ndarray, poses: Sequence[np.ndarray]) -> tuple[np.nda
     median = np.median(lengths, axis=0)
     nearest = int(np.abs(lengths - median).sum(axis=1).argmin())
     shape = np.array(poses[nearest], np.float64)
-    if not len(edges):
+    if not median.any():
         return shape, nearest
     weight = 1.0 / np.maximum(median, max(SHORTEST * float(median.mean()), np.finfo(float).tiny))
     rows = np.arange(len(edges))

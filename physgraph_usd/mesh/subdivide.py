@@ -72,7 +72,7 @@ def subdivide(mesh: PolygonMesh) -> Refinement:
 
 
 def fine_count(mesh: PolygonMesh, levels: int) -> int:
-    """Number of vertices after some subdivisions, counted without making them.
+    """Number of vertices after some subdivisions, exact unless faces repeat a corner, counted without making them.
 
     Args:
         mesh: The cage.

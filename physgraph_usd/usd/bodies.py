@@ -13,6 +13,7 @@ from pxr import Usd, UsdGeom
 from ..colliders.orient import FIXED
 from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ..mesh.topology import PolygonMesh
+from ..scene import FARTHEST, out_of_bounds
 from .lookup import COLLIDER_OFFSET, COLLIDER_SIDE, find_token, find_value
 from .placement import is_flipped, place, timecode
 from .shapes import UPRIGHT, tessellated
@@ -65,9 +66,8 @@ class ColliderReader:
         matrix[:3] *= self.metres
         if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
             return None, (self._out(time, "its transform to the world is not an affine one"),)
-        if self.collider.kind != "mesh":
-            return self._shape(matrix, time)
-        return self._mesh(matrix, time)
+        pose, odd = (self._mesh if self.collider.kind == "mesh" else self._shape)(matrix, time)
+        return (None, odd) if pose is None else self._bounded(pose, time)
 
     def _mesh(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         mesh = UsdGeom.Mesh(self.prim)
@@ -82,7 +82,7 @@ class ColliderReader:
         first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
         split_at = first if first.shape == points.shape else points
         triangles = self._triangles(split_at, counts, indices, flip=flip)
-        return MeshPose(place(points.astype(np.float64), matrix), triangles), ()
+        return MeshPose(place(np.where(np.isfinite(points), points, np.nan).astype(np.float64), matrix), triangles), ()
 
     def _triangles(self, points: np.ndarray, counts: np.ndarray, indices: np.ndarray, *, flip: bool) -> np.ndarray:
         """Triangles of the faces; the same array as last time while the topology is the same.
@@ -116,6 +116,17 @@ class ColliderReader:
             return ShapePose(kind, turn, matrix[:3, 3], size * stretch), ()
         points, triangles = tessellated(kind, size)
         return MeshPose(points @ linear.T + matrix[:3, 3], triangles), ()
+
+    def _bounded(self, pose: Pose, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        """The pose without what is out of bounds: the faces with such points, or a primitive itself."""
+        if not (said := out_of_bounds(pose.corners())):
+            return pose, ()
+        if not isinstance(pose, MeshPose):
+            return None, (self._out(time, said),)
+        near = np.asarray((np.abs(pose.points) <= FARTHEST).all(axis=1))
+        said = f"{said}; faces with it, and with {(~near).sum() - 1} more such, are left out"
+        whole = MeshPose(np.where(near[:, None], pose.points, np.nan), pose.triangles)
+        return whole, (Notice(self.collider.path, time, said),)
 
     def _out(self, time: float | None, why: str) -> Notice:
         return Notice(self.collider.path, time, f"this collider is left out here: {why}")

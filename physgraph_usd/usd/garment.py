@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,9 @@ from .times import garment_times, merge, transform_times, within
 _SMALL, _LARGE = 0.01, 100.0
 _MEDIAN_FRAMES = 9
 """Time codes that `--rest auto` takes medians of: an edge that is odd in four of them does not count."""
+_THICK = 10.0
+"""Part of its size beyond which cloth keeps no distance: where all of it is near all of it, a query asks for V^2 pairs,
+and what is pushed out by more than it measures is no shape that the shot had."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +90,13 @@ class GarmentReader:
         local, notices = self.points.read(time, self.edges)
         names = ("guide:stiffness", "refine:detail", "contact:offset")
         guide, detail, offset = (self.values.number(name, time) for name in names)
-        return GarmentFrame(place(local, matrix), self.values.fabric(time), guide, detail, offset), notices
+        fabric, most = self.values.fabric(time), float(np.linalg.norm(np.ptp(self.garment.rest, axis=0))) / _THICK
+        if max(fabric.thickness, offset) > most:
+            said = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
+            said += f" {1e3 * fabric.thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
+            notices = (*notices, Notice(self.garment.path, None, said))
+        fabric, offset = replace(fabric, thickness=min(fabric.thickness, most)), min(offset, most)
+        return GarmentFrame(place(local, matrix), fabric, guide, detail, offset), notices
 
 
 def all_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
@@ -84,12 +84,13 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
         if not len(known) or np.abs(known - time).min() > 1e-6:
             yield _error("is a sample at a time that the shot does not author", name, time)
             break
-    spec = layer.GetAttributeAtPath(name)
+    spec, clouds = layer.GetAttributeAtPath(name), []
     for time in written[:1] + written[-1:] if written else [None]:
         value = layer.QueryTimeSample(name, time) if time is not None else (spec.default if spec else None)
         below = UsdGeom.Mesh(coarse).GetPointsAttr().Get(code_of(time))
         if value is not None and below is not None and len(value) and len(below):
-            yield from _compare(np.asarray(value), np.asarray(below), name, time)
+            clouds.append((np.asarray(value), np.asarray(below), time))
+    yield from _compare(clouds, name)
 
 
 def _times(prim: Usd.Prim) -> set[float]:
@@ -111,16 +112,25 @@ def _is_skinned(prim: Usd.Prim) -> bool:
     return False
 
 
-def _compare(fine: np.ndarray, coarse: np.ndarray, name: str, time: float | None) -> Iterator[Problem]:
-    """Compare two clouds in the same local space by size and place."""
-    good = coarse[np.isfinite(coarse).all(axis=1)].astype(np.float64)
-    if not len(good) or not np.isfinite(fine).all():
-        return
-    size, wanted = (float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (fine.astype(np.float64), good))
-    away = float(np.linalg.norm(fine.mean(axis=0, dtype=np.float64) - good.mean(axis=0)))
-    if not wanted / 4 <= size <= 4 * wanted:
-        yield _error(
-            f"is {size:g} units large; the coarse mesh is {wanted:g}: units or transforms are wrong", name, time
-        )
-    elif away > wanted:
-        yield _error(f"lies {away:g} units from the coarse mesh, which is {wanted:g} large", name, time)
+def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name: str) -> Iterator[Problem]:
+    """Compare fine and coarse clouds in the same local space by size and place, at some times.
+
+    A sample that is broken, such as one whose points are all at one place, is not the size of the cloth: what is as
+    large as the coarse mesh is at any of the times will do.
+    """
+    whole = [(fine.astype(np.float64), below[np.isfinite(below).all(axis=1)], time) for fine, below, time in clouds]
+    whole = [each for each in whole if len(each[1]) and np.isfinite(each[0]).all()]
+    sizes = [_size(below) for _, below, _ in whole]
+    for fine, below, time in whole if max(sizes, default=0.0) > 0 else ():
+        least, most = min(sizes), max(sizes)
+        away = float(np.linalg.norm(fine.mean(axis=0) - below.mean(axis=0, dtype=np.float64)))
+        if not least / 4 <= _size(fine) <= 4 * most:
+            said = f"is {_size(fine):g} units large; the coarse mesh is {_size(below):g}"
+            yield _error(f"{said}: units or transforms are wrong", name, time)
+        elif away > most:
+            yield _error(f"lies {away:g} units from the coarse mesh, which is {most:g} large", name, time)
+
+
+def _size(cloud: np.ndarray) -> float:
+    """Diagonal of a cloud's box."""
+    return float(np.linalg.norm(np.ptp(cloud.astype(np.float64), axis=0)))

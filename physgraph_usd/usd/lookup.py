@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
@@ -215,14 +216,18 @@ def read_number(attribute: Usd.Attribute, time: float | None) -> float:
 def check_limits(row: Property, value: float, source: str) -> float:
     """Return the value when it is finite and inside its limits.
 
+    Limits are compared in float32, as the schema's attributes hold them: a limit that is authored is the limit.
+
     Raises:
         SchemaError: With the value, the source and the limits.
     """
     low = -math.inf if row.minimum is None else row.minimum
     high = math.inf if row.maximum is None else row.maximum
-    if not (math.isfinite(value) and low <= value <= high):
+    with np.errstate(over="ignore"):
+        held = np.float32(value)
+    if not (np.isfinite(held) and np.float32(low) <= held <= np.float32(high)):
         allowed = f"[{low:g}, {high:g}]" + (f" {row.unit}" if row.unit else "")
-        raise SchemaError(f"{source}: {row.name} is {value:g}; it must be finite and in {allowed}")
+        raise SchemaError(f"{source}: {row.name} is {value:.7g}; it must be finite and in {allowed}")
     if row.type == "int" and value != round(value):
         raise SchemaError(f"{source}: {row.name} is {value:g}; it must be a whole number")
     return value

@@ -6,6 +6,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ..errors import SchemaError
+from .lookup import check_limits
 from .schema import GARMENT
 from .stage import Notice
 
@@ -24,7 +25,7 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
         Values, shape (count,), float64, and what was odd about them.
 
     Raises:
-        SchemaError: When the interpolation, type, number or sign of the values cannot be used.
+        SchemaError: When the interpolation, type, number or limits of the values do not let them be used.
     """
     row = GARMENT[short]
     primvar = _find(prim, row.name.removeprefix("primvars:"))
@@ -42,14 +43,13 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
     elif interpolation not in _PER_VERTEX or len(values) != count:
         said = f"{len(values)} values with {interpolation} interpolation on {count} points"
         raise SchemaError(f"{where} has {said}; author one value per point (vertex) or one for all (constant)")
-    broken = ~np.isfinite(values) | (values < 0)
-    if broken.any():
-        index = int(broken.argmax())
-        raise SchemaError(f"{where}[{index}] is {values[index]:g}; it must be finite and not negative")
-    if row.maximum is not None and (values > row.maximum).any():
-        said = f"{row.name} goes up to {values.max():g}; values over {row.maximum:g} are taken as {row.maximum:g}"
-        return np.minimum(values, row.maximum), (Notice(str(prim.GetPath()), None, said),)
-    return values, ()
+    notices: tuple[Notice, ...] = ()
+    if row is GARMENT["pin"] and (values > 1.0).any():  # Weights that other programs paint are over 1 by rounding.
+        said = f"{row.name} goes up to {values.max():g}; values over 1 are taken as 1"
+        values, notices = np.minimum(values, 1.0), (Notice(str(prim.GetPath()), None, said),)
+    for index in (int(values.argmin()), int(values.argmax())) if count else ():  # NaN is either's first.
+        check_limits(row, float(values[index]), f"{where}[{index}]")
+    return values, notices
 
 
 def _find(prim: Usd.Prim, name: str) -> UsdGeom.Primvar | None:

@@ -19,7 +19,7 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from ..errors import SchemaError, StageError, UsageError
-from ..scene import Frame, Scene
+from ..scene import Frame, Scene, refuse_far
 from .apart import read_apart
 from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots
@@ -113,7 +113,7 @@ class Shot:
         """Read one time code; None reads the default values.
 
         Raises:
-            GarmentError: When a garment is broken at this time.
+            GarmentError: When a garment is broken or out of bounds at this time.
             SchemaError: When an animated value cannot be used.
             StageError: When USD cannot read the files any more.
         """
@@ -128,7 +128,9 @@ class Shot:
                 pose, notices = body.pose(time)
                 poses.append(pose)
                 self._tell(notices)
-        return Frame(time, tuple(garments), tuple(poses))
+        frame = Frame(time, tuple(garments), tuple(poses))
+        refuse_far(self.scene, frame)
+        return frame
 
     def _tell(self, notices: Sequence[Notice]) -> None:
         """Add what was not said before to the warnings."""

@@ -15,6 +15,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ..errors import GarmentError
+from ..scene import out_of_bounds
 from .lookup import nearest, source_name
 from .points import as_points, repair
 from .stage import Notice
@@ -60,7 +61,7 @@ def read_rest(
         baked: Layer of baked skinning, whose points are no rest shape.
 
     Raises:
-        GarmentError: When an authored rest shape does not fit the mesh or has an edge without length.
+        GarmentError: When an authored rest shape does not fit the mesh, or all of its points are at one place.
     """
     path, count = str(prim.GetPath()), len(first)
     authored = _authored(prim, count)
@@ -83,28 +84,35 @@ def read_rest(
 
 
 def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray) -> Rest:
-    """Refuse a rest shape with an edge of no length; say when its size differs much from the animation's.
+    """Refuse a rest shape without size; say where edges have no length, and when its size differs from the animation's.
+
+    Points at one place are sewn together where the animation has them at one place, too; the faces between them are no
+    cloth.
 
     Raises:
-        GarmentError: With the two vertices of the edge.
+        GarmentError: When all of its points are at one place, or one is out of bounds.
     """
     path = str(prim.GetPath())
+    if said := out_of_bounds(rest.points):
+        raise GarmentError(path, f"the rest shape's ({rest.source}) {said}", remedy="check units and transforms")
     edges = edges[edges[:, 0] != edges[:, 1]]
     lengths = np.linalg.norm(rest.points[edges[:, 0]] - rest.points[edges[:, 1]], axis=1)
     mean = float(lengths.mean()) if len(lengths) else 0.0
+    if len(lengths) and mean == 0.0:
+        said, remedy = f"all points of the rest shape ({rest.source}) are at one place", "choose another --rest FRAME"
+        raise GarmentError(path, said, remedy=remedy)
     short = np.flatnonzero(lengths <= _TINY * mean)
+    notices = rest.notices
     if len(short):
         low, high = edges[short[0]]
-        said = f"the rest shape ({rest.source}) has no length between points[{low}] and points[{high}]"
-        raise GarmentError(
-            path, said, remedy="merge these vertices, author primvars:rest, or choose --rest FRAME or --rest auto"
-        )
+        said = f"{len(short)} edges of the rest shape ({rest.source}) have no length, the first between points[{low}]"
+        notices = (*notices, Notice(path, None, f"{said} and points[{high}]: points at one place are taken for one"))
     now = float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean()) if len(edges) else 0.0
     ratio = mean / now if now > 0 else 1.0
     if 1 / _MOST_SCALED <= ratio <= _MOST_SCALED:
-        return rest
+        return Rest(rest.points, rest.source, notices)
     said = f"the rest shape ({rest.source}) has edges {ratio:.3g} times as long as the animation's; check its units"
-    return Rest(rest.points, rest.source, (*rest.notices, Notice(path, None, said)))
+    return Rest(rest.points, rest.source, (*notices, Notice(path, None, said)))
 
 
 def rests_bent(prim: Usd.Prim) -> bool:

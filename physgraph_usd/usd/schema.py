@@ -39,8 +39,9 @@ class Property:
         fallback: Value that refining takes where nothing gives one; None when that means something else, told in
             ``doc``. The schema files have none: an ancestor, a material or ``--set`` may give what the prim does not.
         unit: SI unit, "" when it has none.
-        minimum: Least value allowed, or None.
-        maximum: Greatest value allowed, or None.
+        minimum: Least value allowed, or None; of a primvar, of each of its values.
+        maximum: Greatest value allowed, or None. The stiffest preset is some hundred times the softest; paint may go a
+            hundred times farther.
         doc: What it is, for the schema's documentation.
         uniform: Whether it cannot be animated.
         interpolation: Of a primvar, else "".
@@ -86,7 +87,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     )
 
 
-def _scale(name: str, fallback: float, maximum: float | None, doc: str) -> Property:
+def _scale(name: str, fallback: float, maximum: float, doc: str) -> Property:
     full = f"primvars:{NAMESPACE}{name}"
     return Property(GARMENT_API, full, "float[]", fallback, "", 0.0, maximum, doc, interpolation="vertex")
 
@@ -123,10 +124,10 @@ PROPERTIES: tuple[Property, ...] = (
         GARMENT_API, "physgraph:contact:exclude", "rel", None, "", None, None,
         "Colliders and garments that this garment never touches: prims, prims above them, or collections.",
     ),
-    _scale("stretchScale", 1.0, None, "Painted multiplier of the stretch stiffness; vertex or constant."),
-    _scale("bendScale", 1.0, None, "Painted multiplier of the bending stiffness; vertex or constant."),
-    _scale("detailScale", 1.0, None, "Painted multiplier of the added detail; vertex or constant."),
-    _scale("guideScale", 1.0, None, "Painted multiplier of the guide stiffness; vertex or constant."),
+    _scale("stretchScale", 1.0, 1e4, "Painted multiplier of the stretch stiffness; vertex or constant."),
+    _scale("bendScale", 1.0, 1e4, "Painted multiplier of the bending stiffness; vertex or constant."),
+    _scale("detailScale", 1.0, 10.0, "Painted multiplier of the added detail; vertex or constant."),
+    _scale("guideScale", 1.0, 1e4, "Painted multiplier of the guide stiffness; vertex or constant."),
     _scale("pin", 0.0, 1.0, "1 where the fine cloth follows the coarse cloth exactly."),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,

@@ -261,6 +261,11 @@ def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
             raise StageError(f"cannot open {path}")
         said = [item.commentary for item in diagnostics.TakeUncoalescedDiagnostics()]
         problems = composition_problems(stage, said)
+        rates = {layer.GetDisplayName(): layer.timeCodesPerSecond for layer in stage.GetUsedLayers()}
+    endless = [name for name, rate in rates.items() if not math.isfinite(rate)]
+    if endless:  # USD looks for samples without end.
+        said = f"timeCodesPerSecond of @{endless[0]}@ is {rates[endless[0]]}; author the shot's rate, such as 24"
+        raise StageError(f"cannot read {path}: {said}")
     broken = [problem for problem in problems if not problem.missing]
     if broken:
         raise StageError(f"cannot compose {path}: {broken[0].message}" + _others(len(broken) - 1))

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from . import files, meshes, values, wholes
+from . import files, meshes, odd, values, wholes
 
-KINDS = (*files.KINDS, *meshes.KINDS, *values.KINDS, *wholes.KINDS)
+KINDS = (*files.KINDS, *meshes.KINDS, *values.KINDS, *wholes.KINDS, *odd.KINDS)

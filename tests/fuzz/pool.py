@@ -22,8 +22,9 @@ from .trial import Outcome
 
 START_SECONDS = 120.0
 """Time that a child has for its imports."""
-MEMORY_BYTES = 2**30
-"""What a child may ask for beyond its imports: a damaged binary layer makes USD ask for what its counts say."""
+MEMORY_BYTES = 3 * 2**30
+"""What a child may ask for beyond its imports, three times what the largest mutant needs: a damaged binary layer makes
+USD ask for what its counts say."""
 
 
 def serve(bases: Path, work: Path) -> None:

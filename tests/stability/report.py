@@ -73,7 +73,7 @@ CASES = (
     Case(13, "flat sheet squeezed by a tenth", "wrinkles take up half the energy", solver.s13_saddle),
     Case(14, "a hinge at and past half a turn", "gradient to 1e-4", once=stages.s14_folds),
     Case(15, "crumpled ball, noise of three edges", "energy / 10 in 200 steps", solver.s15_crumpled),
-    Case(16, "rest edges without length, rest points not finite", "refused by name", once=stages.s16_rest_shapes),
+    Case(16, "rest points not finite or out of bounds", "refused by name", once=stages.s16_rest_shapes),
     Case(17, "one pin, all pinned", "to the bit", solver.s17_pins),
     Case(18, "open colliders, wound either way and both", "none pushed through", contact.s18_open),
     Case(19, "card of 0.2 mm or pane between two layers", "none changes sides", contact.s19_thin),

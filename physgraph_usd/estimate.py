@@ -1,0 +1,118 @@
+"""What a shot will cost, from its cages alone: fine vertices, memory, the layer's size and time.
+
+``python -m benchmarks.estimate`` measures what is behind each constant and says by what factor the estimate is off. On
+the samples memory, size and the time of warm frames are within a factor of 2, the time of the first one, which how
+crowded the cloth is decides, within 2.5.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from .errors import GarmentError
+from .mesh.subdivide import fine_count
+from .scene import Garment
+
+PROCESS = 5.2e8
+"""Memory of a process that has done nothing yet but import [bytes]: torch, Warp and its kernels, USD."""
+PER_VERTEX = 6.5e3
+"""Memory for each fine vertex, coarser levels, forces, metric and hierarchies included [bytes]."""
+LAYER_ONCE, LAYER_FRAME = 60.0, 24.0
+"""What a layer holds of each fine vertex: faces, UVs and the default once; points and normals per sample [bytes]."""
+FREE, TOUCHING = (5e-5, 6.5e-6), (9e-5, 2.2e-5)
+"""Time of one core for each fine vertex, in the first frame and in each warm one, of garments that feel no body and of
+those that do [s]."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What refining costs.
+
+    Attributes:
+        vertices: Fine vertices of all garments.
+        memory: Peak memory of all processes [bytes].
+        layer: Size of the layer [bytes].
+        first: Time of one core for the first frame, starting included [s].
+        seconds: Time of one core for each further frame [s].
+    """
+
+    vertices: int
+    memory: float
+    layer: float
+    first: float
+    seconds: float
+
+    def plain(self) -> dict[str, float]:
+        """The estimate for a report."""
+        return {
+            "fine_vertices": self.vertices,
+            "memory_mb": round(self.memory / 1e6),
+            "layer_mb": round(self.layer / 1e6, 1),
+            "first_frame_seconds": float(f"{self.first:.2g}"),
+            "seconds_a_frame": float(f"{self.seconds:.2g}"),
+        }
+
+
+def estimate(garments: Sequence[Garment], levels: Sequence[int], *, frames: int = 1, workers: int = 1) -> Estimate:
+    """Estimate a run.
+
+    Args:
+        garments: The garments.
+        levels: Number of subdivisions of each.
+        frames: Number of time codes.
+        workers: Processes that share the frames.
+    """
+    counts = [fine_count(garment.mesh, level) for garment, level in zip(garments, levels, strict=True)]
+    vertices, processes = sum(counts), min(workers, max(frames, 1))
+    rates = [TOUCHING if garment.colliders else FREE for garment in garments]
+    first, seconds = (sum(n * rate[k] for n, rate in zip(counts, rates, strict=True)) for k in (0, 1))
+    memory = (PROCESS + PER_VERTEX * vertices) * processes + (PROCESS if processes > 1 else 0.0)
+    return Estimate(vertices, memory, vertices * (LAYER_ONCE + LAYER_FRAME * frames), first, seconds)
+
+
+def cannot_fit(
+    garments: Sequence[Garment],
+    levels: Sequence[int],
+    *,
+    frames: int = 1,
+    workers: int = 1,
+    memory: float | None = None,
+) -> GarmentError | None:
+    """The error that names what this machine's memory cannot hold, and the level that it can; or None.
+
+    Args:
+        garments: The garments.
+        levels: Number of subdivisions of each.
+        frames: Number of time codes.
+        workers: Processes that share the frames.
+        memory: What the machine has [bytes]; asked of it when None.
+    """
+    there = memory_there() if memory is None else memory
+    whole = estimate(garments, levels, frames=frames, workers=workers)
+    if whole.memory <= there:
+        return None
+    largest = max(range(len(garments)), key=lambda index: fine_count(garments[index].mesh, levels[index]))
+    fits = (
+        level
+        for level in range(max(levels) - 1, -1, -1)
+        if estimate(garments, [min(level, own) for own in levels], frames=frames, workers=workers).memory <= there
+    )
+    level = next(fits, None)
+    said = (
+        f"level {levels[largest]} makes {whole.vertices:,} fine vertices, which need about {whole.memory / 1e9:.3g} GB"
+    )
+    remedy = "reduce the cage" if level is None else f"use --level {level}"
+    fewer = " or fewer --workers" if workers > 1 else ""
+    return GarmentError(
+        garments[largest].path, f"{said} of memory; this machine has {there / 1e9:.3g} GB", remedy=remedy + fewer
+    )
+
+
+def memory_there() -> float:
+    """Memory of this machine [bytes]; infinite where it does not say."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):  # Windows has no sysconf.
+        return float("inf")

@@ -1,0 +1,165 @@
+"""What everyday shots bring now and then: glitches, points at one place, huge faces, variants, cloth of any size."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from .bases import garments_of
+from .damage import INF, NAN, numbers
+from .meshes import OWN, a_mesh
+from .mutant import Draft, Kind
+
+_PAINTED = ("stretchScale", "bendScale", "guideScale", "detailScale", "pin")
+_EXTREMES = (1e24, 1e38, 3.4e38, NAN, INF, -INF, -1.0, 0.0, 10.0, 1e4)
+_BODIES = ("floor", "sphere", "capsule", "cube", "plane", "cylinder", "cone")
+
+
+def _floats(values: np.ndarray) -> Vt.FloatArray:
+    return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+
+
+def _vectors(points: np.ndarray) -> Vt.Vec3fArray:
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
+
+
+def _times(mesh: UsdGeom.Mesh) -> list[Usd.TimeCode]:
+    """The default and every sample of a mesh's points."""
+    return [Usd.TimeCode.Default(), *map(Usd.TimeCode, mesh.GetPointsAttr().GetTimeSamples())]
+
+
+def _paint(draft: Draft) -> None:
+    """Painted maps with extreme values, at one vertex or at all."""
+    stage = draft.open()
+    mesh = UsdGeom.Mesh(draft.pick(garments_of(stage)))
+    count = len(numbers(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime())))
+    for _ in range(draft.pick([1, 1, 2])):
+        name, value = draft.pick(_PAINTED), draft.pick(_EXTREMES)
+        how = draft.pick(["vertex", "vertex", "constant"])
+        values = np.full(count if how == "vertex" else 1, value if draft.chance(0.5) else 1.0)
+        values[int(draft.rng.integers(len(values)))] = value
+        primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(f"physgraph:{name}", Sdf.ValueTypeNames.FloatArray, how)
+        primvar.Set(_floats(values))
+        draft.said.append(f"{mesh.GetPath()}: {name} {how} {value:g}")
+    draft.save(stage, "saved")
+
+
+def _variants(draft: Draft) -> None:
+    """Variants that hold the garment's points, values or nothing; one, another or none is selected."""
+    stage = draft.open()
+    garment = draft.pick(garments_of(stage))
+    holder = draft.pick([garment, garment.GetParent()])
+    points = numbers(UsdGeom.Mesh(garment).GetPointsAttr().Get(Usd.TimeCode.EarliestTime()))
+    choices = holder.GetVariantSets().AddVariantSet("look")
+    for name in ("bare", "moved", "switched"):
+        choices.AddVariant(name)
+        choices.SetVariantSelection(name)
+        with choices.GetVariantEditContext():
+            mesh = UsdGeom.Mesh(stage.OverridePrim(garment.GetPath()))
+            if name == "moved":
+                mesh.GetPointsAttr().Set(_vectors(points * draft.pick([0.0, 1.1, 100.0])), draft.pick(_times(mesh)))
+            elif name == "switched" and draft.chance(0.5):
+                mesh.GetPrim().SetActive(False)
+            elif name == "switched":
+                mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([3]))
+                mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray([0, 1, 2]))
+    chosen = draft.pick(["bare", "moved", "switched", "nowhere", ""])
+    if chosen:
+        choices.SetVariantSelection(chosen)
+    else:
+        choices.ClearVariantSelection()
+    draft.save(stage, f"{holder.GetPath()}: variant {chosen or 'none'}")
+
+
+def _large_face(draft: Draft) -> None:
+    """A face of hundreds or thousands of corners, round or crumpled, for cloth or a body."""
+    stage = draft.open()
+    mesh, count = a_mesh(draft, stage), draft.pick([50, 300, 1000, 2000])
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), 0.1 * np.sin(3.0 * angle)], axis=1)
+    if draft.chance(0.2):
+        ring += 0.05 * draft.rng.standard_normal(ring.shape)
+    for code in _times(mesh):
+        mesh.GetPointsAttr().Set(_vectors(ring), code)
+    mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count]))
+    mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.arange(count, dtype=np.int32)))
+    draft.save(stage, f"{mesh.GetPath()}: one face of {count} corners")
+
+
+def _flat_bodies(draft: Draft) -> None:
+    """Bodies scaled to nothing along one axis or all, at one time or always."""
+    stage = draft.open()
+    prim = stage.GetPrimAtPath(f"/World/{draft.pick(_BODIES)}")
+    scale = draft.pick(
+        [Gf.Vec3f(0, 0, 0), Gf.Vec3f(1, 0, 1), Gf.Vec3f(0, 0, 1), Gf.Vec3f(1e-30), Gf.Vec3f(1, 1, 1e-12)]
+    )
+    code = draft.pick([Usd.TimeCode.Default(), Usd.TimeCode(2.0)])
+    UsdGeom.XformCommonAPI(prim).SetScale(scale, code)
+    if draft.chance(0.3):
+        draft.options["report"] = draft.folder / "report"
+    draft.save(stage, f"{prim.GetPath()}: scaled by {scale} at {code}")
+
+
+def _glitch(draft: Draft) -> None:
+    """One sample gone wrong: all points equal, a hundred times its size, turned inside out, far away, or torn."""
+    stage = draft.open()
+    mesh = a_mesh(draft, stage)
+    code = draft.pick(_times(mesh)[1:] or _times(mesh))
+    points = numbers(mesh.GetPointsAttr().Get(code)).astype(np.float64).reshape(-1, 3)
+    how = draft.pick(["equal", "size", "inside out", "far", "torn", "body eightfold"])
+    centre = points.mean(axis=0)
+    changed = {
+        "equal": lambda: np.broadcast_to(centre, points.shape),
+        "size": lambda: centre + draft.pick([1e-3, 100.0]) * (points - centre),
+        "inside out": lambda: centre - (points - centre),
+        "far": lambda: points + draft.pick([10.0, 1e4]),
+        "torn": lambda: points + draft.rng.standard_normal(points.shape),
+        "body eightfold": lambda: centre + 8.0 * (points - centre),
+    }[how]()
+    mesh.GetPointsAttr().Set(_vectors(changed), code)
+    draft.save(stage, f"{mesh.GetPath()} at {code}: {how}")
+
+
+def _coincident(draft: Draft) -> None:
+    """Points at one place, at rest or always; a face twice; points that no face uses."""
+    stage = draft.open()
+    mesh = UsdGeom.Mesh(draft.pick(garments_of(stage)))
+    indices, counts = (
+        numbers(each.Get()) for each in (mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr())
+    )
+    pairs = [draft.rng.choice(indices, 2) for _ in range(draft.pick([0, 1, 3, 8]))]
+    if draft.chance(0.5):
+        start = int(draft.rng.integers(len(indices) - 1))
+        pairs.append(indices[start : start + 2])
+    loose = draft.pick([0, 0, 1, 5])
+    for code in _times(mesh):
+        points = numbers(mesh.GetPointsAttr().Get(code)).reshape(-1, 3).copy()
+        for one, other in pairs if code.IsDefault() or draft.chance(0.7) else ():
+            points[one] = points[other]
+        mesh.GetPointsAttr().Set(_vectors(np.vstack([points, np.zeros((loose, 3))])), code)
+    if draft.chance(0.5):
+        first = int(counts[0])
+        mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.append(counts, first).astype(np.int32)))
+        mesh.GetFaceVertexIndicesAttr().Set(
+            Vt.IntArray.FromNumpy(np.append(indices, indices[:first][:: draft.pick([1, -1])]).astype(np.int32))
+        )
+    draft.save(stage, f"{mesh.GetPath()}: {len(pairs)} pairs at one place, {loose} loose points, {len(counts)} faces")
+
+
+def _size(draft: Draft) -> None:
+    """The whole shot a millimetre or kilometres large."""
+    stage = draft.open()
+    metres = draft.pick([1e-6, 1e-5, 3e-4, 1e-3, 1e2, 1e4, 1e6])
+    UsdGeom.SetStageMetersPerUnit(stage, metres)
+    draft.save(stage, f"{metres:g} m per unit")
+
+
+KINDS = (
+    Kind("odd: painted extremes", _paint, OWN),
+    Kind("odd: variants", _variants, OWN),
+    Kind("odd: large faces", _large_face, ("plain", "still", "bodies")),
+    Kind("odd: flat bodies", _flat_bodies, ("bodies",)),
+    Kind("odd: glitch frames", _glitch, ("plain", "bodies", "dressed", "several")),
+    Kind("odd: points at one place", _coincident, OWN),
+    Kind("odd: size of the shot", _size, OWN),
+)
