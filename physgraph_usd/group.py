@@ -28,7 +28,7 @@ from .forces.seam import SewnForces
 from .integrate.base import Integrator, System
 from .integrate.choice import Choice, choose
 from .integrate.metric import Metric
-from .integrate.saddle import facets, leave_saddle
+from .integrate.saddle import leave_saddle
 from .integrate.solve import Budget, LevelReport, solve_level
 from .level import Level, build_levels
 from .level_forces import LevelForces, blame, build_forces, named
@@ -305,13 +305,13 @@ class Group:
         anew = anew and predicted is not None and contact is not None and contact.crossed
         first = 0 if choice.nested or anew else last
         x = predicted if predicted is not None and not anew else self.levels[first].base.apply(coarse)
-        smooth = self.levels[first].smooth_base.apply(coarse)
+        below, smooth = coarse, self.levels[first].smooth_base
         reports: list[LevelReport] = []
         module = ForceModule(())
         for index in range(first, last + 1):
             level, lasting = self.levels[index], forces[index]
             if index > first and level.from_below is not None and level.smooth_from_below is not None:
-                x, smooth = level.from_below.apply(x), level.smooth_from_below.apply(x)
+                below, x, smooth = x, level.from_below.apply(x), level.smooth_from_below
             if index == last and anew and predicted is not None and contact is not None:
                 predicted = x = contact.mixed(predicted, x)
             module = lasting.module(coarse)
@@ -325,7 +325,7 @@ class Group:
                 alone,
                 level,
                 x=x,
-                smoothing=None if warm is not None else facets(level, x, smooth),
+                smoothing=None if warm is not None else lasting.without_facets(x, below, smooth),
                 start=start,
                 view=view,
                 budget=budget,

@@ -18,7 +18,9 @@ from .forces.stretch import PAPER_SPRING, garment_area
 from .forces.tether import Tether
 from .integrate.base import System
 from .integrate.metric import Metric, kept_to_edges
+from .integrate.saddle import facets
 from .level import Level
+from .mesh.stencil import Stencil
 from .scene import Garment, GarmentFrame
 
 
@@ -33,6 +35,7 @@ class LevelForces:
         guide: The guide, without a target.
         metric: The factorised rest Hessian of all of them.
         density: Areal density of each garment [kg/m^2].
+        bends: Whether any cloth resists bending.
     """
 
     level: Level
@@ -41,6 +44,13 @@ class LevelForces:
     guide: Guide
     metric: Metric
     density: Float[Tensor, " garments"]
+    bends: bool
+
+    def without_facets(
+        self, x: Float[Tensor, "vertices 3"], below: Float[Tensor, "coarse 3"], smooth: Stencil
+    ) -> Float[Tensor, "vertices 3"]:
+        """The move that takes a coarser mesh's facets out of x, as `facets` gives it [m]; none where nothing bends."""
+        return facets(self.level, x, below, smooth.apply) if self.bends else torch.zeros_like(x)
 
     def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
         """All terms of one frame, given its recentred coarse positions [m]."""
@@ -121,7 +131,7 @@ def build_forces(
     matrix = kept_to_edges(ForceModule((*elastic, *body, guide)).rest_matrix(), level.edges.cpu().numpy())
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
-    return LevelForces(level, elastic, body, guide, metric, density)
+    return LevelForces(level, elastic, body, guide, metric, density, any(fabric.bend > 0 for fabric in fabrics))
 
 
 def blame(

@@ -280,12 +280,10 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
         start = clock.perf_counter()
         writer.close()
         report.seconds["close"] = clock.perf_counter() - start
-        report.warnings += [str(notice) for notice in writer.notices] + _coarse_garments(report) + _passed(report)
-        report.warnings += _broken(report)
-        report.strict = options.strict
         report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
-        report.warnings += told_unsettled(report.unsettled)
+        report.warnings += [str(notice) for notice in writer.notices] + _of_frames(report)
         say_what_was(report)
+    report.strict = options.strict
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
@@ -328,6 +326,11 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
         report.write(path)
     else:
         write_folder(report, path, opened)
+
+
+def _of_frames(report: RefineReport) -> list[str]:
+    """What frames say that the user should know."""
+    return [*_coarse_garments(report), *_passed(report), *_broken(report), *told_unsettled(report.unsettled)]
 
 
 def _coarse_garments(report: RefineReport) -> list[str]:

@@ -109,9 +109,8 @@ def solve_touching(
     if finest:
         # From cold the rounds did not see sharp folds, which the next frame will.
         relaxing = (much or crowded(touched, x, PILED)) and (smoothing is not None or view.mended or view.crosses(x))
-        x, more = finish_rounds(
-            make_system, integrator, x, terms=touched, view=view, level=level, last=made[-1], budget=budget
-        )
+        given = {"view": view, "level": level, "last": made[-1], "budget": budget}
+        x, more = finish_rounds(make_system, integrator, x, terms=touched, **given)
         made += more
         if relaxing:
             most = RELAXATIONS if smoothing is not None else WARM_RELAXATIONS

@@ -25,11 +25,12 @@ FAR = np.array([1e5, -2e5, 3e5])
 def test_s11_turned_and_carried_far_away(seed: int, kind: str, dtype: torch.dtype, most: float):
     """A random rotation, and far away, rest shape too: recentred, so nothing is lost.
 
-    The number of steps is fixed: rounding may decide at which step the usual tolerance is met.
+    The number of steps is fixed: rounding may decide at which step the usual tolerance is met. They are few: from a
+    start without facets, which is far from rest, more of them let single precision's rounding grow past the bound.
     """
     mesh, rest = sheet(8, 6, EDGE, kind=kind)
     points, turn = wave(rest), rotation(seed)
-    options = {"level": 2, "dtype": dtype, "steps": 6, "tolerance": 0.0}
+    options = {"level": 2, "dtype": dtype, "steps": 3, "tolerance": 0.0}
     here = solved(mesh, rest, points, **options).points[0]
     turned = refiner_of([garment_of(mesh, rest @ turn.T + FAR)], gravity=turn @ DOWN, **options)
     there = turned.solve(frame_of(points @ turn.T + FAR)).points[0]
