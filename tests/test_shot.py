@@ -286,7 +286,7 @@ class TestOptions:
         plain = RefineOptions(level=1, steps=3, heat_map=True).plain()
         assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
             "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths", "resume",
-            "keep_frames",
+            "keep_frames", "strict",
         }  # fmt: skip
         assert json.loads(json.dumps(record, default=str))
 
@@ -345,7 +345,8 @@ def test_samples_refine(sample: Callable[[str], Path], tmp_path: Path, name: str
 
 def refined_sample(sample: Callable[[str], Path], folder: Path, name: str) -> np.ndarray:
     shot, out = sample(name), folder / f"{name}.usdc"
-    refine(shot, out, frames=(8.0, 8.0), temporal="off", level=1)
+    # More steps would let single precision's rounding grow past the bound, far from rest as starts without facets are.
+    refine(shot, out, frames=(8.0, 8.0), temporal="off", level=1, steps=3)
     return fine(shot, out, 8.0, prim=inspect_shot(shot)["garments"][0]["path"])
 
 
