@@ -286,7 +286,7 @@ class TestOptions:
         plain = RefineOptions(level=1, steps=3, heat_map=True).plain()
         assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
             "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths", "resume",
-            "keep_frames",
+            "keep_frames", "strict",
         }  # fmt: skip
         assert json.loads(json.dumps(record, default=str))
 
