@@ -380,11 +380,11 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
 
     made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
     try:
-        for folder in reversed(made):
-            folder.mkdir()
-    except OSError as error:
-        raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
-    try:
+        try:
+            for folder in reversed(made):
+                folder.mkdir()
+        except OSError as error:
+            raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
         yield
     finally:
         for kept in filter(Path.is_dir, map(frames_folder, layers)):
