@@ -88,7 +88,7 @@ def solve_touching(
     x, made, touched = untangle(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
     start = x
     if smoothing is not None:
-        x = view.uncrossed(view.closed(x + _away(smoothing, touched, level)), x) if level.index else x
+        x = view.uncrossed(view.closed(x + smoothing), x) if level.index else x
         x = view.closed(leave_saddle(make_system(touched, x), level, x, outward=outward))
     # Much cloth on cloth settles slowly, and in a held pose one sees it settle.
     much = finest and crowded(touched, x)
@@ -117,12 +117,6 @@ def solve_touching(
             x, more = relax(make_system, integrator, x, view=view, level=level.index, budget=budget, most=most)
             made += more
     return x, made, touched
-
-
-def _away(smoothing: Tensor, touched: Sequence[Touch], level: Level) -> Tensor:
-    """A smoothing move but where cloth is near cloth: linear positions cross nothing there, smooth ones might."""
-    near = [term.near(level) for term in touched if isinstance(term, SelfContact)]
-    return smoothing * ~torch.stack(near).any(dim=0) if near else smoothing
 
 
 def untangle(

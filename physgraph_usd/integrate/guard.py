@@ -56,8 +56,10 @@ class Guard:
         if math.isfinite(proposed.energy) and proposed.energy <= carry.energy:
             return proposed
         corrected = replace(self._corrected(system, carry, proposed), setbacks=carry.setbacks + 1)
+        if corrected.mover == "stayed" and self._spare is not None:  # It may know a way where H0^-1 F leads nowhere.
+            return replace(self._spare.step(system, self._spare.start(system, carry.x)), setbacks=PATIENCE)
         spare = self._spare_of(corrected)
-        if spare is None or corrected.mover == "stayed":
+        if spare is None:
             return corrected
         handed = spare.start(system, corrected.x)
         return replace(handed, mover=corrected.mover, setbacks=corrected.setbacks)

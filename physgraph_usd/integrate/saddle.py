@@ -29,10 +29,6 @@ AMPLITUDE = 0.3
 LEAST_COMPRESSION = 1e-3
 """Compression that cloth takes in its plane."""
 TRIES = 4
-ROUND = 0.75
-"""Part of what a smooth map takes from a bend that the vertices it starts from are moved out by before: of a polygon
-round a circle, theta its angle, the map makes a curve theta^2 / 8 shorter, and moved out wholly one through
-the corners that is theta^2 / 24 longer. In between nothing is stretched."""
 
 
 def facets(
@@ -45,13 +41,12 @@ def facets(
 
     Args:
         level: The level.
-        x: Where a linear map put its vertices [m]; those of the coarser mesh come first.
+        x: Where a linear map put its vertices [m].
         coarse: Vertices of that mesh [m].
         smooth: The smooth map from there.
     """
-    placed = smooth(coarse + ROUND * (coarse - smooth(coarse)[: len(coarse)]))
     normal = _normals(level, x)
-    return ((placed - x) * normal).sum(dim=1, keepdim=True) * normal * level.free
+    return ((smooth(coarse) - x) * normal).sum(dim=1, keepdim=True) * normal * level.free
 
 
 def leave_saddle(

@@ -58,10 +58,13 @@ def reversed_faces(mesh: PolygonMesh) -> PolygonMesh:
 
 @pytest.mark.parametrize("kind", ["triangles", "quads", "mixed"])
 def test_s6_winding_does_not_matter(kind: str):
-    """Both the winding and the mirror image of the cloth give the mirrored answer; vertex numbers agree at level 1."""
+    """Both the winding and the mirror image of the cloth give the mirrored answer; vertex numbers agree at level 1.
+
+    After few steps: many end in one or another of several minima, by rounding.
+    """
     mesh, rest = sheet(6, 4, EDGE, kind=kind)
     points = wave(rest, height=0.02)
-    options = {"level": 1, "steps": 60, "tolerance": 1e-10, "integrator": "newton"}
+    options = {"level": 1, "steps": 3, "tolerance": 0.0, "integrator": "quasi-newton"}
     one = solved(mesh, rest, points, **options).points[0]
     other = replace(garment_of(reversed_faces(mesh), rest), flipped=True)
     two = refiner_of([other], **options).solve(frame_of(points)).points[0]
