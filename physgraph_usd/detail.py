@@ -52,18 +52,22 @@ class Carried:
         detail: Fine positions minus the smooth base [m], shape (V, 3).
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
         held: For how many frames the pose had been held.
+        fine: Fine positions [m], world space, float64, where cloth walks from frame to frame; else None.
     """
 
     coarse: Float[Tensor, "coarse 3"]
     detail: Float[Tensor, "vertices 3"]
     frames: Float[Tensor, "coarse 3 3"]
     held: int = 0
+    fine: Float[Tensor, "vertices 3"] | None = None
 
 
 def join(parts: Sequence[Carried]) -> Carried:
     """What several garments carry, as one."""
     whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
-    return Carried(*whole, held=min(part.held for part in parts))
+    fine = [part.fine for part in parts if part.fine is not None]
+    walked = torch.cat(fine) if len(fine) == len(parts) else None
+    return Carried(*whole, held=min(part.held for part in parts), fine=walked)
 
 
 def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> list[Carried]:
@@ -75,7 +79,8 @@ def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> l
         fine: Fine vertices of each garment.
     """
     pairs = zip(coarse, fine, strict=True)
-    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c], carried.held) for c, f in pairs]
+    own = lambda f: None if carried.fine is None else carried.fine[f]  # noqa: E731
+    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c], carried.held, own(f)) for c, f in pairs]
 
 
 @dataclass(frozen=True, eq=False)

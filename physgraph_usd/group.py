@@ -17,6 +17,7 @@ from .attempts import TORN, best_of
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
+from .contact.promised import solve_promised
 from .contact.rounds import solve_rounds, solve_touching
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
@@ -111,6 +112,8 @@ class Group:
             SolveError: A term of the potential is not finite.
         """
         settings, attempt = self._settings, partial(self._attempt, frames, at, touching, moved)
+        if settings.contact.promise:
+            return attempt(kept)[0]
         return best_of(attempt, kept, counts=settings.contact.cloth != "off", again=settings.budget_ms is None)
 
     def _attempt(
@@ -132,7 +135,10 @@ class Group:
         aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            x, reports, module, told = self._descend(forces, aim, start, clock, contact=contact, anew=anew)
+            before = None if kept is None or kept.fine is None else kept.fine - torch.as_tensor(origin).to(kept.fine)
+            x, reports, module, told = self._descend(
+                forces, aim, start, clock, contact=contact, anew=anew, before=before
+            )
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         result = self._scaled(aim, x, frames, at=at)
@@ -143,6 +149,8 @@ class Group:
             x = x if scaled else start_next
         solved = time.perf_counter()
         carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world), held=start.held)
+        if self._settings.contact.promise:
+            carried = replace(carried, fine=x.double() + torch.as_tensor(origin).to(x.device))
         strain = edge_strain(self.levels[-1], result)
         telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start.why} | told
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
@@ -298,6 +306,7 @@ class Group:
         *,
         contact: FrameContact | None,
         anew: bool,
+        before: Tensor | None = None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
         """Walk the levels; a warm start goes to the finest, unless what crosses starts anew. Also says why."""
         predicted, last = start.detailed, len(self.levels) - 1
@@ -320,6 +329,8 @@ class Group:
             tie = None if warm is None or self._settings.temporal != "tether" else (pull, warm)
             budget = self._settings.budget(last - index, clock, more=choice.steps, warm=warm is not None)
             view = None if contact is None else contact.at(level)
+            if view is not None and view.promise is not None and warm is not None and before is not None:
+                x = view.moved(before, warm)
             alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
             x, made, touched = self._solve_level(
                 alone,
@@ -401,6 +412,9 @@ class Group:
             return solve_rounds(
                 system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, rounds=1
             )
+        if view.promise is not None:
+            own = {"smoothing": smoothing, "outward": self._outward}
+            return solve_promised(system, integrator, x, view=view, level=level, **own, budget=budget)
         given = {"finest": level is self.levels[-1], "smoothing": smoothing, "outward": self._outward}
         return solve_touching(system, integrator, x, view=view, level=level, **given, still=start.still, budget=budget)
 

@@ -12,16 +12,17 @@ from folds import EDGE, SHAPES, crumpled, folded, levels_of, named, placed, squa
 from scipy.sparse import csgraph
 
 from physgraph_usd.contact import cloth
-from physgraph_usd.contact.cloth_mesh import ClothMesh, Crossings, _adjacency, _owned_sides
-from physgraph_usd.contact.clusters import ClusteredParts
+from physgraph_usd.contact.cloth_mesh import ClothMesh, Crossings
+from physgraph_usd.collide.clusters import ClusteredParts
 from physgraph_usd.level import Level
+from physgraph_usd.mesh.topology import adjacency, owned_sides
 
 ALL = np.ones((2, 2), bool)
 
 
 def parts_of(level: Level) -> ClusteredParts:
     edges, triangles = level.edges.numpy(), level.triangles.numpy()
-    return ClusteredParts(level, _adjacency(edges, level.vertex_count), _owned_sides(edges, triangles), meets=ALL)
+    return ClusteredParts(level, adjacency(edges, level.vertex_count), owned_sides(edges, triangles), meets=ALL)
 
 
 def listed(found: Crossings) -> set[tuple[int, int]]:
@@ -47,7 +48,7 @@ class TestClusters:
         level = levels_of(named(square(3), "A"), named(square(4), "B"))[-1]
         parts = parts_of(level)
         first, vertices = (np.asarray(each.numpy(), dtype=np.int64) for each in parts.vertices)
-        beside = _adjacency(level.edges.numpy(), level.vertex_count)
+        beside = adjacency(level.edges.numpy(), level.vertex_count)
         for a, b in pairwise(first):
             own = vertices[a:b]
             assert len(set(level.vertex_garment.numpy()[own].tolist())) == 1

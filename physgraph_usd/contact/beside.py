@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from .cluster_kernels import has
+from ..collide.cluster_kernels import has
 
 wp.set_module_options({"enable_backward": False})
 

@@ -19,7 +19,9 @@ from torch import Tensor
 
 from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact, Spheres
+from ..collide.parts import Parts
 from ..level import Level
+from ..mesh.topology import joined_by
 from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh, Crossings
@@ -94,6 +96,14 @@ class ClothContact:
         self.order, self.outward = (torch.tensor(each, dtype=dtype, device=device) for each in (order, outward))
         self._meshes: dict[int, ClothMesh] = {}
         self._regions: dict[int, Regions] = {}
+        self._parts: dict[tuple[int, bytes], Parts] = {}
+
+    def parts(self, level: Level, sewn: np.ndarray) -> Parts:
+        """What may touch what at a level, sewn at pairs of vertices."""
+        key = level.index, sewn.tobytes()
+        if key not in self._parts:
+            self._parts[key] = Parts(level, self.meets, joined_by(sewn, level.vertex_count) if len(sewn) else None)
+        return self._parts[key]
 
     def mesh(self, level: Level) -> ClothMesh:
         """The hierarchy of a level."""
@@ -224,7 +234,7 @@ class ClothView:
             return self._spheres(x)
         pairs, crossings = self._near(x, keep_pairs=keep_pairs)
         self.tangled = crossings.count > 0
-        if self._sides is None or self.tangled:
+        if self._sides is None or self.tangled or self._settings.promise:
             self._sides = x
         if pairs is None:
             return None
@@ -268,7 +278,7 @@ class ClothView:
         if not bool(busy.any()):
             self._found = None
             return None, none
-        again = self._sides is None or self.tangled or self.before.crossings.count > 0
+        again = self._settings.promise or self._sides is None or self.tangled or self.before.crossings.count > 0
         crossings = self.look(x).crossings if again else none
         self._mesh.move(x)
         before = None if known is None or part > MOST else known.nearest

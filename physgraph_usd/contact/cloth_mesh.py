@@ -17,11 +17,11 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.lanes import Launch
-from ..mesh.topology import find_edges, joined_by
+from ..mesh.topology import adjacency, find_edges, joined_by, owned_sides
 from .again import found_again
 from .beside import add_neighbours, beside_table
-from .cluster_kernels import clusters_beside, pierced
-from .clusters import ClusteredParts
+from ..collide.cluster_kernels import clusters_beside, pierced
+from ..collide.clusters import ClusteredParts
 from .folds import in_sharp_folds
 from .nearest import Nearest, Pairs
 from .proximity import edges_near, faces_near, vertex_normals
@@ -92,12 +92,12 @@ class ClothMesh:
         self.level = level
         wp.init()
         edges, triangles = (each.cpu().numpy() for each in (level.edges, level.triangles))
-        self.beside = _adjacency(edges, level.vertex_count)
+        self.beside = adjacency(edges, level.vertex_count)
         self._garments = len(level.spans)
         self._position = level.rest.to(torch.float32).contiguous().clone()
         self._normal = torch.zeros_like(self._position)
         self.triangles = level.triangles.long()
-        self._clusters = ClusteredParts(level, self.beside, _owned_sides(edges, triangles), meets=meets)
+        self._clusters = ClusteredParts(level, self.beside, owned_sides(edges, triangles), meets=meets)
         self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
         self._rest = level.rest.to(torch.float32).contiguous()
         self._apart, self.sewn = self.beside, np.zeros((0, 2), np.int64)
@@ -361,22 +361,6 @@ class ClothMesh:
         """What both proximity kernels are told of the positions."""
         moving = [_vectors(self._position), _flags(asked), wp.from_torch(reach), _vectors(self._normal)]
         return [*moving, _vectors(self._rest)]
-
-
-def _adjacency(edges: np.ndarray, count: int) -> sp.csr_matrix:
-    """Which vertices an edge joins."""
-    both = np.concatenate([edges, edges[:, ::-1]])
-    return sp.csr_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count))
-
-
-def _owned_sides(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The edges that each face owns, shape (T, 3): each edge once, -1 elsewhere."""
-    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    edge = find_edges(edges, sides)
-    owned = np.full(len(sides), -1, np.int32)
-    kept = np.unique(edge, return_index=True)[1]
-    owned[kept] = edge[kept]
-    return owned.reshape(-1, 3)
 
 
 def _opposite(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -21,6 +22,7 @@ from .cloth_mesh import ClothMesh
 from .last_resort import FIRST, returned, taken_back
 from .mend import smoothed
 from .metric import HeldMetric
+from .promise import Promise
 from .repair import repaired_cage
 from .seams import Seams
 from .settings import ContactSettings
@@ -35,6 +37,9 @@ HOLDS = 6
 MIXED = 4
 """Rings round what crosses in a warm start that start from the coarse levels instead; it fades over as many more."""
 SMOOTHINGS = 8
+FLOOR = 0.06
+"""Of the thickness: gaps under it shrink by a tenth a move at most."""
+PUSHES = 4
 """Passes that smooth wrinkles of cloth between overlapping parts."""
 Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
@@ -57,6 +62,7 @@ class LevelContact:
     rounds: int
     seam: Seam | None = None
     mended: bool = False
+    promise: Promise | None = None
     _held: HeldMetric | None = None
 
     def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric | HeldMetric:
@@ -98,6 +104,11 @@ class LevelContact:
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with their seams closed [m]."""
         return x if self.seam is None else self.seam.closed(x)
+
+    def moved(self, x: Tensor, wanted: Tensor) -> Tensor:
+        """Positions as near to wanted ones as is safe [m], seams closed."""
+        wanted = self.closed(wanted)
+        return wanted if self.promise is None else self.promise.move(x, wanted)
 
     def uncrossed(
         self, x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"]
@@ -187,7 +198,11 @@ class FrameContact:
                 bodies.lose(base)
             if cloth is not None and level is self._levels[-1] and self._judge is not None:
                 cloth.allowed = self._judge.before
-            self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam)
+            promise = None
+            if cloth is not None and self._settings.promise and self._cloth is not None:
+                sewn = np.zeros((0, 2), np.int64) if seam is None else seam.pairs
+                promise = Promise(self._cloth.parts(level, sewn), FLOOR * float(self._thickness.min()), cloth)
+            self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam, promise=promise)
         return self._views[level.index]
 
     @property
@@ -235,6 +250,8 @@ class FrameContact:
             starts: it is where forces rest, so that equal frames stay equal; and what had to move.
         """
         view = self.at(self._levels[-1])
+        if view.promise is not None:
+            return self._pushed(view, x)
         moved: dict[str, object] = {}
         if self.aim is not self._coarse:
             shift = (self.aim - self._coarse).norm(dim=1)
@@ -243,6 +260,21 @@ class FrameContact:
         if view.bodies is not None:
             moved["projected"] = moves(mended, x, passes)
         return x, mended, moved
+
+    def _pushed(self, view: LevelContact, solved: Tensor) -> tuple[Tensor, Tensor, dict[str, object]]:
+        """Cloth moved safely out of bodies."""
+        bodies, x, passes = view.bodies, solved, 0
+        moved: dict[str, object] = {}
+        if bodies is not None:
+            self._hold(bodies, None)
+            for _ in range(PUSHES):
+                out, more = bodies.project(x)
+                passes += more
+                x = view.moved(x, out)
+                if x is out:
+                    break
+            moved["projected"] = moves(solved, x, passes)
+        return x, solved, moved
 
     def _mended(self, view: LevelContact, solved: Tensor) -> tuple[Tensor, Tensor, int]:
         """Cloth before and after bodies pushed what was mended, and their passes."""

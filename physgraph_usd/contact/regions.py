@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..level import Level
-from .cluster_kernels import clusters_meet
-from .clusters import Clusters
+from ..collide.cluster_kernels import clusters_meet
+from ..collide.clusters import Clusters
 
 
 class Regions:

@@ -25,6 +25,7 @@ class ContactSettings:
         way_out: How far vertices that get between overlapping parts of a body are pushed out at most, in the cage's
             mean edges. What the input has there stays.
         measured: Whether what is off is measured all the same.
+        promise: Whether cloth moves safely, from where it was, in place of being mended.
     """
 
     form: str = "quadratic"
@@ -39,6 +40,7 @@ class ContactSettings:
     lifts: int = 40
     way_out: float = 0.5
     measured: bool = False
+    promise: bool = False
 
     @property
     def sees_bodies(self) -> bool:

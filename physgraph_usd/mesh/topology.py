@@ -308,3 +308,19 @@ def patches_with(edges: np.ndarray, some: np.ndarray, seeds: np.ndarray) -> np.n
     """Of some vertices the patches, held together by the edges, that have a seed in them, shape (V,)."""
     patch = joined_by(edges[some[edges].all(axis=1)], len(some))
     return some & np.isin(patch, patch[some & seeds])
+
+
+def adjacency(edges: np.ndarray, count: int) -> sparse.csr_matrix:
+    """Which vertices an edge joins."""
+    both = np.concatenate([edges, edges[:, ::-1]])
+    return sparse.csr_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count))
+
+
+def owned_sides(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The edges that each face owns, shape (T, 3): each edge once, -1 elsewhere."""
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edge = find_edges(edges, sides)
+    owned = np.full(len(sides), -1, np.int32)
+    kept = np.unique(edge, return_index=True)[1]
+    owned[kept] = edge[kept]
+    return owned.reshape(-1, 3)

@@ -57,6 +57,7 @@ class Clusters:
         self.face_boxes, self._boxes = self._vectors(len(triangles), 2), self._vectors(count, 2)
         garment = np.zeros(count, np.int32)
         garment[cluster] = level.vertex_garment.cpu().numpy()
+        self.garment = self._array(garment)
         rings = _rings(cluster[level.edges.cpu().numpy()], count)
         ring = [self._array(rings.indptr), self._array(rings.indices)]
         normal, total = self._vectors(len(triangles), 1), self._vectors(count, 1)
@@ -77,7 +78,7 @@ class Clusters:
         self._shared = [
             self._tree.id,
             *self._boxes,
-            self._array(garment),
+            self.garment,
             *ring,
             turns,
             around,

@@ -1,0 +1,80 @@
+"""A level's vertices, edges and faces in clusters, as kernels read them: what can meet what, and which are one."""
+
+# Warp's structs are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportAttributeAccessIssue=false
+from __future__ import annotations
+
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Int
+from torch import Tensor
+
+from ..level import Level
+from ..mesh.topology import adjacency, owned_sides
+from .clusters import ClusteredParts
+
+
+@wp.struct
+class Topology:
+    """What moves, by cluster; corners are all the vertices of a cluster's parts, each once."""
+
+    first_corner: wp.array(dtype=wp.int32)
+    corners: wp.array(dtype=wp.int32)
+    first_vertex: wp.array(dtype=wp.int32)
+    vertices: wp.array(dtype=wp.int32)
+    first_edge: wp.array(dtype=wp.int32)
+    edges: wp.array(dtype=wp.vec2i)
+    first_face: wp.array(dtype=wp.int32)
+    faces: wp.array(dtype=wp.vec3i)
+    garment: wp.array(dtype=wp.int32)
+    meets: wp.array(dtype=wp.int32)
+    garments: wp.int32
+    label: wp.array(dtype=wp.int32)
+
+
+class Parts:
+    """The vertices, edges and faces of a level that can come near one another.
+
+    Attributes:
+        level: The level.
+        count: Number of clusters.
+        topology: What kernels read.
+    """
+
+    def __init__(self, level: Level, meets: np.ndarray, label: Int[np.ndarray, " vertices"] | None = None) -> None:
+        """Gather the clusters.
+
+        Args:
+            level: The level.
+            meets: Which garments feel which, symmetric, shape (G, G), bool.
+            label: Vertices of one label are sewn together, or one; each its own where None, shape (V,).
+        """
+        self.level = level
+        edges, triangles = (each.cpu().numpy() for each in (level.edges, level.triangles))
+        clusters = ClusteredParts(
+            level, adjacency(edges, level.vertex_count), owned_sides(edges, triangles), meets=meets
+        )
+        self.count = clusters.count
+        table = self.topology = Topology()
+        table.first_vertex, table.vertices = clusters.vertices
+        table.first_edge, table.edges = clusters.edges[:2]
+        table.first_face, table.faces = clusters.faces[:2]
+        table.first_corner, table.corners = (self._array(each) for each in _corners(clusters))
+        table.garment, table.garments = clusters.garment, len(meets)
+        table.meets = self._array(np.asarray(meets).ravel())
+        table.label = self._array(np.arange(level.vertex_count) if label is None else label)
+
+    def _array(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=self.level.device)
+
+
+def _corners(clusters: ClusteredParts) -> tuple[np.ndarray, np.ndarray]:
+    """The first corner of each cluster, and the vertices of its parts, each once."""
+    owned = [
+        np.stack([np.repeat(np.arange(clusters.count), np.diff(first.numpy())), vertex], axis=1)
+        for first, parts in (clusters.vertices, clusters.edges[:2], clusters.faces[:2])
+        for vertex in parts.numpy().reshape(len(parts), -1).T
+    ]
+    cluster, vertex = np.unique(np.concatenate(owned), axis=0).T
+    return np.searchsorted(cluster, np.arange(clusters.count + 1)), vertex

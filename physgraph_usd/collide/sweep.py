@@ -1,0 +1,269 @@
+"""What would touch where all vertices move along straight lines: every pair of parts, and how far it may go."""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..mesh.lanes import LEAST_QUERIES, Launch
+from .impact import impact_of
+from .parts import Parts, Topology
+
+wp.set_module_options({"enable_backward": False})
+
+FAR = wp.constant(wp.float64(1.0e30))
+"""Corner of a box that holds nothing."""
+ROUNDING = wp.constant(wp.float64(2.4e-7))
+"""What boxes in single precision are widened by, of their corners' distance from the origin."""
+
+
+@wp.struct
+class Motion:
+    """Where vertices are, how far they want to go, and which pairs are asked."""
+
+    start: wp.array(dtype=wp.vec3d)
+    way: wp.array(dtype=wp.vec3d)
+    asked: wp.array(dtype=wp.bool)
+    exempt: wp.array(dtype=wp.bool)
+    share: wp.float64
+    floor: wp.float64
+
+
+@wp.struct
+class Sweep:
+    """Of each cluster: the box that its parts sweep, the box where they start, their mean way, how far parts leave it."""
+
+    low: wp.array(dtype=wp.vec3f)
+    high: wp.array(dtype=wp.vec3f)
+    from_low: wp.array(dtype=wp.vec3d)
+    from_high: wp.array(dtype=wp.vec3d)
+    mean: wp.array(dtype=wp.vec3d)
+    spread: wp.array(dtype=wp.float64)
+    asked: wp.array(dtype=wp.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class Impacts:
+    """Pairs of parts that would come too near on their way.
+
+    Attributes:
+        corners: A vertex and a face, or two edges, shape (N, 4).
+        time: Part of their way that they may go, in (0, 1), shape (N,).
+    """
+
+    corners: Int[Tensor, "pairs 4"]
+    time: Float[Tensor, " pairs"]
+
+
+@wp.func
+def single(v: wp.vec3d):
+    """The same in single precision."""
+    return wp.vec3f(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
+
+
+@wp.kernel
+def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
+    """The boxes of a cluster's corners, where they start and all along, and how they move."""
+    i = first + wp.tid()
+    least, most = wp.vec3d(FAR), wp.vec3d(-FAR)
+    lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
+    total, asked = wp.vec3d(), wp.int32(0)
+    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
+    for k in range(begin, end):
+        v = parts.corners[k]
+        at, way = motion.start[v], motion.way[v]
+        least, most = wp.min(least, at), wp.max(most, at)
+        lowest, highest = wp.min(lowest, wp.min(at, at + way)), wp.max(highest, wp.max(at, at + way))
+        total += way
+        if motion.asked[v]:
+            asked = 1
+    mean = total / wp.float64(wp.max(end - begin, 1))
+    spread = wp.float64(0.0)
+    for k in range(begin, end):
+        spread = wp.max(spread, wp.length(motion.way[parts.corners[k]] - mean))
+    slack = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest))
+    sweep.low[i] = single(lowest - slack)
+    sweep.high[i] = single(highest + slack)
+    sweep.from_low[i] = least
+    sweep.from_high[i] = most
+    sweep.mean[i] = mean
+    sweep.spread[i] = spread
+    sweep.asked[i] = asked
+
+
+@wp.func
+def outside(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.vec3d, reach: wp.float64):
+    """Whether two boxes are farther apart than a reach along an axis."""
+    for axis in range(3):
+        if low[axis] > other_high[axis] + reach or other_low[axis] > high[axis] + reach:
+            return True
+    return False
+
+
+@wp.func
+def is_one(parts: Topology, a: wp.int32, b: wp.int32):
+    """Whether two vertices are one, or sewn together."""
+    return parts.label[a] == parts.label[b]
+
+
+@wp.func
+def time_of(face: wp.bool, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32, parts: Topology, motion: Motion):
+    """Part of their ways that a vertex and a face, or two edges, may go; 1 where they are not to be asked."""
+    none = wp.float64(1.0)
+    if not (motion.asked[a] or motion.asked[b] or motion.asked[c] or motion.asked[d]):
+        return none
+    if motion.exempt[a] or motion.exempt[b] or motion.exempt[c] or motion.exempt[d]:
+        return none
+    if is_one(parts, a, c) or is_one(parts, a, d) or is_one(parts, b, wp.where(face, a, c)):
+        return none
+    if not face and is_one(parts, b, d):
+        return none
+    u, v, p, q = motion.way[a], motion.way[b], motion.way[c], motion.way[d]
+    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
+    # The boxes of the two where they start, grown by how much nearer they can come.
+    if face:
+        reach = wp.max(wp.length(v - u), wp.max(wp.length(p - u), wp.length(q - u)))
+        if outside(x, x, wp.min(y, wp.min(z, w)), wp.max(y, wp.max(z, w)), reach):
+            return none
+    else:
+        reach = wp.max(
+            wp.max(wp.length(p - u), wp.length(q - u)), wp.max(wp.length(p - v), wp.length(q - v))
+        )
+        if outside(wp.min(x, y), wp.max(x, y), wp.min(z, w), wp.max(z, w), reach):
+            return none
+    return impact_of(face, x, y, z, w, u, v, p, q, motion.share, motion.floor)
+
+
+@wp.kernel
+def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
+    first: wp.int32,
+    tree: wp.uint64,
+    parts: Topology,
+    motion: Motion,
+    sweep: Sweep,
+    begin: wp.array(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+    corners: wp.array(dtype=wp.vec4i),
+    time: wp.array(dtype=wp.float64),
+):
+    """Count the impacts of a cluster's vertices with faces, and of its edges with those of no lower cluster.
+
+    They are written from where a cluster's begin, so far as there is room.
+    """
+    i = first + wp.tid()
+    room = begin[i + 1] - begin[i]
+    if room == 0 and begin[parts.first_vertex.shape[0] - 1] > 0:
+        return
+    found, one = wp.int32(0), wp.float64(1.0)
+    if sweep.low[i][0] > sweep.high[i][0]:
+        return
+    query = wp.bvh_query_aabb(tree, sweep.low[i], sweep.high[i])
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
+            continue
+        if sweep.asked[i] == 0 and sweep.asked[j] == 0:
+            continue
+        reach = wp.length(sweep.mean[i] - sweep.mean[j]) + sweep.spread[i] + sweep.spread[j]
+        if outside(sweep.from_low[i], sweep.from_high[i], sweep.from_low[j], sweep.from_high[j], reach):
+            continue
+        for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
+            v = parts.vertices[k]
+            at = motion.start[v]
+            if outside(at, at, sweep.from_low[j], sweep.from_high[j], reach):
+                continue
+            for m in range(parts.first_face[j], parts.first_face[j + 1]):
+                t = parts.faces[m]
+                part = time_of(True, v, t[0], t[1], t[2], parts, motion)
+                if part < one:
+                    if found < room:
+                        corners[begin[i] + found] = wp.vec4i(v, t[0], t[1], t[2])
+                        time[begin[i] + found] = part
+                    found += 1
+        if j < i:
+            continue
+        for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
+            e = parts.edges[k]
+            near, far = motion.start[e[0]], motion.start[e[1]]
+            if outside(wp.min(near, far), wp.max(near, far), sweep.from_low[j], sweep.from_high[j], reach):
+                continue
+            begin_of = wp.where(i == j, k + 1, parts.first_edge[j])
+            for m in range(begin_of, parts.first_edge[j + 1]):
+                f = parts.edges[m]
+                part = time_of(False, e[0], e[1], f[0], f[1], parts, motion)
+                if part < one:
+                    if found < room:
+                        corners[begin[i] + found] = wp.vec4i(e[0], e[1], f[0], f[1])
+                        time[begin[i] + found] = part
+                    found += 1
+    count[i] = found
+
+
+def impacts(
+    parts: Parts,
+    start: Float[Tensor, "vertices 3"],
+    way: Float[Tensor, "vertices 3"],
+    *,
+    share: float,
+    floor: float,
+    asked: Bool[Tensor, " vertices"],
+    exempt: Bool[Tensor, " vertices"],
+) -> Impacts:
+    """Every pair of parts that would come too near while vertices move.
+
+    Args:
+        parts: The parts.
+        start: Positions [m], float64.
+        way: How far each vertex goes [m], float64.
+        share: Part of their distance that pairs keep at least.
+        floor: Distance under which they keep nine tenths of it [m].
+        asked: Only pairs with one of these vertices are asked.
+        exempt: No pair with one of these is.
+    """
+    size, device = parts.count, str(start.device)
+    given = {"device": device, "lanes": parts.level.lanes, "least": LEAST_QUERIES}
+    middle = start.mean(dim=0) if len(start) else start.new_zeros(3)
+    motion, sweep = Motion(), _boxes(size, device)
+    motion.start, motion.way = _vectors(start - middle), _vectors(way)
+    motion.asked, motion.exempt = wp.from_torch(asked.contiguous()), wp.from_torch(exempt.contiguous())
+    motion.share, motion.floor = share, floor
+    Launch(sweep_boxes, size, [parts.topology, motion, sweep], **given)({})
+    tree = wp.Bvh(sweep.low, sweep.high)
+    count = torch.zeros(size, dtype=torch.int32, device=device)
+    begin = torch.zeros(size + 1, dtype=torch.int32, device=device)
+    out = Impacts(begin.new_zeros((0, 4)), start.new_zeros(0))
+    for _ in range(2):
+        arrays = [wp.from_torch(begin), wp.from_torch(count), _corners(out.corners), wp.from_torch(out.time)]
+        Launch(impacts_of, size, [tree.id, parts.topology, motion, sweep, *arrays], **given)({})
+        begin[1:] = count.cumsum(dim=0)
+        total = int(begin[-1])
+        if not total:
+            break
+        out = Impacts(begin.new_zeros((total, 4)), start.new_ones(total)) if not len(out.time) else out
+    return out
+
+
+def _boxes(size: int, device: str) -> Sweep:
+    """Room for what is known of clusters."""
+    sweep = Sweep()
+    for name in ("low", "high"):
+        setattr(sweep, name, wp.zeros(size, dtype=wp.vec3f, device=device))
+        setattr(sweep, f"from_{name}", wp.zeros(size, dtype=wp.vec3d, device=device))
+    sweep.mean = wp.zeros(size, dtype=wp.vec3d, device=device)
+    sweep.spread = wp.zeros(size, dtype=wp.float64, device=device)
+    sweep.asked = wp.zeros(size, dtype=wp.int32, device=device)
+    return sweep
+
+
+def _vectors(tensor: Tensor) -> wp.array:
+    return wp.from_torch(tensor.contiguous(), dtype=wp.vec3d)
+
+
+def _corners(tensor: Tensor) -> wp.array:
+    return wp.from_torch(tensor, dtype=wp.vec4i)

@@ -1,0 +1,54 @@
+"""Moves of one level's cloth in one frame that make nothing cross."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..collide.parts import Parts
+from .cloth import ClothView
+from .safe_move import safe_move
+
+GOES = 3
+"""How often a move is taken up again where something was in the way: what was in the way may have gone."""
+TANGLED = 2
+"""Rings round what crosses at the start to which nothing is promised but that no more crosses."""
+
+
+@dataclass(frozen=True, eq=False)
+class Promise:
+    """Moves of one level's cloth in one frame that make nothing cross.
+
+    Attributes:
+        parts: What may touch what.
+        floor: As `safe_move` takes it [m].
+        view: The level's cloth.
+    """
+
+    parts: Parts
+    floor: float
+    view: ClothView
+
+    def move(self, start: Float[Tensor, "vertices 3"], wanted: Float[Tensor, "vertices 3"]) -> Tensor:
+        """Positions as near to what is wanted as is safe [m], ``wanted`` itself where nothing is in the way.
+
+        Round what crosses at the start cloth may pass through itself, so long as no more crosses after that.
+        """
+        crossed = self.view.look(start.to(wanted)).crossings
+        if not crossed.count:
+            return self._go(start, wanted, None)
+        x = self._go(start, wanted, self.view.round_crossings(start.to(wanted), rings=TANGLED))
+        return x if self.view.look(x).crossings.count <= crossed.count else self._go(start, wanted, None)
+
+    def _go(self, start: Tensor, wanted: Tensor, exempt: Bool[Tensor, " vertices"] | None) -> Tensor:
+        """The same, with nothing promised to some vertices."""
+        x, left = start, len(start) + 1
+        for _ in range(GOES):
+            moved = safe_move(x, wanted, self.parts, floor=self.floor, exempt=exempt)
+            x, short = moved.x, int(moved.short.sum())
+            if not short or short >= left:
+                break
+            left = short
+        return x
