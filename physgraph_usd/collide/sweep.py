@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -113,40 +114,50 @@ def is_one(parts: Topology, a: wp.int32, b: wp.int32):
 
 
 @wp.func
-def time_of(face: wp.bool, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32, parts: Topology, motion: Motion):
-    """Part of their ways that a vertex and a face, or two edges, may go; 1 where they are not to be asked."""
+def time_of(
+    face: wp.bool,
+    a: wp.int32,
+    b: wp.int32,
+    c: wp.int32,
+    d: wp.int32,
+    parts: Topology,
+    motion: Motion,
+    reach: wp.float64,
+):
+    """Part of their ways that a vertex and a face, or two edges, may go; 1 where they are not to be asked.
+
+    They are refused first where their boxes at the start are farther apart than a reach, the cheapest thing to see.
+    """
     none = wp.float64(1.0)
-    if not (motion.asked[a] or motion.asked[b] or motion.asked[c] or motion.asked[d]):
-        return none
-    if motion.exempt[a] or motion.exempt[b] or motion.exempt[c] or motion.exempt[d]:
+    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
+    low, high = wp.min(z, w), wp.max(z, w)
+    if face:
+        low, high = wp.min(y, low), wp.max(y, high)
+        if outside(x, x, low, high, reach):
+            return none
+    elif outside(wp.min(x, y), wp.max(x, y), low, high, reach):
         return none
     if is_one(parts, a, c) or is_one(parts, a, d) or is_one(parts, b, wp.where(face, a, c)):
         return none
     if not face and is_one(parts, b, d):
         return none
+    if not (motion.asked[a] or motion.asked[b] or motion.asked[c] or motion.asked[d]):
+        return none
+    if motion.exempt[a] or motion.exempt[b] or motion.exempt[c] or motion.exempt[d]:
+        return none
     u, v, p, q = motion.way[a], motion.way[b], motion.way[c], motion.way[d]
-    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
-    # The boxes of the two where they start, grown by how much nearer they can come.
-    if face:
-        reach = wp.max(wp.length(v - u), wp.max(wp.length(p - u), wp.length(q - u)))
-        if outside(x, x, wp.min(y, wp.min(z, w)), wp.max(y, wp.max(z, w)), reach):
-            return none
-    else:
-        reach = wp.max(
-            wp.max(wp.length(p - u), wp.length(q - u)), wp.max(wp.length(p - v), wp.length(q - v))
-        )
-        if outside(wp.min(x, y), wp.max(x, y), wp.min(z, w), wp.max(z, w), reach):
-            return none
     return impact_of(face, x, y, z, w, u, v, p, q, motion.share, motion.floor)
 
 
 @wp.kernel
 def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
     first: wp.int32,
-    tree: wp.uint64,
     parts: Topology,
     motion: Motion,
     sweep: Sweep,
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
     begin: wp.array(dtype=wp.int32),
     count: wp.array(dtype=wp.int32),
     corners: wp.array(dtype=wp.vec4i),
@@ -161,9 +172,9 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
     if room == 0 and begin[parts.first_vertex.shape[0] - 1] > 0:
         return
     found, one = wp.int32(0), wp.float64(1.0)
-    if sweep.low[i][0] > sweep.high[i][0]:
+    if low[i][0] > high[i][0]:
         return
-    query = wp.bvh_query_aabb(tree, sweep.low[i], sweep.high[i])
+    query = wp.bvh_query_aabb(tree, low[i], high[i])
     j = wp.int32(0)
     while wp.bvh_query_next(query, j):
         if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
@@ -180,7 +191,7 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
                 continue
             for m in range(parts.first_face[j], parts.first_face[j + 1]):
                 t = parts.faces[m]
-                part = time_of(True, v, t[0], t[1], t[2], parts, motion)
+                part = time_of(True, v, t[0], t[1], t[2], parts, motion, reach)
                 if part < one:
                     if found < room:
                         corners[begin[i] + found] = wp.vec4i(v, t[0], t[1], t[2])
@@ -196,7 +207,7 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             begin_of = wp.where(i == j, k + 1, parts.first_edge[j])
             for m in range(begin_of, parts.first_edge[j + 1]):
                 f = parts.edges[m]
-                part = time_of(False, e[0], e[1], f[0], f[1], parts, motion)
+                part = time_of(False, e[0], e[1], f[0], f[1], parts, motion, reach)
                 if part < one:
                     if found < room:
                         corners[begin[i] + found] = wp.vec4i(e[0], e[1], f[0], f[1])
@@ -205,51 +216,73 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
     count[i] = found
 
 
-def impacts(
-    parts: Parts,
-    start: Float[Tensor, "vertices 3"],
-    way: Float[Tensor, "vertices 3"],
-    *,
-    share: float,
-    floor: float,
-    asked: Bool[Tensor, " vertices"],
-    exempt: Bool[Tensor, " vertices"],
-) -> Impacts:
-    """Every pair of parts that would come too near while vertices move.
+class Swept:
+    """All parts and the space that they sweep while each vertex moves along a straight line."""
 
-    Args:
-        parts: The parts.
-        start: Positions [m], float64.
-        way: How far each vertex goes [m], float64.
-        share: Part of their distance that pairs keep at least.
-        floor: Distance under which they keep nine tenths of it [m].
-        asked: Only pairs with one of these vertices are asked.
-        exempt: No pair with one of these is.
-    """
-    size, device = parts.count, str(start.device)
-    given = {"device": device, "lanes": parts.level.lanes, "least": LEAST_QUERIES}
-    middle = start.mean(dim=0) if len(start) else start.new_zeros(3)
-    motion, sweep = Motion(), _boxes(size, device)
-    motion.start, motion.way = _vectors(start - middle), _vectors(way)
-    motion.asked, motion.exempt = wp.from_torch(asked.contiguous()), wp.from_torch(exempt.contiguous())
-    motion.share, motion.floor = share, floor
-    Launch(sweep_boxes, size, [parts.topology, motion, sweep], **given)({})
-    tree = wp.Bvh(sweep.low, sweep.high)
-    count = torch.zeros(size, dtype=torch.int32, device=device)
-    begin = torch.zeros(size + 1, dtype=torch.int32, device=device)
-    out = Impacts(begin.new_zeros((0, 4)), start.new_zeros(0))
-    for _ in range(2):
-        arrays = [wp.from_torch(begin), wp.from_torch(count), _corners(out.corners), wp.from_torch(out.time)]
-        Launch(impacts_of, size, [tree.id, parts.topology, motion, sweep, *arrays], **given)({})
-        begin[1:] = count.cumsum(dim=0)
-        total = int(begin[-1])
-        if not total:
-            break
-        out = Impacts(begin.new_zeros((total, 4)), start.new_ones(total)) if not len(out.time) else out
-    return out
+    def __init__(self, parts: Parts, start: Float[Tensor, "vertices 3"], way: Float[Tensor, "vertices 3"]) -> None:
+        """Build the hierarchy.
+
+        Args:
+            parts: The parts.
+            start: Positions [m], float64.
+            way: How far each vertex goes [m], float64.
+        """
+        self._parts, self._device = parts, str(start.device)
+        self._start = start - (start.mean(dim=0) if len(start) else start.new_zeros(3))
+        self._boxes = _boxes(parts.count, self._device)
+        none = torch.zeros(len(start), dtype=torch.bool, device=start.device)
+        self._launch(sweep_boxes, self._motion(way, asked=none, exempt=none), self._boxes)
+        self._tree = wp.Bvh(self._boxes.low, self._boxes.high)
+
+    def impacts(
+        self,
+        way: Float[Tensor, "vertices 3"],
+        *,
+        share: float,
+        floor: float,
+        asked: Bool[Tensor, " vertices"],
+        exempt: Bool[Tensor, " vertices"],
+    ) -> Impacts:
+        """Every pair of parts that would come too near.
+
+        Args:
+            way: How far each vertex goes [m], no farther along its line than was swept, float64.
+            share: Part of their distance that pairs keep at least.
+            floor: Distance under which they keep nine tenths of it [m].
+            asked: Only pairs with one of these vertices are asked.
+            exempt: No pair with one of these is.
+        """
+        motion, now = self._motion(way, asked=asked, exempt=exempt), _boxes(self._parts.count, self._device)
+        motion.share, motion.floor = share, floor
+        self._launch(sweep_boxes, motion, now)
+        count = torch.zeros(self._parts.count, dtype=torch.int32, device=way.device)
+        begin = torch.zeros(self._parts.count + 1, dtype=torch.int32, device=way.device)
+        out = Impacts(begin.new_zeros((0, 4)), way.new_zeros(0))
+        for _ in range(2):  # They are counted, and then written.
+            arrays = [wp.from_torch(each) for each in (begin, count, out.time)]
+            arrays.insert(2, wp.from_torch(out.corners, dtype=wp.vec4i))
+            self._launch(impacts_of, motion, now, self._tree.id, self._boxes.low, self._boxes.high, *arrays)
+            begin[1:] = count.cumsum(dim=0)
+            total = int(begin[-1])
+            if not total or len(out.time):
+                break
+            out = Impacts(begin.new_zeros((total, 4)), way.new_ones(total))
+        return out
+
+    def _motion(self, way: Tensor, *, asked: Tensor, exempt: Tensor) -> Any:
+        """What kernels are told of the vertices."""
+        motion = Motion()
+        motion.start, motion.way = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (self._start, way))
+        motion.asked, motion.exempt = (wp.from_torch(each.contiguous()) for each in (asked, exempt))
+        return motion
+
+    def _launch(self, kernel: wp.Kernel, *inputs: object) -> None:
+        """Run over the clusters."""
+        given = {"device": self._device, "lanes": self._parts.level.lanes, "least": LEAST_QUERIES}
+        Launch(kernel, self._parts.count, [self._parts.topology, *inputs], **given)({})
 
 
-def _boxes(size: int, device: str) -> Sweep:
+def _boxes(size: int, device: str) -> Any:
     """Room for what is known of clusters."""
     sweep = Sweep()
     for name in ("low", "high"):
@@ -260,10 +293,3 @@ def _boxes(size: int, device: str) -> Sweep:
     sweep.asked = wp.zeros(size, dtype=wp.int32, device=device)
     return sweep
 
-
-def _vectors(tensor: Tensor) -> wp.array:
-    return wp.from_torch(tensor.contiguous(), dtype=wp.vec3d)
-
-
-def _corners(tensor: Tensor) -> wp.array:
-    return wp.from_torch(tensor, dtype=wp.vec4i)

@@ -13,6 +13,7 @@ from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
 from ..level import Level
 from .frame import LevelContact, Touch
+from .metric import SMOOTH, HeldMetric
 
 ROUNDS, STEPS = 10, 4
 """Most rounds of a level, and steps of each."""
@@ -65,19 +66,26 @@ def solve_promised(
     kept: list[Carry] = []
     going: Carry | None = None
     last: System | None = None
+    made = 0
     for _ in range(ROUNDS):
         terms = view.terms(x)
         system = make_system(terms, x)
+        shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
         y, report = solve_level(
             system,
             integrator,
             x,
             level=level.index,
-            budget=replace(budget, steps=STEPS, extra=0),
+            budget=replace(
+                budget, steps=STEPS, extra=0, tolerance=shrunk * budget.tolerance, rest=budget.rest if not made else 1.0
+            ),
             observe=lambda carry: kept.__setitem__(slice(None), [carry]),
             resume=going if last is not None and system.shares_metric(last) else None,
         )
+        held = system.metric.held(kept[-1].force) if isinstance(system.metric, HeldMetric) else None
+        report.remaining_move = report.remaining_move if held is None else system.remaining_move(held)
         reports.append(report)
+        made += 1
         y = view.closed(y)
         x = view.moved(x, y)
         going = kept[-1] if x is y else None if kept[-1].setbacks else replace(kept[-1], x=x)

@@ -17,10 +17,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.parts import Parts
-from ..collide.sweep import impacts
+from ..collide.sweep import Swept
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
+BACK = 0.9
+"""Part of the way to an impact that its vertices go: others, cut in turn, may come nearer than they were to."""
 SHORTENINGS = 16
 """Passes in which vertices that would touch go less far; after them they stay, so that there is an end."""
 
@@ -73,13 +75,14 @@ def safe_move(
     none = torch.zeros(len(way), dtype=torch.bool, device=way.device)
     exempt = none if exempt is None else exempt
     x, asked = wanted, (way != 0).any(dim=1)
+    swept = Swept(parts, at, way)
     for attempt in range(len(way) + SHORTENINGS):
-        met = impacts(parts, at, x.double() - at, share=KEPT, floor=floor, asked=asked, exempt=exempt)
+        met = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, exempt=exempt)
         if not len(met.time):
             break
         least = torch.ones_like(share)
         corner = met.corners.long().reshape(-1)
-        least.scatter_reduce_(0, corner, met.time.repeat_interleave(4), "amin")
+        least.scatter_reduce_(0, corner, BACK * met.time.repeat_interleave(4), "amin")
         shorter = share * least if attempt < SHORTENINGS else torch.where(least < 1.0, 0.0, share)
         asked, share = shorter < share, shorter
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
