@@ -1,4 +1,4 @@
-"""Closest points of a point and a triangle and of two edges, in double precision."""
+"""Closest points of a vertex and a triangle and of two edges, in double precision."""
 
 # Warp's functions are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
@@ -23,44 +23,61 @@ def along(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 
 @wp.func
-def to_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Way to p from the closest point of an edge."""
-    return p - a - along(p, a, b) * (b - a)
-
-
-@wp.func
-def shorter(u: wp.vec3d, v: wp.vec3d):
-    """The shorter one of two vectors."""
-    return wp.where(wp.dot(v, v) < wp.dot(u, u), v, u)
-
-
-@wp.func
-def to_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Way to a point from the closest point of a triangle."""
+def weights_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Weights of p and the corners in the way to p from the closest point of a triangle; they sum to 0."""
+    zero, one = wp.float64(0.0), wp.float64(1.0)
     first, second, way = b - a, c - a, p - a
     normal = wp.cross(first, second)
     size = wp.dot(normal, normal)
     if size > FLAT * wp.dot(first, first) * wp.dot(second, second):
         # Inside all three sides the foot of the perpendicular is the closest point.
-        v = wp.dot(wp.cross(way, second), normal)
-        w = wp.dot(wp.cross(first, way), normal)
-        if v >= wp.float64(0.0) and w >= wp.float64(0.0) and v + w <= size:
-            return wp.dot(way, normal) / size * normal
-    return shorter(shorter(to_edge(p, a, b), to_edge(p, b, c)), to_edge(p, c, a))
+        v, w = wp.dot(wp.cross(way, second), normal), wp.dot(wp.cross(first, way), normal)
+        if v >= zero and w >= zero and v + w <= size:
+            return wp.vec4d(one, (v + w) / size - one, -v / size, -w / size)
+    r, s, t = along(p, a, b), along(p, b, c), along(p, c, a)
+    to_ab, to_bc, to_ca = p - a - r * (b - a), p - b - s * (c - b), p - c - t * (a - c)
+    ab, bc, ca = wp.dot(to_ab, to_ab), wp.dot(to_bc, to_bc), wp.dot(to_ca, to_ca)
+    if ab <= bc and ab <= ca:
+        return wp.vec4d(one, r - one, -r, zero)
+    if bc <= ca:
+        return wp.vec4d(one, zero, s - one, -s)
+    return wp.vec4d(one, -t, zero, t - one)
 
 
 @wp.func
-def between_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Shortest way from the edge c-d to the edge a-b."""
+def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Weights of the ends in the shortest way from the edge c-d to the edge a-b; they sum to 0."""
+    zero, one = wp.float64(0.0), wp.float64(1.0)
     first, second, way = b - a, d - c, a - c
     aa, cc, ac = wp.dot(first, first), wp.dot(second, second), wp.dot(first, second)
     wa, wc = wp.dot(way, first), wp.dot(way, second)
     size = aa * cc - ac * ac
     if size > FLAT * aa * cc:
-        s = (ac * wc - wa * cc) / size
-        t = (aa * wc - ac * wa) / size
-        zero, one = wp.float64(0.0), wp.float64(1.0)
+        s, t = (ac * wc - wa * cc) / size, (aa * wc - ac * wa) / size
         if s >= zero and s <= one and t >= zero and t <= one:
-            return way + s * first - t * second
-    best = shorter(to_edge(a, c, d), to_edge(b, c, d))
-    return shorter(best, shorter(-to_edge(c, a, b), -to_edge(d, a, b)))
+            return wp.vec4d(one - s, s, t - one, -t)
+    best = wp.vec4d(one, zero, zero, zero)
+    least = wp.float64(1.0e300)
+    for end in range(4):
+        # One edge's end, and the closest point of the other edge.
+        from_first = end < 2
+        p = wp.where(end == 0, a, wp.where(end == 1, b, wp.where(end == 2, c, d)))
+        near, far = wp.where(from_first, c, a), wp.where(from_first, d, b)
+        t = along(p, near, far)
+        gap = p - near - t * (far - near)
+        if wp.dot(gap, gap) < least:
+            least = wp.dot(gap, gap)
+            last = wp.float64(end % 2)
+            if from_first:
+                best = wp.vec4d(one - last, last, t - one, -t)
+            else:
+                best = wp.vec4d(one - t, t, last - one, -last)
+    return best
+
+
+@wp.func
+def weights_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Weights in the shortest way to the vertex a from the triangle b, c, d, or to the edge a-b from the edge c-d."""
+    if face:
+        return weights_on_triangle(a, b, c, d)
+    return weights_of_edges(a, b, c, d)

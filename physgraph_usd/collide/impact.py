@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .distance import between_edges, to_triangle
+from .distance import weights_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,10 +23,9 @@ STEPS = wp.constant(256)
 
 @wp.func
 def distance_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Distance of the point a from the triangle b, c, d, or of the edges a-b and c-d."""
-    if face:
-        return wp.length(to_triangle(a, b, c, d))
-    return wp.length(between_edges(a, b, c, d))
+    """Distance of the vertex a from the triangle b, c, d, or of the edges a-b and c-d."""
+    weight = weights_of(face, a, b, c, d)
+    return wp.length(weight[0] * a + weight[1] * b + weight[2] * c + weight[3] * d)
 
 
 @wp.func

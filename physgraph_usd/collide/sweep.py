@@ -1,4 +1,4 @@
-"""What would touch where all vertices move along straight lines: every pair of parts, and how far it may go."""
+"""Every pair of parts that is near, or that would touch where all vertices move along straight lines."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.lanes import LEAST_QUERIES, Launch
-from .impact import impact_of
+from .impact import distance_of, impact_of
 from .parts import Parts, Topology
 
 wp.set_module_options({"enable_backward": False})
@@ -26,7 +26,7 @@ ROUNDING = wp.constant(wp.float64(2.4e-7))
 
 @wp.struct
 class Motion:
-    """Where vertices are, how far they want to go, and which pairs are asked."""
+    """Where vertices are, how far they want to go, and which pairs are asked: for their way, or what is within reach."""
 
     start: wp.array(dtype=wp.vec3d)
     way: wp.array(dtype=wp.vec3d)
@@ -34,6 +34,7 @@ class Motion:
     exempt: wp.array(dtype=wp.bool)
     share: wp.float64
     floor: wp.float64
+    within: wp.float64
 
 
 @wp.struct
@@ -50,16 +51,19 @@ class Sweep:
 
 
 @dataclass(frozen=True, eq=False)
-class Impacts:
-    """Pairs of parts that would come too near on their way.
+class Pairs:
+    """Pairs of parts.
 
     Attributes:
-        corners: A vertex and a face, or two edges, shape (N, 4).
-        time: Part of their way that they may go, in (0, 1), shape (N,).
+        corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4).
+        value: Of impacts the part of their way that they may go, in (0, 1); of near pairs their distance over the
+            one asked for; shape (N,).
+        face: Whether it is a vertex and a face, shape (N,).
     """
 
     corners: Int[Tensor, "pairs 4"]
-    time: Float[Tensor, " pairs"]
+    value: Float[Tensor, " pairs"]
+    face: Bool[Tensor, " pairs"]
 
 
 @wp.func
@@ -88,7 +92,7 @@ def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
     spread = wp.float64(0.0)
     for k in range(begin, end):
         spread = wp.max(spread, wp.length(motion.way[parts.corners[k]] - mean))
-    slack = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest))
+    slack = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest)) + wp.vec3d(motion.within)
     sweep.low[i] = single(lowest - slack)
     sweep.high[i] = single(highest + slack)
     sweep.from_low[i] = least
@@ -114,7 +118,7 @@ def is_one(parts: Topology, a: wp.int32, b: wp.int32):
 
 
 @wp.func
-def time_of(
+def value_of(
     face: wp.bool,
     a: wp.int32,
     b: wp.int32,
@@ -124,9 +128,11 @@ def time_of(
     motion: Motion,
     reach: wp.float64,
 ):
-    """Part of their ways that a vertex and a face, or two edges, may go; 1 where they are not to be asked.
+    """Part of their ways that a vertex and a face, or two edges, may go, or their distance over the one asked for.
 
-    They are refused first where their boxes at the start are farther apart than a reach, the cheapest thing to see.
+    It is 1 where they are not to be asked.
+
+    Pairs are refused first where their boxes at the start are farther apart than a reach, the cheapest thing to see.
     """
     none = wp.float64(1.0)
     x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
@@ -145,12 +151,14 @@ def time_of(
         return none
     if motion.exempt[a] or motion.exempt[b] or motion.exempt[c] or motion.exempt[d]:
         return none
+    if motion.within > wp.float64(0.0):
+        return distance_of(face, x, y, z, w) / motion.within
     u, v, p, q = motion.way[a], motion.way[b], motion.way[c], motion.way[d]
     return impact_of(face, x, y, z, w, u, v, p, q, motion.share, motion.floor)
 
 
 @wp.kernel
-def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
+def pairs_of(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
     first: wp.int32,
     parts: Topology,
     motion: Motion,
@@ -161,9 +169,10 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
     begin: wp.array(dtype=wp.int32),
     count: wp.array(dtype=wp.int32),
     corners: wp.array(dtype=wp.vec4i),
-    time: wp.array(dtype=wp.float64),
+    value: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.bool),
 ):
-    """Count the impacts of a cluster's vertices with faces, and of its edges with those of no lower cluster.
+    """Count the pairs of a cluster's vertices with faces, and of its edges with those of no lower cluster.
 
     They are written from where a cluster's begin, so far as there is room.
     """
@@ -181,7 +190,7 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             continue
         if sweep.asked[i] == 0 and sweep.asked[j] == 0:
             continue
-        reach = wp.length(sweep.mean[i] - sweep.mean[j]) + sweep.spread[i] + sweep.spread[j]
+        reach = wp.length(sweep.mean[i] - sweep.mean[j]) + sweep.spread[i] + sweep.spread[j] + motion.within
         if outside(sweep.from_low[i], sweep.from_high[i], sweep.from_low[j], sweep.from_high[j], reach):
             continue
         for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
@@ -191,11 +200,12 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
                 continue
             for m in range(parts.first_face[j], parts.first_face[j + 1]):
                 t = parts.faces[m]
-                part = time_of(True, v, t[0], t[1], t[2], parts, motion, reach)
+                part = value_of(True, v, t[0], t[1], t[2], parts, motion, reach)
                 if part < one:
                     if found < room:
                         corners[begin[i] + found] = wp.vec4i(v, t[0], t[1], t[2])
-                        time[begin[i] + found] = part
+                        value[begin[i] + found] = part
+                        face[begin[i] + found] = True
                     found += 1
         if j < i:
             continue
@@ -207,11 +217,11 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
             begin_of = wp.where(i == j, k + 1, parts.first_edge[j])
             for m in range(begin_of, parts.first_edge[j + 1]):
                 f = parts.edges[m]
-                part = time_of(False, e[0], e[1], f[0], f[1], parts, motion, reach)
+                part = value_of(False, e[0], e[1], f[0], f[1], parts, motion, reach)
                 if part < one:
                     if found < room:
                         corners[begin[i] + found] = wp.vec4i(e[0], e[1], f[0], f[1])
-                        time[begin[i] + found] = part
+                        value[begin[i] + found] = part
                     found += 1
     count[i] = found
 
@@ -219,14 +229,23 @@ def impacts_of(  # noqa: C901, PLR0912 - one query, each candidate refused as ea
 class Swept:
     """All parts and the space that they sweep while each vertex moves along a straight line."""
 
-    def __init__(self, parts: Parts, start: Float[Tensor, "vertices 3"], way: Float[Tensor, "vertices 3"]) -> None:
+    def __init__(
+        self,
+        parts: Parts,
+        start: Float[Tensor, "vertices 3"],
+        way: Float[Tensor, "vertices 3"],
+        *,
+        within: float = 0.0,
+    ) -> None:
         """Build the hierarchy.
 
         Args:
             parts: The parts.
             start: Positions [m], float64.
             way: How far each vertex goes [m], float64.
+            within: Distance that is asked for where nothing moves [m].
         """
+        self._within = within
         self._parts, self._device = parts, str(start.device)
         self._start = start - (start.mean(dim=0) if len(start) else start.new_zeros(3))
         self._boxes = _boxes(parts.count, self._device)
@@ -242,7 +261,7 @@ class Swept:
         floor: float,
         asked: Bool[Tensor, " vertices"],
         exempt: Bool[Tensor, " vertices"],
-    ) -> Impacts:
+    ) -> Pairs:
         """Every pair of parts that would come too near.
 
         Args:
@@ -252,26 +271,36 @@ class Swept:
             asked: Only pairs with one of these vertices are asked.
             exempt: No pair with one of these is.
         """
-        motion, now = self._motion(way, asked=asked, exempt=exempt), _boxes(self._parts.count, self._device)
+        motion = self._motion(way, asked=asked, exempt=exempt)
         motion.share, motion.floor = share, floor
+        return self._pairs(motion)
+
+    def _pairs(self, motion: Any) -> Pairs:
+        """The pairs that are asked for."""
+        now, size, device = _boxes(self._parts.count, self._device), self._parts.count, self._start.device
         self._launch(sweep_boxes, motion, now)
-        count = torch.zeros(self._parts.count, dtype=torch.int32, device=way.device)
-        begin = torch.zeros(self._parts.count + 1, dtype=torch.int32, device=way.device)
-        out = Impacts(begin.new_zeros((0, 4)), way.new_zeros(0))
+        count, begin = (torch.zeros(size + extra, dtype=torch.int32, device=device) for extra in (0, 1))
+        out = _room(begin, 0)
         for _ in range(2):  # They are counted, and then written.
-            arrays = [wp.from_torch(each) for each in (begin, count, out.time)]
-            arrays.insert(2, wp.from_torch(out.corners, dtype=wp.vec4i))
-            self._launch(impacts_of, motion, now, self._tree.id, self._boxes.low, self._boxes.high, *arrays)
+            arrays = [wp.from_torch(begin), wp.from_torch(count), wp.from_torch(out.corners, dtype=wp.vec4i)]
+            arrays += [wp.from_torch(out.value), wp.from_torch(out.face)]
+            self._launch(pairs_of, motion, now, self._tree.id, self._boxes.low, self._boxes.high, *arrays)
             begin[1:] = count.cumsum(dim=0)
             total = int(begin[-1])
-            if not total or len(out.time):
+            if not total or len(out.value):
                 break
-            out = Impacts(begin.new_zeros((total, 4)), way.new_ones(total))
+            out = _room(begin, total)
         return out
+
+    def near(self, exempt: Bool[Tensor, " vertices"]) -> Pairs:
+        """Every pair of parts within the distance asked for, but for those with an exempt vertex."""
+        still = torch.zeros_like(self._start)
+        return self._pairs(self._motion(still, asked=torch.ones_like(exempt), exempt=exempt))
 
     def _motion(self, way: Tensor, *, asked: Tensor, exempt: Tensor) -> Any:
         """What kernels are told of the vertices."""
         motion = Motion()
+        motion.within = self._within
         motion.start, motion.way = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (self._start, way))
         motion.asked, motion.exempt = (wp.from_torch(each.contiguous()) for each in (asked, exempt))
         return motion
@@ -280,6 +309,12 @@ class Swept:
         """Run over the clusters."""
         given = {"device": self._device, "lanes": self._parts.level.lanes, "least": LEAST_QUERIES}
         Launch(kernel, self._parts.count, [self._parts.topology, *inputs], **given)({})
+
+
+def _room(like: Tensor, count: int) -> Pairs:
+    """Room for some pairs."""
+    value = torch.ones(count, dtype=torch.float64, device=like.device)
+    return Pairs(like.new_zeros((count, 4)), value, torch.zeros(count, dtype=torch.bool, device=like.device))
 
 
 def _boxes(size: int, device: str) -> Any:

@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..forces.seam import Seam
-from ..forces.self_contact import SelfContact, Spheres
+from ..collide.near import near_pairs
+from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..collide.parts import Parts
 from ..level import Level
 from ..mesh.topology import joined_by
@@ -47,6 +48,7 @@ AHEAD = 0.5
 STALE, FEW, MOST = 0.1, 1e-3, 0.35
 """Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
 has, and everywhere where more than the last part has."""
+HALF, MARGIN = 0.5, 0.3
 LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
 EVERYWHERE = 0.5
@@ -160,6 +162,7 @@ class ClothView:
         self._gap_finder = GapFinder(
             self._mesh, base, lasting.order, lasting.outward, thickness=thickness, stiffness=settings.cloth_stiffness
         )
+        self._thickness = thickness
         self._sides: Tensor | None = None
         self._found: _Found | None = None
         self._looked: ClothState | None = None
@@ -232,6 +235,8 @@ class ClothView:
         """
         if self._settings.cloth == "spheres":
             return self._spheres(x)
+        if self._settings.promise:
+            return self._complete(x)
         pairs, crossings = self._near(x, keep_pairs=keep_pairs)
         self.tangled = crossings.count > 0
         if self._sides is None or self.tangled or self._settings.promise:
@@ -239,6 +244,31 @@ class ClothView:
         if pairs is None:
             return None
         gaps = self._gap_finder.gaps(pairs, x, start=self._sides, crossings=crossings)
+        if crossings.count:
+            step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
+            gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=stiffness))
+        return SelfContact(self._level, gaps) if len(gaps.corners) else None
+
+    def _complete(self, x: Tensor) -> SelfContact | None:
+        """The force between all parts that are near, each on its side; what crosses is drawn out."""
+        crossings = self.look(x).crossings
+        self.tangled = crossings.count > 0
+        sewn = np.zeros((0, 2), np.int64) if self._seam is None else self._seam.pairs
+        crossed = self._mesh.crossed(crossings) if crossings.count else None
+        within = float(self._thickness.max()) + MARGIN * float(self._level.spacing.mean())
+        near = near_pairs(self._lasting.parts(self._level, sewn), x, within, crossed)
+        corners = near.corners.long()
+        at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
+        thickness = self._thickness[self._level.vertex_garment[corners[:, [0, 3]]].long()].mean(dim=1)
+        area = self._level.vertex_area[corners]
+        share = torch.where(near.face, area[:, 0], area.amin(dim=1) / 3.0)
+        gaps = Gaps(
+            near.corners,
+            near.weight,
+            torch.nn.functional.normalize(near.way, dim=1, eps=1e-30).contiguous(),
+            torch.minimum(thickness, HALF * at_rest).contiguous(),
+            self._settings.cloth_stiffness * share,
+        )
         if crossings.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=stiffness))

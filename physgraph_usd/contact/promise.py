@@ -11,7 +11,7 @@ from ..collide.parts import Parts
 from .cloth import ClothView
 from .safe_move import safe_move
 
-GOES = 3
+GOES = 2
 """How often a move is taken up again where something was in the way: what was in the way may have gone."""
 TANGLED = 2
 """Rings round what crosses at the start to which nothing is promised but that no more crosses."""

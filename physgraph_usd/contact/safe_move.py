@@ -78,11 +78,11 @@ def safe_move(
     swept = Swept(parts, at, way)
     for attempt in range(len(way) + SHORTENINGS):
         met = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, exempt=exempt)
-        if not len(met.time):
+        if not len(met.value):
             break
         least = torch.ones_like(share)
         corner = met.corners.long().reshape(-1)
-        least.scatter_reduce_(0, corner, BACK * met.time.repeat_interleave(4), "amin")
+        least.scatter_reduce_(0, corner, BACK * met.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < SHORTENINGS else torch.where(least < 1.0, 0.0, share)
         asked, share = shorter < share, shorter
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)

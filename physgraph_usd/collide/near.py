@@ -1,0 +1,71 @@
+"""Every pair of parts nearer than a distance, and the shortest way between the two."""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..mesh.lanes import Launch
+from .distance import weights_of
+from .parts import Parts
+from .sweep import Swept
+
+wp.set_module_options({"enable_backward": False})
+
+
+@dataclass(frozen=True, eq=False)
+class NearPairs:
+    """Pairs of parts near one another.
+
+    Attributes:
+        corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4), int32.
+        weight: Of the corners in the shortest way from the second part to the first; rows sum to 0, shape (N, 4).
+        way: That way [m], shape (N, 3).
+        face: Whether it is a vertex and a face, shape (N,).
+    """
+
+    corners: Int[Tensor, "pairs 4"]
+    weight: Float[Tensor, "pairs 4"]
+    way: Float[Tensor, "pairs 3"]
+    face: Bool[Tensor, " pairs"]
+
+
+@wp.kernel
+def _closest(
+    first: wp.int32,
+    x: wp.array(dtype=wp.vec3d),
+    corners: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.bool),
+    weight: wp.array(dtype=wp.vec4d),
+):
+    i = first + wp.tid()
+    c = corners[i]
+    weight[i] = weights_of(face[i], x[c[0]], x[c[1]], x[c[2]], x[c[3]])
+
+
+def near_pairs(
+    parts: Parts, x: Float[Tensor, "vertices 3"], within: float, exempt: Bool[Tensor, " vertices"] | None = None
+) -> NearPairs:
+    """Every vertex and face, and every two edges, that share no vertex and are nearer than a distance.
+
+    Args:
+        parts: The parts.
+        x: Positions [m].
+        within: The distance [m].
+        exempt: No pair with one of these vertices, or None.
+    """
+    at = x.double()
+    none = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    pairs = Swept(parts, at, torch.zeros_like(at), within=within).near(none if exempt is None else exempt)
+    weight = torch.zeros((len(pairs.face), 4), dtype=torch.float64, device=x.device)
+    inputs = [wp.from_torch(at.contiguous(), dtype=wp.vec3d), wp.from_torch(pairs.corners, dtype=wp.vec4i)]
+    inputs += [wp.from_torch(pairs.face), wp.from_torch(weight, dtype=wp.vec4d)]
+    Launch(_closest, len(weight), inputs, device=str(x.device), lanes=parts.level.lanes)({})
+    way = (weight.unsqueeze(2) * at[pairs.corners.long()]).sum(dim=1)
+    return NearPairs(pairs.corners, weight.to(x), way.to(x), pairs.face)
