@@ -49,6 +49,24 @@ def _closest(
     weight[i] = weights_of(face[i], x[c[0]], x[c[1]], x[c[2]], x[c[3]])
 
 
+def weights(
+    x: Float[Tensor, "vertices 3"], corners: Int[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], *, lanes: int = 1
+) -> Float[Tensor, "pairs 4"]:
+    """Weights of corners in the shortest way from each pair's second part to its first, as in `NearPairs`.
+
+    Args:
+        x: Positions [m], float64.
+        corners: A vertex and the corners of a face, or the ends of two edges, int32.
+        face: Whether it is a vertex and a face.
+        lanes: Most threads on the CPU.
+    """
+    out = torch.zeros((len(face), 4), dtype=torch.float64, device=x.device)
+    inputs = [wp.from_torch(x.contiguous(), dtype=wp.vec3d), wp.from_torch(corners, dtype=wp.vec4i)]
+    inputs += [wp.from_torch(face), wp.from_torch(out, dtype=wp.vec4d)]
+    Launch(_closest, len(out), inputs, device=str(x.device), lanes=lanes)({})
+    return out
+
+
 def near_pairs(
     parts: Parts, x: Float[Tensor, "vertices 3"], within: float, exempt: Bool[Tensor, " vertices"] | None = None
 ) -> NearPairs:
@@ -63,9 +81,6 @@ def near_pairs(
     at = x.double()
     none = torch.zeros(len(x), dtype=torch.bool, device=x.device)
     pairs = Swept(parts, at, torch.zeros_like(at), within=within).near(none if exempt is None else exempt)
-    weight = torch.zeros((len(pairs.face), 4), dtype=torch.float64, device=x.device)
-    inputs = [wp.from_torch(at.contiguous(), dtype=wp.vec3d), wp.from_torch(pairs.corners, dtype=wp.vec4i)]
-    inputs += [wp.from_torch(pairs.face), wp.from_torch(weight, dtype=wp.vec4d)]
-    Launch(_closest, len(weight), inputs, device=str(x.device), lanes=parts.level.lanes)({})
+    weight = weights(at, pairs.corners, pairs.face, lanes=parts.level.lanes)
     way = (weight.unsqueeze(2) * at[pairs.corners.long()]).sum(dim=1)
     return NearPairs(pairs.corners, weight.to(x), way.to(x), pairs.face)

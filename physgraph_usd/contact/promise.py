@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -11,7 +12,7 @@ from ..collide.parts import Parts
 from .cloth import ClothView
 from .safe_move import safe_move
 
-GOES = 2
+GOES = 3
 """How often a move is taken up again where something was in the way: what was in the way may have gone."""
 TANGLED = 2
 """Rings round what crosses at the start to which nothing is promised but that no more crosses."""
@@ -44,11 +45,14 @@ class Promise:
 
     def _go(self, start: Tensor, wanted: Tensor, exempt: Bool[Tensor, " vertices"] | None) -> Tensor:
         """The same, with nothing promised to some vertices."""
-        x, left = start, len(start) + 1
+        x = start
         for _ in range(GOES):
             moved = safe_move(x, wanted, self.parts, floor=self.floor, exempt=exempt)
             x, short = moved.x, int(moved.short.sum())
-            if not short or short >= left:
+            if not short:
                 break
-            left = short
+            # What is left of a way goes on along what was in it.
+            rest = wanted.double() - x.double()
+            against = (rest * moved.clear).sum(dim=1, keepdim=True).clamp_max(0.0)
+            wanted = torch.where(moved.short.unsqueeze(1), (x.double() + rest - against * moved.clear).to(wanted), wanted)
         return x

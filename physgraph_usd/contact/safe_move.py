@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.parts import Parts
-from ..collide.sweep import Swept
+from ..collide.near import weights
+from ..collide.sweep import Pairs, Swept
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
@@ -34,10 +35,12 @@ class Moved:
     Attributes:
         x: Positions [m], shape (V, 3).
         share: How much of its way each vertex has gone, in [0, 1], shape (V,), float64.
+        clear: Unit way of each vertex that is short from what was in its way, 0 elsewhere, shape (V, 3), float64.
     """
 
     x: Float[Tensor, "vertices 3"]
     share: Float[Tensor, " vertices"]
+    clear: Float[Tensor, "vertices 3"]
 
     @property
     def short(self) -> Bool[Tensor, " vertices"]:
@@ -76,6 +79,7 @@ def safe_move(
     exempt = none if exempt is None else exempt
     x, asked = wanted, (way != 0).any(dim=1)
     swept = Swept(parts, at, way)
+    clear = torch.zeros_like(way)
     for attempt in range(len(way) + SHORTENINGS):
         met = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, exempt=exempt)
         if not len(met.value):
@@ -84,6 +88,29 @@ def safe_move(
         corner = met.corners.long().reshape(-1)
         least.scatter_reduce_(0, corner, BACK * met.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < SHORTENINGS else torch.where(least < 1.0, 0.0, share)
-        asked, share = shorter < share, shorter
+        asked, clear = shorter < share, _away(met, at + share.unsqueeze(1) * way, at, clear)
+        share = shorter
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
-    return Moved(x, share)
+    return Moved(x, share, clear)
+
+
+def _away(met: Pairs, end: Tensor, start: Tensor, known: Tensor) -> Float[Tensor, "vertices 3"]:
+    """Unit way of each vertex from the part that it meets first [1], known ones where it meets none."""
+    corners = met.corners.long()
+    there = start[corners] + met.value.reshape(-1, 1, 1) * (end - start)[corners]
+    own = torch.arange(4 * len(corners), dtype=torch.int32, device=end.device).reshape(-1, 4)
+    weight = weights(there.reshape(-1, 3), own, met.face)
+    way = torch.nn.functional.normalize((weight.unsqueeze(2) * there).sum(dim=1), dim=1, eps=1e-300)
+    side = torch.ones_like(weight)
+    side[:, 2:] = -1.0
+    side[met.face, 1] = -1.0
+    order = torch.argsort(met.value, descending=True, stable=True).repeat_interleave(4)
+    # The first that a vertex meets is written last; the rank of each pair makes that so on any device.
+    place = torch.arange(4, device=end.device).repeat(len(corners))
+    vertex, rank = corners[order, place], torch.arange(4 * len(corners), device=end.device)
+    last = torch.full_like(known[:, 0], -1, dtype=torch.int64).scatter_reduce_(0, vertex, rank, "amax")
+    hit = torch.nonzero(last >= 0).squeeze(1)
+    pair, corner = order[last[hit]], place[last[hit]]
+    out = known.clone()
+    out[hit] = side[pair, corner].unsqueeze(1) * way[pair]
+    return out
