@@ -331,7 +331,8 @@ class Group:
             budget = self._settings.budget(last - index, clock, more=choice.steps, warm=warm is not None)
             view = None if contact is None else contact.at(level)
             if view is not None and view.promise is not None and warm is not None and before is not None:
-                x = view.moved(before, warm)
+                x = view.walked(before, warm)
+                view.target = warm
             alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
             x, made, touched = self._solve_level(
                 alone,

@@ -35,6 +35,8 @@ STALE = 0.1
 """How far a vertex moves before the plane that it sees is found anew, in edge lengths."""
 HOLLOW = 0.02
 """How far in front of a plane seen before the closest point lies in a crease of the body, in edge lengths."""
+PASSING = 2.0
+"""Edges from its target beyond which a vertex may pass through a body to it."""
 STALLED = 6
 """How often faces that a body comes through are moved in vain, once none more comes clear."""
 
@@ -123,6 +125,11 @@ class LevelBodies:
                 break
             out, passes = no_farther(lifted, first, LIFT * self._level.spacing), passes + 1
         return (best if best is first else self.push_out(best)), passes
+
+    def let_through(self, x: Float[Tensor, "vertices 3"], target: Float[Tensor, "vertices 3"]) -> None:
+        """From now on let vertices at x [m] pass through bodies that are between them and a target [m]."""
+        for track in self._tracks:
+            track.let_through(x, target, PASSING * self._level.spacing)
 
     def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Free vertices moved to the least clearance, wherever bodies come through faces [m]."""

@@ -376,6 +376,14 @@ class ClothView:
         state = self.look(x)
         return state.crossings.count > 0 and self._excess(state, self.allowed or self.before) > 0
 
+    def grown(self, some: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
+        """Some vertices and those within some rings of them."""
+        return self._mesh.grown(some, rings)
+
+    def mean_beside(self, values: Float[Tensor, "vertices 3"], where: Bool[Tensor, " vertices"]) -> Tensor:
+        """The mean of the neighbours' values at given vertices, as they are elsewhere."""
+        return smoothed(self._mesh, values, where, passes=1)
+
     def round_crossings(self, x: Float[Tensor, "vertices 3"], *, rings: int) -> Bool[Tensor, " vertices"]:
         """Vertices within some rings of what crosses at x [m]."""
         return self._mesh.grown(self._mesh.crossed(self.look(x).crossings), rings)

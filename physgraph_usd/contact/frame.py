@@ -63,6 +63,7 @@ class LevelContact:
     seam: Seam | None = None
     mended: bool = False
     promise: Promise | None = None
+    target: Tensor | None = None
     _held: HeldMetric | None = None
 
     def metric(self, plain: Metric, terms: Sequence[Touch], x: Float[Tensor, "vertices 3"]) -> Metric | HeldMetric:
@@ -92,6 +93,7 @@ class LevelContact:
 
     def terms(self, x: Float[Tensor, "vertices 3"], *, keep_pairs: bool = False) -> tuple[Touch, ...]:
         """The forces of what is near positions x [m]; empty where nothing is. Pairs are kept as by `ClothView.term`."""
+        self.let_through(x)
         bodies = None if self.bodies is None else self.bodies.term(x)
         cloth = None if self.cloth is None else self.cloth.term(x, keep_pairs=keep_pairs)
         return tuple(term for term in (bodies, cloth) if term is not None)
@@ -105,10 +107,20 @@ class LevelContact:
         """Positions with their seams closed [m]."""
         return x if self.seam is None else self.seam.closed(x)
 
+    def let_through(self, x: Tensor) -> None:
+        """Let cloth at x [m] through bodies that are between it and its target."""
+        if self.bodies is not None and self.target is not None:
+            self.bodies.let_through(x, self.target)
+
     def moved(self, x: Tensor, wanted: Tensor) -> Tensor:
         """Positions as near to wanted ones as is safe [m], seams closed."""
         wanted = self.closed(wanted)
         return wanted if self.promise is None else self.promise.move(x, wanted)
+
+    def walked(self, x: Tensor, wanted: Tensor) -> Tensor:
+        """The same for the far move from the frame before."""
+        wanted = self.closed(wanted)
+        return wanted if self.promise is None else self.promise.walk(x, wanted)
 
     def uncrossed(
         self, x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"]
@@ -268,6 +280,7 @@ class FrameContact:
         if bodies is not None:
             self._hold(bodies, None)
             for _ in range(PUSHES):
+                view.let_through(x)
                 out, more = bodies.project(x)
                 passes += more
                 x = view.moved(x, out)

@@ -14,6 +14,8 @@ from .safe_move import safe_move
 
 GOES = 3
 """How often a move is taken up again where something was in the way: what was in the way may have gone."""
+LATE, RINGS, SPREADS = 0.25, 8, 16
+"""Edges that cloth lags behind from where it holds up what is beside it, within so many rings, in so many passes."""
 TANGLED = 2
 """Rings round what crosses at the start to which nothing is promised but that no more crosses."""
 
@@ -42,6 +44,20 @@ class Promise:
             return self._go(start, wanted, None)
         x = self._go(start, wanted, self.view.round_crossings(start.to(wanted), rings=TANGLED))
         return x if self.view.look(x).crossings.count <= crossed.count else self._go(start, wanted, None)
+
+    def walk(self, start: Float[Tensor, "vertices 3"], wanted: Float[Tensor, "vertices 3"]) -> Tensor:
+        """The same for a far move: what is held up holds up the cloth beside it, so that it is not torn."""
+        x = self.move(start, wanted)
+        lag = (wanted.double() - x.double()).to(wanted)
+        late = lag.norm(dim=1) > LATE * self.parts.level.spacing
+        if not bool(late.any()):
+            return x
+        around = self.view.grown(late, RINGS)
+        values, held = lag * late.unsqueeze(1), late.unsqueeze(1)
+        for _ in range(SPREADS):
+            share = self.view.mean_beside(values, around)
+            values = torch.where(held, lag, torch.where(around.unsqueeze(1), share, values))
+        return self.move(start, wanted - values)
 
     def _go(self, start: Tensor, wanted: Tensor, exempt: Bool[Tensor, " vertices"] | None) -> Tensor:
         """The same, with nothing promised to some vertices."""

@@ -12,6 +12,8 @@ from ..colliders.sign import MARGIN, ROUNDING, behind, is_clear
 from ..level import Level
 from .measure import Pierced, is_between, pierced, pinched
 
+THROUGH = (0.2, 0.4, 0.6, 0.8, 1.0)
+"""Where on the way to its target a vertex must be inside a body for that to let it pass."""
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
 
@@ -30,6 +32,7 @@ class Track:
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
         held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
         lost: Vertices that lay between overlapping parts in the input, and stay while inside, shape (V,), or None.
+        passing: Vertices whose way to where they belong leads through the body, which lets them, shape (V,), or None.
         inside: Closest points of the vertices with negative distances, as they were found first; or None.
         looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
     """
@@ -43,6 +46,7 @@ class Track:
     longest: float
     held: Tensor | None = None
     lost: Tensor | None = None
+    passing: Tensor | None = None
     inside: Nearest | None = None
     looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
 
@@ -86,6 +90,8 @@ class Track:
         outward = outward * self._outward(which).unsqueeze(1)
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
         normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+        if self.passing is not None:
+            kept &= ~self.passing[which]
         return which[kept], normal[kept], (distance * sign)[kept]
 
     def between(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,6 +109,23 @@ class Track:
             which, asked, found = which[within], asked[within], found.some(within)
         between = torch.nonzero(is_between(found, self.surface.exit(asked, found))).squeeze(1)
         return which[between], self.surface.inside(asked[between], parts=2)
+
+    def let_through(self, x: Tensor, target: Tensor, least: Tensor) -> None:
+        """From now on let vertices at x [m] pass whose way to a target, farther than the least, is through the body."""
+        self.passing = None
+        if not self.surface.closed:
+            return
+        way = target - x
+        length = way.norm(dim=1)
+        near = (self.known - MARGIN * (x - self.at).norm(dim=1) < length) & (length > least) & self.offset.isfinite()
+        which = torch.nonzero(near).squeeze(1)
+        if not len(which):
+            return
+        through = torch.zeros_like(which, dtype=torch.bool)
+        for part in THROUGH:
+            through |= self.surface.inside(x[which] + part * way[which] + self.shift)
+        self.passing = torch.zeros_like(near)
+        self.passing[which[through]] = True
 
     def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
         """How far to look for the surface: what is farther away outside is known well enough by that bound."""
