@@ -4,6 +4,7 @@
         [--way-out 3] [--device cuda] [FOLDER]
 
 Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
+In the walking form, which is being built beside ours, cloth walks from where it was by moves that make nothing cross.
 Prints a row a shot: the sums over frames and garments. The paper's form stands without our last projection, but with
 our mending of what newly crosses. With --way-out cloth between overlapping parts of a body is pushed out by ways so
 many cage edges long, in place of half of one.
@@ -32,6 +33,7 @@ from physgraph_usd.usd.reader import Shot, open_shot
 FORMS = {
     "ours": ContactSettings(),
     "paper": ContactSettings(form="linear", cloth="spheres", projections=0, lifts=0),
+    "walking": ContactSettings(promise=True),
     "elastic": ContactSettings(form="off", cloth="off"),
 }
 SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "crossing": 1, "skirt": 20, "tshirt": 30}

@@ -79,8 +79,16 @@ def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> l
         fine: Fine vertices of each garment.
     """
     pairs = zip(coarse, fine, strict=True)
-    own = lambda f: None if carried.fine is None else carried.fine[f]  # noqa: E731
-    return [Carried(carried.coarse[c], carried.detail[f], carried.frames[c], carried.held, own(f)) for c, f in pairs]
+    return [
+        Carried(
+            carried.coarse[c],
+            carried.detail[f],
+            carried.frames[c],
+            held=carried.held,
+            fine=None if carried.fine is None else carried.fine[f],
+        )
+        for c, f in pairs
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -152,7 +152,6 @@ class Group:
         if self._settings.contact.promise:
             carried = replace(carried, fine=x.double() + torch.as_tensor(origin).to(x.device))
         strain = edge_strain(self.levels[-1], result)
-        told["pre"] = module.energies(x)
         telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start.why} | told
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
         measured, crossing = ({}, None) if judge is None else judge.measure(result)

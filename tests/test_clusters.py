@@ -11,9 +11,9 @@ from brute import Soup, crossings
 from folds import EDGE, SHAPES, crumpled, folded, levels_of, named, placed, square, strip, view_of
 from scipy.sparse import csgraph
 
+from physgraph_usd.collide.clusters import ClusteredParts
 from physgraph_usd.contact import cloth
 from physgraph_usd.contact.cloth_mesh import ClothMesh, Crossings
-from physgraph_usd.collide.clusters import ClusteredParts
 from physgraph_usd.level import Level
 from physgraph_usd.mesh.topology import adjacency, owned_sides
 

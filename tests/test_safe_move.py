@@ -147,7 +147,7 @@ class TestWhatIsFreeToGoGoes:
 
     def test_layers_that_move_together_are_not_held_up(self):
         scenes = Scenes(4, gap=1e-3, far=0.0, dtype=torch.float64)
-        assert not bool(scenes.go(scenes.start + [30.0 * EDGE, 7.0 * EDGE, -11.0 * EDGE]).short.any())
+        assert not bool(scenes.go(scenes.start + EDGE * np.array([30.0, 7.0, -11.0])).short.any())
 
     def test_what_is_in_the_way_holds_up_only_what_it_meets(self):
         scenes = Scenes(2, gap=0.5, far=0.0, dtype=torch.float64)

@@ -1,1 +1,1 @@
-"""Detection: what is near what, what would touch on its way, what crosses. Positions in, answers out; nothing is kept."""
+"""Detection: what is near what, and what would touch on its way. Positions in, answers out; nothing is remembered."""

@@ -1,14 +1,12 @@
 """A level's vertices, edges and faces in clusters, as kernels read them: what can meet what, and which are one."""
 
 # Warp's structs are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 from __future__ import annotations
 
 import numpy as np
-import torch
 import warp as wp
 from jaxtyping import Int
-from torch import Tensor
 
 from ..level import Level
 from ..mesh.topology import adjacency, owned_sides

@@ -1,7 +1,7 @@
 """Every pair of parts that is near, or that would touch where all vertices move along straight lines."""
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ ROUNDING = wp.constant(wp.float64(2.4e-7))
 
 @wp.struct
 class Motion:
-    """Where vertices are, how far they want to go, and which pairs are asked: for their way, or what is within reach."""
+    """Where vertices are, how far they want to go, which pairs are asked, and a distance where nothing moves."""
 
     start: wp.array(dtype=wp.vec3d)
     way: wp.array(dtype=wp.vec3d)
@@ -39,7 +39,7 @@ class Motion:
 
 @wp.struct
 class Sweep:
-    """Of each cluster: the box that its parts sweep, the box where they start, their mean way, how far parts leave it."""
+    """Of each cluster: the boxes that its parts sweep and start in, their mean way, and how far they leave it."""
 
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)
@@ -118,7 +118,7 @@ def is_one(parts: Topology, a: wp.int32, b: wp.int32):
 
 
 @wp.func
-def value_of(
+def value_of(  # noqa: PLR0911 - each pair is refused as early as can be
     face: wp.bool,
     a: wp.int32,
     b: wp.int32,
@@ -327,4 +327,3 @@ def _boxes(size: int, device: str) -> Any:
     sweep.spread = wp.zeros(size, dtype=wp.float64, device=device)
     sweep.asked = wp.zeros(size, dtype=wp.int32, device=device)
     return sweep
-

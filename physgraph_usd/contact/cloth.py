@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..forces.seam import Seam
 from ..collide.near import near_pairs
-from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..collide.parts import Parts
+from ..forces.seam import Seam
+from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
 from ..mesh.topology import joined_by
 from ..scene import Garment

@@ -15,13 +15,13 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..collide.cluster_kernels import clusters_beside, pierced
+from ..collide.clusters import ClusteredParts
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import adjacency, find_edges, joined_by, owned_sides
 from .again import found_again
 from .beside import add_neighbours, beside_table
-from ..collide.cluster_kernels import clusters_beside, pierced
-from ..collide.clusters import ClusteredParts
 from .folds import in_sharp_folds
 from .nearest import Nearest, Pairs
 from .proximity import edges_near, faces_near, vertex_normals

@@ -70,5 +70,7 @@ class Promise:
             # What is left of a way goes on along what was in it.
             rest = wanted.double() - x.double()
             against = (rest * moved.clear).sum(dim=1, keepdim=True).clamp_max(0.0)
-            wanted = torch.where(moved.short.unsqueeze(1), (x.double() + rest - against * moved.clear).to(wanted), wanted)
+            wanted = torch.where(
+                moved.short.unsqueeze(1), (x.double() + rest - against * moved.clear).to(wanted), wanted
+            )
         return x

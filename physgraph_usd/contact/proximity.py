@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from .beside import bits_beside, bits_of_edge, is_own_edge, is_own_face
 from ..collide.cluster_kernels import FAR, are_apart
+from .beside import bits_beside, bits_of_edge, is_own_edge, is_own_face
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,9 +14,9 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..level import Level
 from ..collide.cluster_kernels import clusters_meet
 from ..collide.clusters import Clusters
+from ..level import Level
 
 
 class Regions:

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.parts import Parts
 from ..collide.near import weights
+from ..collide.parts import Parts
 from ..collide.sweep import Pairs, Swept
 
 KEPT = 0.2
