@@ -53,8 +53,11 @@ def author_record(layer: Sdf.Layer, record: Mapping[str, Any]) -> None:
 
 
 def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
-    """The record of a layer that we wrote, or None."""
-    record = layer.customLayerData.get(RECORD)
+    """The record of a layer that we wrote, or None; a damaged file has none."""
+    try:
+        record = layer.customLayerData.get(RECORD)
+    except USD_ERRORS:
+        return None
     return dict(record) if isinstance(record, Mapping) else None
 
 
