@@ -67,7 +67,7 @@ class Allocating(Ending):
     def end(self) -> None:
         import warp as wp  # here: the other workers start without it
 
-        wp.empty((1 << 30, 1 << 30), dtype=wp.uint8, device="cpu")
+        wp.empty((1 << 30, 1 << 30), dtype=float, device="cpu")
 
 
 class Broken(Ending):
