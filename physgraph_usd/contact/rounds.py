@@ -32,6 +32,8 @@ UNSETTLED = 0.2
 pinched between bodies cannot settle and holds up the steps of all the rest."""
 LAST_UNTANGLINGS, LAST_TRIES = 4, 3
 """Rounds that draw out what still crosses at the end, and how often while they help."""
+LONGEST = 16
+"""Most steps of a round: in more of them cloth passes through what it had not seen, and taken back it is strained."""
 RELAXATIONS, WARM_RELAXATIONS, RELAXING = 8, 4, 8
 """Rounds after the last mending, from cold and in a warm frame, and most steps of each, half of those that there are:
 mended cloth is where no force would put it."""
@@ -212,6 +214,7 @@ def solve_rounds(
     reports: list[LevelReport] = []
     share, last = budget.steps if whole else -(-budget.steps // rounds), None
     left = max(budget.steps, share * rounds) if terms else budget.steps
+    share = min(share, LONGEST)
     extra = budget.extra if terms else 0
     kept: list[Carry] = []
     going: Carry | None = None
