@@ -135,6 +135,17 @@ def test_more_steps_do_not_end_higher(real_data: Path):
     assert energies[1] < 5e-3
 
 
+@pytest.mark.real_data
+def test_cloth_between_what_touches_is_solved_as_if_held_there(real_data: Path):
+    """As if it hung free it would have moved by 60 edges at once, and 48 steps of the finest level moved nothing."""
+    file, cloth = real_data / "shots" / "02_makehuman_usdskel_dm.usdc", ["/shot/char/top", "/shot/char/shorts"]
+    shot = open_shot(str(file), garments=cloth, colliders=["/shot/char/body"])
+    refiner = Refiner(shot.scene, RefineOptions(temporal="off").solve_settings(), levels=[2, 2])
+    levels = refiner.solve(shot.frame(41.0)).telemetry[0]["levels"]
+    assert isinstance(levels, list)
+    assert levels[-1]["remaining_move"] < 6.0
+
+
 class TestExtraSteps:
     def test_far_from_rest_there_are_more_steps(self):
         mesh, rest = sheet(8, 6)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..forces.self_contact import SelfContact
 from ..integrate.base import Carry, Integrator, System
+from ..integrate.metric import Metric
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
 from ..level import Level
@@ -30,6 +31,8 @@ STEPS = 4
 UNSETTLED = 0.2
 """Remaining move, in edge lengths, above which the cloth away from what touches is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
+STAYING = 100.0
+"""Stiffness, over that at rest, of the springs that hold what touches then."""
 LAST_UNTANGLINGS, LAST_TRIES = 4, 3
 """Rounds that draw out what still crosses at the end, and how often while they help."""
 LONGEST = 16
@@ -321,7 +324,10 @@ def _solve_apart(
 ) -> tuple[Tensor, list[LevelReport]]:
     """Solve the cloth away from what touches, without it, where it has not settled; what touches stays."""
     held = torch.stack([term.near(level) for term in terms]).any(dim=0)
-    apart = System(plain.field, plain.metric, free=plain.free & ~held, spacing=plain.spacing, level=level)
+    metric = plain.metric
+    if isinstance(metric, Metric):  # Else a piece would be moved as if nothing held it at its rim, and all steps fail.
+        metric = metric.plus(STAYING * metric.diagonal * held.squeeze(1))
+    apart = System(plain.field, metric, free=plain.free & ~held, spacing=plain.spacing, level=level)
     force = apart.energy_and_force(x)[1]
     if apart.remaining_move(apart.apply_metric_inverse(force)) <= UNSETTLED:
         return x, []
