@@ -1,14 +1,14 @@
 """Whether cold frames settle, and whether the cage's triangles show in them.
 
     python -m benchmarks.cold_frames [--count 12] [--level 2] [--steps 12] [--integrator auto] [--shot NAME]
-        [--whole] [FOLDER]
+        [--linear] [--whole] [FOLDER]
 
 Solves frames spread over each sample and, where FOLDER holds real shots, over those, each by itself. Prints a row a
 shot: frames that did not settle (`physgraph_usd.settled`), those that ended with no step that lowers the energy, the
 largest remaining move in tolerances, edges of cloth through cloth in the input and after, evaluations, the part of them
 that line searches spent in vain, the RMS angle between triangles at the cage's edges over that elsewhere (median and
 largest; of the smooth upsampled cage in brackets), and the median time. With --whole each frame has a row, and its
-energy.
+energy. With --linear levels start from linear positions on the level below, facets and all.
 """
 
 from __future__ import annotations
@@ -16,12 +16,16 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from unittest import mock
 
 import click
 import numpy as np
+import torch
 
+from physgraph_usd import level_forces
 from physgraph_usd.group import Group
 from physgraph_usd.level import hinge_geometry
 from physgraph_usd.options import RefineOptions
@@ -87,6 +91,7 @@ class Row:
 @click.option("--integrator", default="auto", show_default=True)
 @click.option("--shot", "shots", multiple=True, help="Only these.")
 @click.option("--whole", is_flag=True, help="A row a frame.")
+@click.option("--linear", is_flag=True, help="Levels start with the facets of the level below.")
 def main(
     folder: Path | None,
     count: int,
@@ -95,6 +100,7 @@ def main(
     integrator: str,
     shots: Sequence[str],
     whole: bool,
+    linear: bool,
 ) -> None:
     """Print the table."""
     prepare_device("cpu")
@@ -103,7 +109,10 @@ def main(
         "| shot | frames | unsettled | stalled | remaining | crossings | evaluations | failed % | folds | most | s |"
     )
     click.echo("|" + "---|" * 11)
-    with tempfile.TemporaryDirectory() as place:
+    with ExitStack() as during:
+        place = during.enter_context(tempfile.TemporaryDirectory())
+        if linear:
+            during.enter_context(mock.patch.object(level_forces, "facets", lambda level, x, *_: torch.zeros_like(x)))
         for name in [*SAMPLES, *MORE_SAMPLES, *([*REAL, *FREE] if folder else ())]:
             if shots and not any(each in name for each in shots):
                 continue

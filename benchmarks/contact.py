@@ -18,26 +18,25 @@ import time
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import trimesh
 
-from physgraph_usd.colliders.pose import Collider, MeshPose
+from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.fabric import PRESETS
 from physgraph_usd.integrate import method_named
-from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
+from physgraph_usd.scene import Frame, GarmentFrame, Scene
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.solve_settings import SolveSettings
+
+from .sheet_over_ball import SheetOverBall
 
 REPEATS = 5
 WARM = 13
 """Frames of the sequence, the first of which is cold."""
 TRAVEL = 0.05
 """Angle by which its folds travel round the ball between frames."""
-SIDE = 79
-EDGE = 0.02
+SHEET = SheetOverBall(side=79, edge=0.02, radius=0.4)
 LANES = 2
 
 
@@ -53,8 +52,8 @@ def main() -> None:
 
 def cold_frames(device: str) -> None:
     """Print the table of frames by themselves, and what each form leaves."""
-    scene, ball = _scene()
-    sheets = [_draped(height) for height in (0.0, -0.003, -0.006)]
+    scene, ball = SHEET.scene(subdivisions=5)
+    sheets = [SHEET.draped(height) for height in (0.0, -0.003, -0.006)]
     far = MeshPose(ball.points + 100.0, ball.triangles)
     cases = {
         "switched off": ("off", "off", ball),
@@ -95,12 +94,12 @@ def cold_frames(device: str) -> None:
 
 def warm_frames(device: str) -> None:
     """Print the table of a sequence's frames, the first left out."""
-    scene, ball = _scene()
+    scene, ball = SHEET.scene(subdivisions=5)
     cases = {"switched off": ("off", "off"), "contact": ("quadratic", "pairs"), "body only": ("quadratic", "off")}
     refiners = {name: _refiner(scene, *forms, device=device, temporal="tether") for name, forms in cases.items()}
     times, work, steps = ({name: list[float]() for name in cases} for _ in range(3))
     for index in range(WARM):
-        points, turned = _draped(0.0, phase=TRAVEL * index), _turned(ball, index)
+        points, turned = SHEET.draped(0.0, phase=TRAVEL * index), _turned(ball, index)
         for name, refiner in refiners.items():
             began, worked = time.perf_counter(), time.process_time()
             state = refiner.solve(Frame(None, (GarmentFrame(points, PRESETS["jersey"]),), (turned,)))
@@ -114,38 +113,10 @@ def warm_frames(device: str) -> None:
         say(f"| {name} | {frame:.0f} | {made:.0f} | {frame / bases[0]:.2f} | {worked / bases[1]:.2f} |")
 
 
-def _scene() -> tuple[Scene, MeshPose]:
-    """A square sheet that feels one ball."""
-    ids = np.arange((SIDE + 1) ** 2).reshape(SIDE + 1, SIDE + 1)
-    quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
-    one = np.ones(ids.size)
-    mesh = PolygonMesh(np.full(len(quads), 4), quads.ravel(), ids.size)
-    garment = Garment("/Sheet", mesh, _flat(), 2, False, False, one, one, one, one, 0.0 * one, colliders=(0,))
-    sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.4)
-    pose = MeshPose(np.asarray(sphere.vertices) - np.array([0.0, 0.4, 0.0]), np.asarray(sphere.faces, np.int32))
-    return Scene((garment,), np.array([0.0, -9.81, 0.0]), (), (Collider("/Ball", "mesh"),)), pose
-
-
 def _turned(ball: MeshPose, index: int) -> MeshPose:
     """The ball turned about the vertical, a little farther each frame."""
     turn = trimesh.transformations.rotation_matrix(TRAVEL * index, [0.0, 1.0, 0.0])[:3, :3]
     return MeshPose(ball.points @ turn.T, ball.triangles)
-
-
-def _flat() -> np.ndarray:
-    axis = EDGE * (np.arange(SIDE + 1) - 0.5 * SIDE)
-    x, z = np.meshgrid(axis, axis)
-    return np.stack([x, 0.0 * x, -z], axis=-1).reshape(-1, 3)
-
-
-def _draped(height: float, phase: float = 0.0) -> np.ndarray:
-    """The sheet bent over the ball, a little too low, and flared with folds outside it, turned by a phase."""
-    flat = _flat()
-    radius, angle = np.hypot(flat[:, 0], flat[:, 2]), np.arctan2(flat[:, 2], flat[:, 0])
-    bend = np.minimum(radius / 0.4, 1.2)
-    out = 0.4 * np.sin(bend) + 0.3 * np.maximum(radius - 0.48, 0.0) * (1.0 + 0.2 * np.cos(9 * (angle - phase)))
-    down = 0.4 * (np.cos(bend) - 1.0) - 0.9 * np.maximum(radius - 0.48, 0.0)
-    return np.stack([out * np.cos(angle), down + height, out * np.sin(angle)], axis=1)
 
 
 def _refiner(scene: Scene, form: str, cloth: str, *, device: str, temporal: str = "off") -> Refiner:

@@ -16,20 +16,20 @@ from typing import Any
 
 import click
 import numpy as np
-import trimesh
 
-from physgraph_usd.colliders.pose import Collider, MeshPose
+from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.fabric import PRESETS
-from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
+from physgraph_usd.scene import Frame, GarmentFrame
 from physgraph_usd.shot import prepare_device
+
+from .sheet_over_ball import SheetOverBall
 
 BEFORE = 5
 """Clean frames before the broken one."""
-SIDE, EDGE, RADIUS = 24, 0.025, 0.15
+SHEET = SheetOverBall(side=24, edge=0.025, radius=0.15)
 DRIFT = np.array([1e-6, 0.0, 0.0])
 """Of a held cage, a frame [m]: equal frames would be taken over as they are."""
 Glitch = Callable[[Frame], Frame]
@@ -105,11 +105,11 @@ def run(
     Returns:
         Fine positions [m], shape (V, 3), and telemetry of each frame; where it failed those of the frame before.
     """
-    scene, ball = _scene()
+    scene, ball = SHEET.scene(subdivisions=4)
     refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[level], lanes=2)
     told: list[tuple[np.ndarray, dict[str, Any]]] = []
     for index in range(BEFORE + 1 + after):
-        points = _draped(travel * index) + index * DRIFT
+        points = SHEET.draped(0.002, travel * index) + index * DRIFT
         frame = Frame(float(index), (GarmentFrame(points, PRESETS["jersey"]),), (ball,))
         frame = glitch(frame) if glitch is not None and index == BEFORE else frame
         try:
@@ -121,34 +121,6 @@ def run(
         assert state.points[0] is not None
         told.append((state.points[0], dict(state.telemetry[0])))
     return told
-
-
-def _scene() -> tuple[Scene, MeshPose]:
-    """A square sheet that feels one ball."""
-    ids = np.arange((SIDE + 1) ** 2).reshape(SIDE + 1, SIDE + 1)
-    quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
-    one = np.ones(ids.size)
-    mesh = PolygonMesh(np.full(len(quads), 4), quads.ravel(), ids.size)
-    garment = Garment("/Sheet", mesh, _flat(), 2, False, False, one, one, one, one, 0.0 * one, colliders=(0,))
-    sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    pose = MeshPose(np.asarray(sphere.vertices) - np.array([0.0, RADIUS, 0.0]), np.asarray(sphere.faces, np.int32))
-    return Scene((garment,), np.array([0.0, -9.81, 0.0]), (), (Collider("/Ball", "mesh"),)), pose
-
-
-def _flat() -> np.ndarray:
-    axis = EDGE * (np.arange(SIDE + 1) - 0.5 * SIDE)
-    x, z = np.meshgrid(axis, axis)
-    return np.stack([x, 0.0 * x, -z], axis=-1).reshape(-1, 3)
-
-
-def _draped(phase: float) -> np.ndarray:
-    """The sheet bent over the ball and flared with folds outside it, turned by a phase [rad]."""
-    flat, rim = _flat(), 1.2 * RADIUS
-    radius, angle = np.hypot(flat[:, 0], flat[:, 2]), np.arctan2(flat[:, 2], flat[:, 0])
-    bend, beyond = np.minimum(radius / RADIUS, 1.2), np.maximum(radius - rim, 0.0)
-    out = RADIUS * np.sin(bend) + 0.3 * beyond * (1.0 + 0.2 * np.cos(9 * (angle - phase)))
-    down = RADIUS * (np.cos(bend) - 1.0) - 0.9 * beyond
-    return np.stack([out * np.cos(angle), down + 0.002, out * np.sin(angle)], axis=1)
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ layer_options = _together(
     click.option("--progress", is_flag=True, help="Say each frame in a line of its own, into files and pipes too."),
     click.option("--strict", is_flag=True, help="Exit with 3 where a frame did not settle."),
     overwrite_option,
-    click.option("--resume", is_flag=True, help="Go on from the finished frames of a run that was interrupted."),
+    click.option("--resume", is_flag=True, help="Go on from the frames and layers that an interrupted run finished."),
     click.option("--keep-frames/--no-keep-frames", default=True, help="Leave finished frames when interrupted."),
     click.option("--dry-run", is_flag=True, help="Print what would be done; write nothing."),
 )
@@ -377,6 +377,7 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
     Finished frames that are left by an interruption are named.
     """
     from .frames import frames_folder
+    from .lock import is_held
 
     made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
     try:
@@ -388,7 +389,8 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
         yield
     finally:
         for kept in filter(Path.is_dir, map(frames_folder, layers)):
-            click.echo(f"finished frames are kept in {kept}; --resume goes on from them", err=True)
+            if not is_held(kept):
+                click.echo(f"finished frames are kept in {kept}; --resume goes on from them", err=True)
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()

@@ -1,6 +1,7 @@
 """Finished frames of a run in a folder beside its layer: they outlive the run when it is interrupted.
 
-One file a frame, whole or not there, and one that says what decides the frames. The folder goes when the layer is done.
+One file a frame, whole or not there, and one that says what decides the frames. The folder goes when the layer is done;
+until then one run holds it.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -17,11 +18,13 @@ from typing import Any
 import numpy as np
 
 from .errors import LayerError, UsageError
+from .lock import LOCK, FolderLock
 from .usd.atomic import temporary_path
 
 RUN = "run.json"
 """The file that says what decides the frames."""
 _DONE, _FAILED, _TEMPORARY = ".npz", ".failed.npz", ".tmp"
+_FRAMES = ".frames"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +48,7 @@ class Outcome:
 
 def frames_folder(layer: Path) -> Path:
     """Where the finished frames of a layer are."""
-    return layer.with_name(layer.name + ".frames")
+    return layer.with_name(layer.name + _FRAMES)
 
 
 class FrameFolder:
@@ -70,34 +73,43 @@ class FrameFolder:
 
         Raises:
             UsageError: The folder holds finished frames of another run, or is not ours.
-            LayerError: The folder cannot be made.
+            LayerError: The folder cannot be made, or another run is at work in it.
         """
         self.folder, self._resumed, self._keep = folder, resume, keep
         wanted = json.loads(json.dumps(run))
         try:
-            found = self._found()
-            different = self._differences(wanted) if found else []
-            if different and (resume or not drop):
-                raise UsageError(
-                    f"{folder} holds {len(found)} finished frames of a run with other {', '.join(different[:3])}; "
-                    "refine as then, or drop them by --overwrite without --resume"
-                )
-            self.kept = frozenset(found if resume else ())
-            self.dropped = 0 if resume or different else len(found)
-            if not self.kept:
-                self.remove()
-            folder.mkdir(exist_ok=True)
-            (folder / RUN).write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+            self._check_ours()
+            self._lock = FolderLock(folder, layer=folder.with_name(folder.name.removesuffix(_FRAMES)))
+            with ExitStack() as unless_taken:
+                unless_taken.callback(self._lock.release)
+                self._take(wanted, resume=resume, drop=drop)
+                unless_taken.pop_all()
         except OSError as error:
             raise LayerError(f"cannot write {folder}: {error.strerror}") from error
 
+    def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
+        """Use or drop what is there."""
+        found = self._found()
+        different = self._differences(wanted) if found else []
+        if different and (resume or not drop):
+            raise UsageError(
+                f"{self.folder} holds {len(found)} finished frames of a run with other {', '.join(different[:3])}; "
+                "refine as then, or drop them by --overwrite without --resume"
+            )
+        self.kept = frozenset(found if resume else ())
+        self.dropped = 0 if resume or different else len(found)
+        if not self.kept:
+            self._clear()
+        (self.folder / RUN).write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+
+    def _check_ours(self) -> None:
+        names = {file.name for file in self.folder.glob("*")}
+        if names and not names & {RUN, LOCK}:
+            raise UsageError(f"{self.folder} is no folder of finished frames; choose another name for the layer")
+
     def _found(self) -> list[int]:
         """Numbers of the whole frames that are there."""
-        if not self.folder.is_dir():
-            return []
-        names = [file.name for file in self.folder.iterdir()]
-        if names and RUN not in names:
-            raise UsageError(f"{self.folder} is no folder of finished frames; choose another name for the layer")
+        names = [file.name for file in self.folder.glob("*")]
         numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
         return [number for number in numbers if zipfile.is_zipfile(self._file(number))]
 
@@ -152,14 +164,11 @@ class FrameFolder:
             raise LayerError(f"{file} is damaged; remove it and --resume") from error
         return Outcome(time, points, reused, record, heat)
 
-    def remove(self) -> None:
-        """Remove our files, and the folder where nothing else is in it."""
-        if self.folder.is_dir():
-            for file in self.folder.iterdir():
-                if file.name == RUN or file.name.endswith(_DONE) or file.name.endswith(_TEMPORARY):
-                    file.unlink(missing_ok=True)
-            with suppress(OSError):
-                self.folder.rmdir()
+    def _clear(self) -> None:
+        """Remove our files but the one that is held."""
+        for file in self.folder.glob("*"):
+            if file.name == RUN or file.name.endswith(_DONE) or file.name.endswith(_TEMPORARY):
+                file.unlink(missing_ok=True)
 
     def __enter__(self) -> FrameFolder:
         """Return itself."""
@@ -168,10 +177,13 @@ class FrameFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Keep the frames of a run that was interrupted, and those that were there before it."""
+        """Keep the frames of a run that was interrupted, and those that were there before it; let go of the folder."""
         unwritten = isinstance(error, LayerError) and not self._resumed
-        if kind is None or unwritten or not (self._keep or self.kept) or not self._found():
-            self.remove()
+        try:
+            if kind is None or unwritten or not (self._keep or self.kept) or not self._found():
+                self._clear()
+        finally:
+            self._lock.release()
 
 
 def _heat_of(data: Mapping[str, np.ndarray], index: int) -> dict[str, np.ndarray]:

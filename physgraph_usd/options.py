@@ -55,7 +55,8 @@ class RefineOptions:
         report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
-        resume: Go on from the finished frames of a run that was interrupted, in ``<layer>.frames``.
+        resume: Go on from the finished frames of a run that was interrupted, in ``<layer>.frames``; a layer that the
+            same run has finished is left as it is.
         keep_frames: Leave finished frames there when the run is interrupted.
         velocities: Also write point velocities of garments that have none in the shot.
         heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.

@@ -109,6 +109,8 @@ def memory_is_named() -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not _MEMORY.search(str(error)):
             raise
+        if "cuda" in str(error).lower():
+            raise SolveError("out of memory on the CUDA device; a lower --level or --device cpu may do") from error
         raise SolveError("out of memory; a lower --level or fewer --workers needs less") from error
 
 

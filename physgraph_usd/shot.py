@@ -31,7 +31,7 @@ from .resolution import too_coarse
 from .settled import told_unsettled, unsettled_frames
 from .usd.atomic import check_place
 from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
-from .usd.provenance import asset_path, file_hashes, write_root
+from .usd.provenance import FAILED, UNSETTLED, asset_path, file_hashes, is_result_of, write_root
 from .usd.reader import Shot, open_shot
 from .usd.writer import LayerWriter
 
@@ -75,6 +75,11 @@ def _refine(shot: str | Path, out: Path, options: RefineOptions, *, began: float
             raise large
         if options.dry_run:
             return report
+        if options.resume and _is_done(opened, out, options):
+            report.warnings.append(f"{out} is taken as done: the same files, options and version made it")
+            report.out = out
+            return report
+        _check_new(out, options)
         _tell(report.warnings, options)
         solver = _ShotSolver(str(shot), [garment["level"] for garment in report.garments], options)
         solver.adopt(opened)
@@ -139,10 +144,22 @@ def _check_places(out: Path, options: RefineOptions) -> None:
     """Refuse before the work, not after an hour of frames, what could not be written then."""
     if not out.resolve().parent.is_dir():
         raise LayerError(f"the folder {out.resolve().parent} does not exist")
+    if not options.resume:
+        _check_new(out, options)
+    for _, path in options.targets(out):
+        check_place(path)
+
+
+def _check_new(out: Path, options: RefineOptions) -> None:
     for _, path in options.targets(out):
         if path.is_file() and not options.overwrite:
             raise UsageError(f"{path} exists; choose another name or allow overwriting")
-        check_place(path)
+
+
+def _is_done(opened: Shot, out: Path, options: RefineOptions) -> bool:
+    """Whether a run with these options has made everything there is to make, from the same files."""
+    made = all(path.is_file() for _, path in options.targets(out)) and not frames_folder(out).exists()
+    return made and is_result_of(out, _provenance(opened, out, options), settled=options.strict)
 
 
 def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
@@ -277,10 +294,10 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
                     options.progress(done, len(times))
         if len(report.failed) == len(times):
             raise SolveError(next(iter(report.failed.values())))
-        start = clock.perf_counter()
-        writer.close()
-        report.seconds["close"] = clock.perf_counter() - start
         report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
+        start = clock.perf_counter()
+        writer.close(lacking={FAILED: list(report.failed) or None, UNSETTLED: len(report.unsettled) or None})
+        report.seconds["close"] = clock.perf_counter() - start
         report.warnings += [str(notice) for notice in writer.notices] + _of_frames(report)
         say_what_was(report)
     report.strict = options.strict

@@ -61,6 +61,15 @@ class Exhausted(Ending):
         np.empty(1 << 50)
 
 
+class Allocating(Ending):
+    """Asks Warp for more than there is."""
+
+    def end(self) -> None:
+        import warp as wp  # here: the other workers start without it
+
+        wp.empty((1 << 30, 1 << 30), dtype=float, device="cpu")
+
+
 class Broken(Ending):
     def end(self) -> None:
         raise GarmentError("/World/cloth", "torn", time=5.0, remedy="mend it")

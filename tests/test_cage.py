@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz.damage import replace
 from pxr import Usd, UsdGeom
 from stages import add_sheet, new_stage, save, sheet_faces
 
@@ -90,6 +91,13 @@ def test_creases_are_told(stage: Usd.Stage) -> None:
     made.CreateCreaseLengthsAttr([2])
     made.CreateCreaseSharpnessesAttr([3.0])
     assert "creaseIndices sharpen" in str(read_cage(made.GetPrim(), 20, ()).notices[0])
+
+
+@pytest.mark.parametrize(("kind", "value"), [("bool", True), ("half", 0.5), ("token", "soft")])
+def test_creases_of_a_wrong_type_are_told_too(stage: Usd.Stage, kind: str, value: object) -> None:
+    prim = mesh(stage, COUNTS, INDICES).GetPrim()
+    replace(stage, prim.GetPath().AppendProperty("creaseIndices"), kind, value)
+    assert "creaseIndices sharpen" in str(read_cage(prim, 20, ()).notices[0])
 
 
 def test_topology_controls_that_usd_does_not_know_are_told(stage: Usd.Stage) -> None:

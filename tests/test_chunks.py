@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cloth import rms
-from frame_solvers import Broken, Counting, Dying, Exhausted, Failing, Killed, Raising, Short
+from frame_solvers import Allocating, Broken, Counting, Dying, Exhausted, Failing, Killed, Raising, Short
 from hypothesis import given
 from hypothesis import strategies as st
 from shots import EDGE, cloth_shot, faults, fine, refine, sample_times
@@ -19,6 +19,7 @@ from shots import EDGE, cloth_shot, faults, fine, refine, sample_times
 from physgraph_usd.chunks import RUN_UP, chunks_of, solve_in_chunks
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SolveError, UsageError
 from physgraph_usd.frames import FrameFolder, Outcome
+from physgraph_usd.processes import memory_is_named
 
 SEAM = 5e-2
 """Largest difference that the number of workers makes, RMS over a frame, in fine edge lengths; 0.036 was measured."""
@@ -91,7 +92,8 @@ def test_a_frame_that_failed_is_handed_on_and_ends_nothing(tmp_path: Path, worke
         (Dying(), SolveError, r"a worker process died \(exit code 9\)"),
         (Killed(), SolveError, r"died \(SIGKILL\), perhaps for lack of memory"),
         (Raising(), PhysGraphError, "unexpected ValueError: a bug"),
-        (Exhausted(), SolveError, "out of memory"),
+        (Exhausted(), SolveError, "out of memory; a lower --level or fewer --workers needs less"),
+        (Allocating(), SolveError, "out of memory; a lower --level or fewer --workers needs less"),
         (Broken(), GarmentError, "</World/cloth> at time code 5: torn"),
         (Short(), SolveError, "without the result of time code 3"),
     ],
@@ -100,6 +102,20 @@ def test_what_ends_a_worker_is_named(tmp_path: Path, solver: Counting, error: ty
     with pytest.raises(error, match=said):
         solve(solver, tmp_path / "f", workers=2, keep=False)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "Failed to allocate 21600000000 bytes on device 'cuda:0'",
+        "CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of 79.10 GiB",
+        "Warp CUDA error 2: out of memory (in function wp_alloc_device_default)",
+    ],
+)
+def test_what_a_gpu_lacks_may_be_there_without_it(said: str):
+    with pytest.raises(SolveError, match="out of memory on the CUDA device; a lower --level or --device cpu"):
+        with memory_is_named():
+            raise RuntimeError(said)
 
 
 class TestKeptFrames:

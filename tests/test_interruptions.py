@@ -17,6 +17,8 @@ import pytest
 from shots import cloth_shot, command, faults, sample_times
 
 from physgraph_usd.frames import frames_folder
+from physgraph_usd.lock import LOCK
+from physgraph_usd.usd.atomic import HOST
 
 TIMES = tuple(float(t) for t in range(1, 61))
 LINE = ("--level", "2", "--steps", "4", "--temporal", "off")
@@ -84,6 +86,7 @@ def test_a_killed_run_leaves_nothing_under_the_name_and_a_rerun_finishes(
         process.send_signal(signal.SIGKILL)
         process.wait()
     assert alive, "the run was over before it was killed: make it longer"
+    assert (frames_folder(out) / LOCK).exists()
     assert not out.exists()
     finishes(shot, out, whole, *(() if seed else ("--resume",)))
 
@@ -120,6 +123,26 @@ def test_a_polite_signal_keeps_finished_frames_and_nothing_else(
     assert all(file.name == "run.json" or file in finished(out) for file in frames_folder(out).iterdir())
     if (number, workers) == (signal.SIGTERM, "1"):
         finishes(shot, out, whole, "--resume", "--workers", "2")
+
+
+def test_a_second_run_leaves_the_frames_of_the_first_alone(shot: Path, whole: bytes):
+    """Two processes with one output; the first one waits where it is until the second has ended, then goes on."""
+    out = shot.parent / "two" / "fine.usdc"
+    out.parent.mkdir()
+    with running(shot, out) as first:
+        first.send_signal(signal.SIGSTOP)
+        there = finished(out)
+        for more in ((), ("--overwrite",)):
+            second = command("refine", shot, "-o", out, *LINE, *more)
+            assert second.returncode == 1, second.stderr
+            who = f"{out} is being made by process {first.pid} on {HOST}; wait for it, end it, or name another layer"
+            assert second.stderr.splitlines()[-1] == f"error: {who}"
+        assert there
+        assert finished(out) == there
+        first.send_signal(signal.SIGCONT)
+        assert first.wait(timeout=60) == 0
+    assert out.read_bytes() == whole
+    assert [file.name for file in out.parent.iterdir()] == [out.name]
 
 
 def test_frames_of_another_run_are_neither_used_nor_dropped_unasked(shot: Path, tmp_path: Path):

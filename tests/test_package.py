@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import zipfile
@@ -12,6 +13,7 @@ import pytest
 import physgraph_usd
 
 ROOT = Path(__file__).resolve().parents[1]
+MADE_BY_RUNS = {"build/"}
 HEAVY = {"torch", "warp", "numpy", "scipy", "trimesh"}
 
 
@@ -68,3 +70,16 @@ def test_wheel_carries_schemas_weights_and_licence(tmp_path: Path) -> None:
         assert f"physgraph_usd/{name}" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "schemas/"))]
+
+
+def test_contributing_names_each_module_and_none_that_is_not_there() -> None:
+    """Its tree holds what is in the package's folder; every file that it names is there."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    package = ROOT / "physgraph_usd"
+    tree = text.partition("physgraph_usd/\n")[2].partition("```")[0]
+    there = {path.name for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert not {name for name in there if not name.startswith("__") and name not in tree}
+    named = re.findall(r"(?<![\w./<>*-])((?:[\w-]+/)*\w[\w-]*\.(?:py|toml|md)|(?:[\w-]+/)+)(?![\w<*])", text)
+    roots = (ROOT, package)
+    assert len(named) > 50
+    assert not sorted({name for name in named if not any((root / name).exists() for root in roots)} - MADE_BY_RUNS)

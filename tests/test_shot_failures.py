@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from pxr import Usd, UsdGeom
-from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_times
+from pxr import Sdf, Usd, UsdGeom
+from shots import CLOTH, EDGE, TIMES, cloth_shot, command, faults, fine, refine, sample_times
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import GarmentError, PhysGraphError
@@ -139,6 +139,22 @@ def test_a_shot_that_is_cut_short_while_it_is_read_is_named(tmp_path: Path, part
     assert done.returncode == 0, done.stderr
     assert "shot.usdc" in done.stdout
     assert "\n" not in done.stdout
+    assert only(tmp_path, "shot.usdc")
+
+
+@pytest.mark.parametrize(("place", "patch"), [(248, b"\x01"), (244, bytes(8)), (128, bytes(8))])
+def test_a_damaged_crate_is_named(tmp_path: Path, place: int, patch: bytes):
+    """A child that is not there, names that are none, a value that is none: USD ends the process, or raises."""
+    shot = tmp_path / "shot.usdc"
+    layer = Sdf.Layer.CreateNew(str(shot))
+    layer.customLayerData = {"a": {"b": Sdf.AssetPath("a.usd"), "active": 1.0, "nested": {"x": {"y": 2}}}}
+    Sdf.PrimSpec(layer, "A", Sdf.SpecifierDef)
+    layer.Save()
+    data = shot.read_bytes()
+    shot.write_bytes(data[:place] + patch + data[place + len(patch) :])
+    done = command("refine", shot, "-o", tmp_path / "fine.usdc")
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.splitlines()[-1].startswith("error: "), done.stderr
     assert only(tmp_path, "shot.usdc")
 
 

@@ -2,7 +2,8 @@
 
 Cloth buckles in many ways, and a descent ends in the one that its start lies nearest to. So several are begun, in
 float64: each integrator of `STARTS` with its steps, then quasi-Newton at the finest level, for as long as that lowers
-the energy; last, Newton from the best two. Where a method that is measured finds less, that is Phi* in the end.
+the energy; last, Newton from each that was among the best two of those tried until then, as a search that ends early
+goes on from no other. Where a method that is measured finds less, that is Phi* in the end.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10
 """How a start goes on, how often at most, and how often more where it is one of the finalists."""
 NEWTON, POLISHES = ("newton", 8), 6
 FINALISTS = 2
+"""How many starts of a search, and of each beginning of it, Newton goes on from."""
 SETTLED = 2e-4
 """Fall of the energy, over the whole fall, under which going on is not worth it: gaps are told to a thousandth."""
 SOLUTION = "chart.solution.{}.npz"
@@ -159,6 +161,12 @@ class _Descent:
         return self
 
 
+def _finalists(runs: Sequence[_Descent]) -> list[_Descent]:
+    """The best of all and the best of each beginning: what a search that ends earlier goes on from is among them."""
+    led = (run for k, run in enumerate(runs) if sum(each.energy < run.energy for each in runs[:k]) < FINALISTS)
+    return sorted(led, key=lambda run: run.energy)
+
+
 def find_reference(
     problem: Problem, frame: Frame, *, settings: SolveSettings = COLD, seconds: float = math.inf, short: bool = False
 ) -> Reference:
@@ -181,7 +189,7 @@ def find_reference(
             f"{method[0]}, {method[1]} steps", method, most=1
         )
         runs.append(descent.go_on(", and on", ON, most=ROUNDS, until=began + DESCENT * seconds))
-    for each in sorted(runs, key=lambda run: run.energy)[:FINALISTS]:
+    for each in _finalists(runs):
         each.go_on(", and on", ON, most=MORE, until=began + seconds)
         each.go_on(", and Newton", NEWTON, most=POLISHES, until=began + seconds)
     best, *others = sorted(runs, key=lambda run: run.energy)

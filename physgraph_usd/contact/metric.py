@@ -21,9 +21,11 @@ from __future__ import annotations
 
 from functools import cached_property
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..integrate.base import Solver
 from ..integrate.metric import Metric
 
 SMOOTH, ROUGH = 0.1, 2.0
@@ -68,6 +70,17 @@ class HeldMetric:
         held = self._held(force)
         self._last = force, force._version, held
         return (force * self._rough).add_(held, alpha=SMOOTH)
+
+    def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
+        """P with max(K, stiffness - D) for K: the solve for cloth that is as stiff as that [N/m] where it is more."""
+        other = HeldMetric(self._plain, torch.maximum(self.stiff, stiffness - self._plain.diagonal.to(stiffness)))
+
+        def solve(force: Tensor) -> Tensor:
+            out = other.solve(force)
+            self._last = other._last
+            return out
+
+        return solve
 
     def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"] | None:
         """R H0^-1 R F [m], by which the remaining move is judged, of the force solved for last; None of any other."""

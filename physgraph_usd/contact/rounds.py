@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..forces.self_contact import SelfContact
 from ..integrate.base import Carry, Integrator, System
+from ..integrate.metric import Metric
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
 from ..level import Level
@@ -30,8 +31,12 @@ STEPS = 4
 UNSETTLED = 0.2
 """Remaining move, in edge lengths, above which the cloth away from what touches is solved once more by itself: cloth
 pinched between bodies cannot settle and holds up the steps of all the rest."""
+STAYING = 100.0
+"""Stiffness, over that at rest, of the springs that hold what touches then."""
 LAST_UNTANGLINGS, LAST_TRIES = 4, 3
 """Rounds that draw out what still crosses at the end, and how often while they help."""
+LONGEST = 16
+"""Most steps of a round: in more of them cloth passes through what it had not seen, and taken back it is strained."""
 RELAXATIONS, WARM_RELAXATIONS, RELAXING = 8, 4, 8
 """Rounds after the last mending, from cold and in a warm frame, and most steps of each, half of those that there are:
 mended cloth is where no force would put it."""
@@ -212,6 +217,7 @@ def solve_rounds(
     reports: list[LevelReport] = []
     share, last = budget.steps if whole else -(-budget.steps // rounds), None
     left = max(budget.steps, share * rounds) if terms else budget.steps
+    share = min(share, LONGEST)
     extra = budget.extra if terms else 0
     kept: list[Carry] = []
     going: Carry | None = None
@@ -318,7 +324,10 @@ def _solve_apart(
 ) -> tuple[Tensor, list[LevelReport]]:
     """Solve the cloth away from what touches, without it, where it has not settled; what touches stays."""
     held = torch.stack([term.near(level) for term in terms]).any(dim=0)
-    apart = System(plain.field, plain.metric, free=plain.free & ~held, spacing=plain.spacing, level=level)
+    metric = plain.metric
+    if isinstance(metric, Metric):  # Else a piece would be moved as if nothing held it at its rim, and all steps fail.
+        metric = metric.plus(STAYING * metric.diagonal * held.squeeze(1))
+    apart = System(plain.field, metric, free=plain.free & ~held, spacing=plain.spacing, level=level)
     force = apart.energy_and_force(x)[1]
     if apart.remaining_move(apart.apply_metric_inverse(force)) <= UNSETTLED:
         return x, []

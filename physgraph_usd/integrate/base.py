@@ -11,6 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+Solver = Callable[[Tensor], Tensor]
+"""From right-hand sides [N] to solutions [m], shape (V, 3)."""
+
 
 @runtime_checkable
 class ForceField(Protocol):
@@ -36,6 +39,10 @@ class Preconditioner(Protocol):
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]."""
+        ...
+
+    def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
+        """R H0^-1 R, R = min(1, D / K)^1/2: the solve for cloth as stiff as K [N/m] where that is more than D, H0's."""
         ...
 
 
@@ -141,10 +148,17 @@ class System:
         energy, force = self.field.energy_and_force(x)
         return float(energy), force if self._all_free else force * self._kept
 
-    def apply_metric_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with."""
+    def apply_metric_inverse(
+        self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
+    ) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with.
+
+        Args:
+            force: F [N].
+            solver: What the metric gave to be used in place of H0^-1, or None.
+        """
         self.metric_solves += 1
-        move = self.metric.solve(force)
+        move = self.metric.solve(force) if solver is None else solver(force)
         return move if self._all_free else move * self._kept
 
     def apply_smooth_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:

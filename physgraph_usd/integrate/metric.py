@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..mesh.stencil import add_at
+from .base import Solver
 from .multifrontal import DissectedSolver, Elimination
 
 REGULARISATION = 1e-7
@@ -38,10 +38,6 @@ def kept_to_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
     couplings = sp.csr_matrix(-(matrix.multiply(pattern + pattern.T)).minimum(0.0))
     excess = np.asarray(matrix.sum(axis=1)).ravel() + np.asarray(couplings.sum(axis=1)).ravel()
     return sp.csr_matrix(sp.diags(excess) - couplings)
-
-
-Solver = Callable[[Tensor], Tensor]
-"""From right-hand sides to solutions, shape (V, 3)."""
 
 
 class Metric:
@@ -104,6 +100,11 @@ class Metric:
         """The solve of R H0^-1 R F [m], R a diagonal, in no more passes than that of H0^-1 F."""
         before, after = self._scaled * factor, self._kept * factor
         return lambda force: self._solver(force * before).mul_(after)
+
+    def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
+        """As of `Preconditioner`."""
+        own = self.diagonal.to(stiffness)
+        return self.between((own / torch.maximum(own, stiffness)).sqrt().unsqueeze(1))
 
 
 class MergedMetric(Metric):

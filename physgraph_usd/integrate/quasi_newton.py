@@ -9,23 +9,28 @@
 
 The two-loop recursion (Nocedal 1980) applied to F needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, so a
 step costs one metric solve and, when the first trial is accepted, one force evaluation.
+
+H0 is of the rest shape. A collapsed triangle is up to 10^5 times as stiff, so that H0^-1 F goes much too far there and
+a line search shortens the steps of the whole garment to nothing. After such a step the metric is made as stiff as the
+present state is (`Preconditioner.stiffened`), which shortens moves there and nowhere else; for as many steps as there
+are secants, since a triangle that opens would stay as slow as it was.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, System
+from .base import Carry, Solver, System
 from .truncation import truncated
 
 ARMIJO = 1e-4
 MAX_BACKTRACKS = 12
 SHORTENED = 0.01
-"""Part of its length to which a step is shortened from which on the secants are dropped."""
+"""Part of its length to which a step is shortened from which on the secants are dropped and the metric is stiffened."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +63,23 @@ class QuasiNewton:
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory."""
         energy, force = system.energy_and_force(x)
-        scale = None if self._use_metric else 1.0 / system.diagonal(x).unsqueeze(1)
-        return self._carry(x, energy, force, _Memory((), scale, self._image(system, scale, force)))
+        inverse = None if self._use_metric else self._present(system, x)
+        return self._begin(system, x, energy, force, inverse=inverse)
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate x anew under forces that changed a little; the secants are kept."""
         memory: _Memory = carry.memory
         energy, force = system.energy_and_force(carry.x)
-        kept = _Memory(memory.pairs, memory.scale, self._image(system, memory.scale, force))
+        kept = replace(memory, image=self._image(system, memory.inverse, force))
         return self._carry(carry.x, energy, force, kept)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One secant step with a backtracking line search; the energy never rises by more than rounding.
 
-        A step that had to be shortened much drops the secants: they misled it, and its own is mostly rounding.
+        A step that had to be shortened much drops the secants: they misled it, and its own is mostly rounding. The
+        next one knows the present state's stiffness.
         """
-        memory: _Memory = carry.memory
+        memory = self._softened(system, carry) if carry.memory.stiff >= self._history else carry.memory
         direction = two_loop(carry.force, memory.image, memory.pairs)
         slope = _dot(carry.force, direction)
         if not slope > 0:
@@ -82,43 +88,64 @@ class QuasiNewton:
         if found is None:
             return self._forget(system, carry)
         x, energy, force = found
-        image = self._image(system, memory.scale, force)
         move = x - carry.x
+        if _dot(move, move) < SHORTENED**2 * _dot(direction, direction):
+            return self._begin(system, x, energy, force, inverse=self._present(system, x))
+        image = self._image(system, memory.inverse, force)
         pair = pair_of(move, carry.force - force, memory.image - image)
         pairs = memory.pairs if pair is None else (*memory.pairs, pair)[-self._history :]
-        if _dot(move, move) < SHORTENED**2 * _dot(direction, direction):
-            pairs = ()
-        return self._carry(x, energy, force, _Memory(pairs, memory.scale, image))
+        return self._carry(x, energy, force, _Memory(pairs, memory.inverse, image, memory.stiff + bool(memory.stiff)))
+
+    def _begin(self, system: System, x: Tensor, energy: float, force: Tensor, *, inverse: Solver | None) -> Carry:
+        stiff = int(inverse is not None and self._use_metric)
+        return self._carry(x, energy, force, _Memory((), inverse, self._image(system, inverse, force), stiff))
+
+    def _softened(self, system: System, carry: Carry) -> _Memory:
+        """The memory of a carry with the metric at rest in place of one that was stiffened."""
+        memory: _Memory = carry.memory
+        pairs = tuple(replace(pair, image=system.apply_metric_inverse(pair.yields)) for pair in memory.pairs)
+        return _Memory(pairs, None, system.apply_metric_inverse(carry.force))
 
     def _carry(self, x: Tensor, energy: float, force: Tensor, memory: _Memory) -> Carry:
         return Carry(x, energy, force, memory.image if self._use_metric else None, self.name, memory)
 
-    def _image(self, system: System, scale: Tensor | None, force: Tensor) -> Tensor:
-        return system.apply_metric_inverse(force) if scale is None else force * scale
+    def _present(self, system: System, x: Tensor) -> Solver:
+        """A guess of the inverse Hessian that knows how stiff the present state is."""
+        stiffness = system.diagonal(x)
+        return system.metric.stiffened(stiffness) if self._use_metric else (1.0 / stiffness.unsqueeze(1)).mul
+
+    def _image(self, system: System, inverse: Solver | None, force: Tensor) -> Tensor:
+        return system.apply_metric_inverse(force, inverse) if inverse is None or self._use_metric else inverse(force)
 
     def _forget(self, system: System, carry: Carry) -> Carry:
-        """No secant step lowers the energy: drop the secants; without any, try one step on the diagonal, then stay.
-
-        The diagonal knows the present state, so it frees a collapsed triangle that holds up the metric's direction.
-        """
+        """No secant step lowers the energy: drop the secants; without any, try one step on the diagonal, then stay."""
         memory: _Memory = carry.memory
         if memory.pairs:
-            return self._carry(carry.x, carry.energy, carry.force, _Memory((), memory.scale, memory.image))
+            inverse = self._present(system, carry.x)
+            return self._begin(system, carry.x, carry.energy, carry.force, inverse=inverse)
         direction = carry.force / system.diagonal(carry.x).unsqueeze(1)
         found = backtrack(system, carry, direction, _dot(carry.force, direction))
         if found is None:
             return carry.moved_by("stayed")
         x, energy, force = found
-        return self._carry(x, energy, force, _Memory((), memory.scale, self._image(system, memory.scale, force)))
+        return self._begin(system, x, energy, force, inverse=self._present(system, x))
 
 
 @dataclass(frozen=True, eq=False)
 class _Memory:
-    """Secant pairs, the diagonal scaling in place of the metric or None, and the image of the present force."""
+    """What is remembered from step to step.
+
+    Attributes:
+        pairs: Secants.
+        inverse: First guess of the inverse Hessian; None for H0^-1.
+        image: That of the present force.
+        stiff: Number of the step since the metric was stiffened, from 1 on; 0 where it was not.
+    """
 
     pairs: tuple[Pair, ...]
-    scale: Tensor | None
+    inverse: Solver | None
     image: Tensor
+    stiff: int = 0
 
 
 def backtrack(

@@ -138,7 +138,7 @@ def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
     authored = [
         attribute.GetName()
         for attribute in (usd.GetCreaseIndicesAttr(), usd.GetCornerIndicesAttr())
-        if attribute.HasAuthoredValue() and len(attribute.Get(Usd.TimeCode.EarliestTime()) or ())
+        if attribute.HasAuthoredValue() and np.size(attribute.Get(Usd.TimeCode.EarliestTime()) or ())
     ]
     said = f"{' and '.join(authored)} sharpen the cage's limit surface; cloth has no sharp edges, so they are dropped"
     return [Notice(str(usd.GetPath()), None, said)] if authored else []

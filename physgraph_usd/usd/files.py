@@ -12,7 +12,7 @@ from pxr import Ar, Sdf, Usd, UsdUtils
 
 from ..errors import UsageError
 from .provenance import read_record
-from .stage import USD_ERRORS, quiet
+from .stage import USD_ERRORS, is_sound, quiet
 
 LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
 """Suffixes of the layers that we write."""
@@ -45,7 +45,8 @@ def files_of(shot: str | Path) -> set[Path]:
 def _layer_of(file: Path) -> Sdf.Layer | None:
     """The layer in a file; None where USD cannot read one."""
     try:
-        return Sdf.Layer.FindOrOpen(str(file)) if Usd.Stage.IsSupportedFile(str(file)) and file.is_file() else None
+        layer = Sdf.Layer.FindOrOpen(str(file)) if Usd.Stage.IsSupportedFile(str(file)) and file.is_file() else None
+        return layer if layer is not None and is_sound(layer) else None
     except (*USD_ERRORS, UnicodeDecodeError):
         return None
 
@@ -60,7 +61,11 @@ def _named_in(file: Path) -> Iterator[str]:
     layer = _layer_of(file)
     if layer is None:
         return
-    for name in chain(*UsdUtils.ExtractExternalReferences(str(file))):
+    try:
+        names = list(chain(*UsdUtils.ExtractExternalReferences(str(file))))
+    except USD_ERRORS:  # a damaged file, which the stage's reader names
+        return
+    for name in names:
         path = Sdf.ComputeAssetPathRelativeToLayer(layer, name)
         if _UDIM in path:
             yield from glob.glob(glob.escape(path).replace(_UDIM, "[0-9]*"))

@@ -19,6 +19,8 @@ from .atomic import prepare_target, publish, temporary_path
 from .stage import TRAVERSAL, USD_ERRORS, reason_of
 
 RECORD = "physgraph"
+FAILED, UNSETTLED = "failed", "unsettled"
+"""Entries of the record: time codes without a sample, and how many were written though they did not settle."""
 _COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
 _NOT_FOR_ROOT = {"subLayers", "subLayerOffsets", "customLayerData", "documentation", "comment", "hasOwnedSubLayers"}
 
@@ -53,9 +55,31 @@ def author_record(layer: Sdf.Layer, record: Mapping[str, Any]) -> None:
 
 
 def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
-    """The record of a layer that we wrote, or None."""
-    record = layer.customLayerData.get(RECORD)
+    """The record of a layer that we wrote, or None; a damaged file has none."""
+    try:
+        record = layer.customLayerData.get(RECORD)
+    except USD_ERRORS:
+        return None
     return dict(record) if isinstance(record, Mapping) else None
+
+
+def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False) -> bool:
+    """Whether a file is a layer that has this in its record, and every frame.
+
+    Args:
+        path: The layer.
+        record: Entries of the record, as `author_record` takes them.
+        settled: Whether every frame must have settled, too.
+    """
+    wanted = Sdf.Layer.CreateAnonymous()
+    author_record(wanted, record)
+    try:
+        layer = Sdf.Layer.FindOrOpen(str(path))
+    except USD_ERRORS:
+        return False
+    there = (read_record(layer) if layer else None) or {}
+    lacking = FAILED in there or (settled and UNSETTLED in there)
+    return not lacking and all(there.get(key) == value for key, value in (read_record(wanted) or {}).items())
 
 
 def recorded_shot(layer: Sdf.Layer) -> str | None:

@@ -242,6 +242,13 @@ def check_there(path: str | Path, kind: type[PhysGraphError] = StageError) -> No
         raise kind(f"no such file: {path}")
 
 
+def is_sound(layer: Sdf.Layer) -> bool:
+    """Whether a layer holds every prim that it lists: USD ends the process where it follows one that is not there."""
+    paths: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(Sdf.Path(path)))
+    return all(not path.isEmpty and (not path.IsPrimPath() or layer.GetPrimAtPath(path)) for path in paths)
+
+
 def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     """Open a stage with all payloads, for reading.
 
@@ -256,6 +263,9 @@ def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     """
     check_there(path)
     with pxr_errors(f"cannot open {path}"), quiet() as diagnostics:
+        root = Sdf.Layer.FindOrOpen(path)
+        if root is not None and not is_sound(root):
+            raise StageError(f"cannot open {path}: it lists prims that it does not hold; the file is damaged")
         stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
         if not stage:
             raise StageError(f"cannot open {path}")

@@ -77,9 +77,8 @@ class LayerWriter:
         check_targets([("the layer", out)], files_of(shot.path))
         _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
-        self._rate, self._velocities = _rate(shot.stage), velocities
-        self._open = True
-        self._record = dict(provenance or {})
+        self._rate, self._velocities, self._open = _rate(shot.stage), velocities, True
+        self._record = {"mode": mode} | dict(provenance or {})
         self.notices: list[Notice] = []
         self.targets: list[Sdf.Path] = []
         self._tracks: list[PointTrack] = []
@@ -99,8 +98,6 @@ class LayerWriter:
         with pxr_errors(f"cannot read {self._shot.path}"):
             for index, steps in enumerate(refinements):
                 self._author_garment(index, steps, span)
-        named = {"shot": provenance.asset_path(self._shot.path, self._stream.target.parent), "mode": self._mode}
-        provenance.author_record(self._stream.layer, named | self._record | _facts(self._shot, self.targets))
 
     def _author_garment(self, index: int, steps: Sequence[Refinement], span: tuple[float, float] | None) -> None:
         """Author one garment's defaults and start its track."""
@@ -190,8 +187,11 @@ class LayerWriter:
         for track, maps in zip(self._heat, heat, strict=False):
             track.check(maps or {}, time)
 
-    def close(self) -> Path:
+    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path:
         """Finish, validate and move the layer to its final name.
+
+        Args:
+            lacking: Entries of the record about what the layer lacks.
 
         Returns:
             The layer's path.
@@ -203,6 +203,8 @@ class LayerWriter:
             raise LayerError(f"no time code was written to {self._stream.target}")
         for track in self._tracks:
             track.finish()
+        facts = _facts(self._shot, self.targets, self._stream.target)
+        provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
         self._stream.flush()
         self._check_written()
         path = self._stream.commit()
@@ -234,10 +236,11 @@ class LayerWriter:
             self._cleanup.close()
 
 
-def _facts(shot: Shot, targets: Sequence[Sdf.Path]) -> dict[str, Any]:
+def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path) -> dict[str, Any]:
     """What the record says of the garments, and of what they were read from."""
     held = zip(targets, shot.sources, strict=True)
     return {
+        "shot": provenance.asset_path(shot.path, out.parent),
         "garments": [str(path) for path in targets],
         "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
         "variants": shot.selections or None,

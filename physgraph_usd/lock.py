@@ -1,0 +1,95 @@
+"""A folder that one process at a time works in; a process that dies, however it dies, lets go of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from .errors import LayerError
+from .usd.atomic import HOST
+
+LOCK = "run.lock"
+"""The file that is held; it says by whom."""
+if sys.platform == "win32":
+    import msvcrt
+
+    def _hold(handle: int) -> None:
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # what is held there cannot be read
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+else:
+    import fcntl
+
+    def _hold(handle: int) -> None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+class FolderLock:
+    """A process's hold on a folder."""
+
+    def __init__(self, folder: Path, *, layer: Path) -> None:
+        """Take hold of a folder, which is made where it is not there.
+
+        Args:
+            folder: The folder.
+            layer: What is made with it, for the message.
+
+        Raises:
+            LayerError: Another run holds it.
+            OSError: The folder cannot be made or written.
+        """
+        self._file = folder / LOCK
+        while True:
+            folder.mkdir(exist_ok=True)
+            self._handle = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
+            if not _held(self._handle):
+                who = os.read(self._handle, 200).decode(errors="replace") or "another run"
+                os.close(self._handle)
+                raise LayerError(f"{layer} is being made by {who}; wait for it, end it, or name another layer")
+            if _is_at(self._file, self._handle):
+                break
+            os.close(self._handle)  # who held it has removed it since
+        os.ftruncate(self._handle, 0)
+        os.write(self._handle, f"process {os.getpid()} on {HOST}".encode())
+
+    def release(self) -> None:
+        """Let go; the folder goes where nothing else is in it."""
+        if os.name == "nt":  # where no file that is open can be removed, by anybody
+            os.close(self._handle)
+        for remove in (self._file.unlink, self._file.parent.rmdir):
+            with suppress(OSError):
+                remove()
+        if os.name != "nt":
+            os.close(self._handle)
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a run is at work in a folder."""
+    try:
+        handle = os.open(folder / LOCK, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        return not _held(handle)
+    finally:
+        os.close(handle)
+
+
+def _held(handle: int) -> bool:
+    """Take hold of an open file, unless another does; a disk that knows no locks lets everybody."""
+    try:
+        _hold(handle)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _is_at(file: Path, handle: int) -> bool:
+    """Whether an open file is still the one of that name."""
+    try:
+        return os.path.samestat(os.fstat(handle), file.stat())
+    except FileNotFoundError:
+        return False
