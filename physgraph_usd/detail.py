@@ -61,6 +61,10 @@ class Carried:
     held: int = 0
     fine: Float[Tensor, "vertices 3"] | None = None
 
+    def about(self, origin: np.ndarray) -> Float[Tensor, "vertices 3"] | None:
+        """Fine positions about an origin [m], float64, where cloth walks; else None."""
+        return None if self.fine is None else self.fine - torch.as_tensor(origin).to(self.fine)
+
 
 def join(parts: Sequence[Carried]) -> Carried:
     """What several garments carry, as one."""

@@ -135,10 +135,8 @@ class Group:
         aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            before = None if kept is None or kept.fine is None else kept.fine - torch.as_tensor(origin).to(kept.fine)
-            x, reports, module, told = self._descend(
-                forces, aim, start, clock, contact=contact, anew=anew, before=before
-            )
+            given = {"contact": contact, "anew": anew, "before": kept and kept.about(origin)}
+            x, reports, module, told = self._descend(forces, aim, start, clock, **given)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         result = self._scaled(aim, x, frames, at=at)
@@ -148,9 +146,7 @@ class Group:
             result, start_next, finished = contact.finish(result)
             x = x if scaled else start_next
         solved = time.perf_counter()
-        carried = replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world), held=start.held)
-        if self._settings.contact.promise:
-            carried = replace(carried, fine=x.double() + torch.as_tensor(origin).to(x.device))
+        carried = self._carried(coarse, x, world, origin=origin, held=start.held)
         strain = edge_strain(self.levels[-1], result)
         telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start.why} | told
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
@@ -170,6 +166,11 @@ class Group:
         # What the last push out of bodies stretches is not carried on.
         torn = strain["p99"] if strain["p99"] <= TORN else edge_strain(self.levels[-1], x)["p99"]
         return Solved(own[0], carried, telemetry, own[1]), torn
+
+    def _carried(self, coarse: Tensor, x: Tensor, world: np.ndarray, *, origin: np.ndarray, held: int) -> Carried:
+        """What the next frame needs; where cloth walks, its positions too."""
+        fine = x.double() + torch.as_tensor(origin).to(x.device) if self._settings.contact.promise else None
+        return replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world), held=held, fine=fine)
 
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()

@@ -68,7 +68,7 @@ def weights(
 
 
 def near_pairs(
-    parts: Parts, x: Float[Tensor, "vertices 3"], within: float, exempt: Bool[Tensor, " vertices"] | None = None
+    parts: Parts, x: Float[Tensor, "vertices 3"], within: float, *, exempt: Bool[Tensor, " vertices"] | None = None
 ) -> NearPairs:
     """Every vertex and face, and every two edges, that share no vertex and are nearer than a distance.
 

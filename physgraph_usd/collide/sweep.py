@@ -50,6 +50,17 @@ class Sweep:
     asked: wp.array(dtype=wp.int32)
 
 
+@wp.struct
+class Found:
+    """Where each cluster's pairs begin, how many it has, and what `Pairs` holds."""
+
+    begin: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    corners: wp.array(dtype=wp.vec4i)
+    value: wp.array(dtype=wp.float64)
+    face: wp.array(dtype=wp.bool)
+
+
 @dataclass(frozen=True, eq=False)
 class Pairs:
     """Pairs of parts.
@@ -112,6 +123,22 @@ def outside(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.v
 
 
 @wp.func
+def reach_of(motion: Motion, sweep: Sweep, i: wp.int32, j: wp.int32):
+    """How much nearer parts of two clusters can come, or the distance asked for."""
+    return wp.length(sweep.mean[i] - sweep.mean[j]) + sweep.spread[i] + sweep.spread[j] + motion.within
+
+
+@wp.func
+def write(found: Found, i: wp.int32, count: wp.int32, corners: wp.vec4i, value: wp.float64, face: wp.bool):
+    """Write a cluster's next pair, if there is room."""
+    place = found.begin[i] + count
+    if place < found.begin[i + 1]:
+        found.corners[place] = corners
+        found.value[place] = value
+        found.face[place] = face
+
+
+@wp.func
 def is_one(parts: Topology, a: wp.int32, b: wp.int32):
     """Whether two vertices are one, or sewn together."""
     return parts.label[a] == parts.label[b]
@@ -157,8 +184,44 @@ def value_of(  # noqa: PLR0911 - each pair is refused as early as can be
     return impact_of(face, x, y, z, w, u, v, p, q, motion.share, motion.floor)
 
 
+@wp.func
+def faces_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp.int32, j: wp.int32, count: wp.int32):
+    """Write the pairs of a cluster's vertices and another's faces; the number of the cluster's pairs so far."""
+    reach = reach_of(motion, sweep, i, j)
+    for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
+        v = parts.vertices[k]
+        at = motion.start[v]
+        if outside(at, at, sweep.from_low[j], sweep.from_high[j], reach):
+            continue
+        for m in range(parts.first_face[j], parts.first_face[j + 1]):
+            t = parts.faces[m]
+            value = value_of(True, v, t[0], t[1], t[2], parts, motion, reach)
+            if value < wp.float64(1.0):
+                write(found, i, count, wp.vec4i(v, t[0], t[1], t[2]), value, True)
+                count += 1
+    return count
+
+
+@wp.func
+def edges_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp.int32, j: wp.int32, count: wp.int32):
+    """The same of the edges of two clusters, each pair once."""
+    reach = reach_of(motion, sweep, i, j)
+    for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
+        e = parts.edges[k]
+        near, far = motion.start[e[0]], motion.start[e[1]]
+        if outside(wp.min(near, far), wp.max(near, far), sweep.from_low[j], sweep.from_high[j], reach):
+            continue
+        for m in range(wp.where(i == j, k + 1, parts.first_edge[j]), parts.first_edge[j + 1]):
+            f = parts.edges[m]
+            value = value_of(False, e[0], e[1], f[0], f[1], parts, motion, reach)
+            if value < wp.float64(1.0):
+                write(found, i, count, wp.vec4i(e[0], e[1], f[0], f[1]), value, False)
+                count += 1
+    return count
+
+
 @wp.kernel
-def pairs_of(  # noqa: C901, PLR0912 - one query, each candidate refused as early as can be
+def pairs_of(
     first: wp.int32,
     parts: Topology,
     motion: Motion,
@@ -166,64 +229,30 @@ def pairs_of(  # noqa: C901, PLR0912 - one query, each candidate refused as earl
     tree: wp.uint64,
     low: wp.array(dtype=wp.vec3f),
     high: wp.array(dtype=wp.vec3f),
-    begin: wp.array(dtype=wp.int32),
-    count: wp.array(dtype=wp.int32),
-    corners: wp.array(dtype=wp.vec4i),
-    value: wp.array(dtype=wp.float64),
-    face: wp.array(dtype=wp.bool),
+    found: Found,
 ):
     """Count the pairs of a cluster's vertices with faces, and of its edges with those of no lower cluster.
 
     They are written from where a cluster's begin, so far as there is room.
     """
     i = first + wp.tid()
-    room = begin[i + 1] - begin[i]
-    if room == 0 and begin[parts.first_vertex.shape[0] - 1] > 0:
+    is_second = found.begin[found.count.shape[0]] > 0
+    if low[i][0] > high[i][0] or (is_second and found.begin[i + 1] == found.begin[i]):
         return
-    found, one = wp.int32(0), wp.float64(1.0)
-    if low[i][0] > high[i][0]:
-        return
+    count, j = wp.int32(0), wp.int32(0)
     query = wp.bvh_query_aabb(tree, low[i], high[i])
-    j = wp.int32(0)
     while wp.bvh_query_next(query, j):
         if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
             continue
         if sweep.asked[i] == 0 and sweep.asked[j] == 0:
             continue
-        reach = wp.length(sweep.mean[i] - sweep.mean[j]) + sweep.spread[i] + sweep.spread[j] + motion.within
+        reach = reach_of(motion, sweep, i, j)
         if outside(sweep.from_low[i], sweep.from_high[i], sweep.from_low[j], sweep.from_high[j], reach):
             continue
-        for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
-            v = parts.vertices[k]
-            at = motion.start[v]
-            if outside(at, at, sweep.from_low[j], sweep.from_high[j], reach):
-                continue
-            for m in range(parts.first_face[j], parts.first_face[j + 1]):
-                t = parts.faces[m]
-                part = value_of(True, v, t[0], t[1], t[2], parts, motion, reach)
-                if part < one:
-                    if found < room:
-                        corners[begin[i] + found] = wp.vec4i(v, t[0], t[1], t[2])
-                        value[begin[i] + found] = part
-                        face[begin[i] + found] = True
-                    found += 1
-        if j < i:
-            continue
-        for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
-            e = parts.edges[k]
-            near, far = motion.start[e[0]], motion.start[e[1]]
-            if outside(wp.min(near, far), wp.max(near, far), sweep.from_low[j], sweep.from_high[j], reach):
-                continue
-            begin_of = wp.where(i == j, k + 1, parts.first_edge[j])
-            for m in range(begin_of, parts.first_edge[j + 1]):
-                f = parts.edges[m]
-                part = value_of(False, e[0], e[1], f[0], f[1], parts, motion, reach)
-                if part < one:
-                    if found < room:
-                        corners[begin[i] + found] = wp.vec4i(e[0], e[1], f[0], f[1])
-                        value[begin[i] + found] = part
-                    found += 1
-    count[i] = found
+        count = faces_met(parts, motion, sweep, found, i, j, count)
+        if j >= i:
+            count = edges_met(parts, motion, sweep, found, i, j, count)
+    found.count[i] = count
 
 
 class Swept:
@@ -282,9 +311,11 @@ class Swept:
         count, begin = (torch.zeros(size + extra, dtype=torch.int32, device=device) for extra in (0, 1))
         out = _room(begin, 0)
         for _ in range(2):  # They are counted, and then written.
-            arrays = [wp.from_torch(begin), wp.from_torch(count), wp.from_torch(out.corners, dtype=wp.vec4i)]
-            arrays += [wp.from_torch(out.value), wp.from_torch(out.face)]
-            self._launch(pairs_of, motion, now, self._tree.id, self._boxes.low, self._boxes.high, *arrays)
+            found = Found()
+            found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
+            found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
+            found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
+            self._launch(pairs_of, motion, now, self._tree.id, self._boxes.low, self._boxes.high, found)
             begin[1:] = count.cumsum(dim=0)
             total = int(begin[-1])
             if not total or len(out.value):

@@ -85,9 +85,8 @@ class LevelBodies:
         before = self._sights or [Sight.none(x)] * len(self._tracks)
         self._sights = [self._look(*each, x) for each in zip(self._tracks, before, strict=True)]
         planes = [each.planes() for sight in self._sights for each in (sight.closest, sight.crease)]
-        if not any(len(each.vertex) for each in planes):
-            return None
-        return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form)
+        seen = any(len(each.vertex) for each in planes)
+        return Contact(self._level, planes, self._settings.stiffness, form=self._settings.form) if seen else None
 
     def _look(self, track: Track, known: Sight, x: Tensor) -> Sight:
         """What is seen of one body; planes of vertices that have hardly moved stay."""
@@ -128,8 +127,8 @@ class LevelBodies:
 
     def let_through(self, x: Float[Tensor, "vertices 3"], target: Float[Tensor, "vertices 3"]) -> None:
         """From now on let vertices at x [m] pass through bodies that are between them and a target [m]."""
-        for track in self._tracks:
-            track.let_through(x, target, PASSING * self._level.spacing)
+        for each in self._tracks:
+            each.let_through(x, target, PASSING * self._level.spacing)
 
     def push_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Free vertices moved to the least clearance, wherever bodies come through faces [m]."""
@@ -140,10 +139,8 @@ class LevelBodies:
         inside, held = (torch.zeros_like(self._level.free[:, 0]) for _ in range(2))
         for track in self._tracks:
             at = x + track.shift
-            if torch.equal(x, track.at):
-                signed = track.known
-            else:
-                signed = signed_distances(track.surface, at, self._level.edges, reach=self._reach)
+            asked = track.surface, at, self._level.edges
+            signed = track.known if torch.equal(x, track.at) else signed_distances(*asked, reach=self._reach)
             signed = torch.where(track.offset.isfinite(), signed, signed.abs())
             depth, pinned = depths(track.surface, at, signed, track.longest)
             inside |= depth > 0
@@ -254,8 +251,7 @@ class LevelBodies:
         stays = (track.known < 0) | ~track.offset.isfinite()
         for other in self._tracks:  # Between two bodies there is no room to lift anything.
             if other is not track:
-                moved = (x - other.at).norm(dim=1)
-                stays |= other.known - moved < 2.0 * self._settings.clearance * other.offset
+                stays |= other.known - (x - other.at).norm(dim=1) < 2.0 * self._settings.clearance * other.offset
         return torch.nonzero(hit & ~stays[triangles].any(dim=1)).squeeze(1)
 
     def _pierced(self, track: Track, x: Tensor) -> Pierced:

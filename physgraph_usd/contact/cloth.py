@@ -239,7 +239,7 @@ class ClothView:
             return self._complete(x)
         pairs, crossings = self._near(x, keep_pairs=keep_pairs)
         self.tangled = crossings.count > 0
-        if self._sides is None or self.tangled or self._settings.promise:
+        if self._sides is None or self.tangled:
             self._sides = x
         if pairs is None:
             return None
@@ -256,7 +256,7 @@ class ClothView:
         sewn = np.zeros((0, 2), np.int64) if self._seam is None else self._seam.pairs
         crossed = self._mesh.crossed(crossings) if crossings.count else None
         within = float(self._thickness.max()) + MARGIN * float(self._level.spacing.mean())
-        near = near_pairs(self._lasting.parts(self._level, sewn), x, within, crossed)
+        near = near_pairs(self._lasting.parts(self._level, sewn), x, within, exempt=crossed)
         corners = near.corners.long()
         at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
         thickness = self._thickness[self._level.vertex_garment[corners[:, [0, 3]]].long()].mean(dim=1)
@@ -308,7 +308,7 @@ class ClothView:
         if not bool(busy.any()):
             self._found = None
             return None, none
-        again = self._settings.promise or self._sides is None or self.tangled or self.before.crossings.count > 0
+        again = self._sides is None or self.tangled or self.before.crossings.count > 0
         crossings = self.look(x).crossings if again else none
         self._mesh.move(x)
         before = None if known is None or part > MOST else known.nearest

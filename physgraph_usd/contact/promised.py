@@ -50,46 +50,69 @@ def solve_promised(
     Raises:
         SolveError: The energy is not finite.
     """
-    x = view.closed(x)
-    most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS * (smoothing is None)
-    reports: list[LevelReport] = []
-    terms = view.terms(x)
-    while view.tangled and len(reports) < most:
-        short = replace(budget, steps=STEPS, tolerance=0.0, extra=0)
-        y, report = solve_level(make_system(terms, x), integrator, x, level=level.index, budget=short)
-        x = view.moved(x, y)
-        reports.append(report)
-        terms = view.terms(x)
+    x, reports = _drawn_out(make_system, integrator, view.closed(x), view=view, level=level, budget=budget)
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
-        x = view.moved(x, leave_saddle(make_system(terms, x), level, x, outward=outward))
-    kept: list[Carry] = []
-    going: Carry | None = None
-    last: System | None = None
-    made = 0
-    for _ in range(ROUNDS):
-        terms = view.terms(x)
+        x = view.moved(x, leave_saddle(make_system(view.terms(x), x), level, x, outward=outward))
+    carry, last, terms = None, None, view.terms(x)
+    for number in range(ROUNDS):
+        terms = view.terms(x) if number else terms
         system = make_system(terms, x)
-        shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
-        y, report = solve_level(
-            system,
-            integrator,
-            x,
-            level=level.index,
-            budget=replace(
-                budget, steps=STEPS, extra=0, tolerance=shrunk * budget.tolerance, rest=budget.rest if not made else 1.0
-            ),
-            observe=lambda carry: kept.__setitem__(slice(None), [carry]),
-            resume=going if last is not None and system.shares_metric(last) else None,
-        )
-        held = system.metric.held(kept[-1].force) if isinstance(system.metric, HeldMetric) else None
-        report.remaining_move = report.remaining_move if held is None else system.remaining_move(held)
+        resume = carry if last is not None and system.shares_metric(last) else None
+        of_round = _budget_of(budget, system, first=not number)
+        y, report, ended = _descended(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         reports.append(report)
-        made += 1
-        y = view.closed(y)
-        x = view.moved(x, y)
-        going = kept[-1] if x is y else None if kept[-1].setbacks else replace(kept[-1], x=x)
-        last = system
+        x, last = view.moved(x, y), system
+        carry = ended if x is y else None if ended.setbacks else replace(ended, x=x)
         if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and x is y):
             break
     return x, reports, terms
+
+
+def _drawn_out(
+    make_system: Callable[[Sequence[Touch], Tensor], System],
+    integrator: Integrator,
+    x: Tensor,
+    *,
+    view: LevelContact,
+    level: Level,
+    budget: Budget,
+) -> tuple[Tensor, list[LevelReport]]:
+    """Rounds of few steps in which contours shorten, at the cage and where the last level or frame left any."""
+    most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS
+    reports: list[LevelReport] = []
+    short = replace(budget, steps=STEPS, tolerance=0.0, extra=0)
+    while len(reports) < most:
+        terms = view.terms(x)
+        if not view.tangled:
+            break
+        y, report = solve_level(make_system(terms, x), integrator, x, level=level.index, budget=short)
+        x = view.moved(x, y)
+        reports.append(report)
+    return x, reports
+
+
+def _budget_of(budget: Budget, system: System, *, first: bool) -> Budget:
+    """The budget of a round: what a held metric calls a small move is that much smaller."""
+    shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
+    rest = budget.rest if first else 1.0
+    return replace(budget, steps=STEPS, extra=0, tolerance=shrunk * budget.tolerance, rest=rest)
+
+
+def _descended(
+    system: System, integrator: Integrator, x: Tensor, *, level: int, budget: Budget, resume: Carry | None
+) -> tuple[Tensor, LevelReport, Carry]:
+    """One round's steps, its report with the remaining move of the smooth part, and where the integrator ended."""
+    kept: list[Carry] = []
+    y, report = solve_level(
+        system,
+        integrator,
+        x,
+        level=level,
+        budget=budget,
+        observe=lambda carry: kept.__setitem__(slice(None), [carry]),
+        resume=resume,
+    )
+    held = system.metric.held(kept[-1].force) if isinstance(system.metric, HeldMetric) else None
+    report.remaining_move = report.remaining_move if held is None else system.remaining_move(held)
+    return y, report, kept[-1]

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..forces.base import ForceModule
-from ..integrate.base import Carry, Integrator, System
+from ..integrate.base import Carry, Integrator, Solver, System
 
 NOISE = 1e-3
 """Root mean square of what a twin's start differs by, in local edge lengths: well above float32's rounding."""
@@ -58,8 +58,12 @@ class JointSystem(System):
         force = force if self._through else force.detach()
         return float(energies.detach().sum()), force * self.free
 
-    def apply_metric_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 F [m], with gradients."""
+    def apply_metric_inverse(
+        self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
+    ) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m], with gradients; without them where another solver is to be used in place of H0^-1."""
+        if solver is not None:
+            return super().apply_metric_inverse(force, solver)
         return cast(Tensor, _MetricSolve.apply(force, self))
 
     @property
