@@ -25,7 +25,7 @@ class TestCagesThatPassThroughOneAnother:
         inputs, results = [], []
         for number, height in enumerate([0.03, 0.015, 0.0, -0.015, 0.0, 0.03]):
             tilted = (flat + 0.2 * flat[:, :1] * [0.0, 1.0, 0.0]) @ turn.T
-            cages = [flat, tilted + [0.004, height, 0.003]]
+            cages = [flat, tilted + np.array([0.004, height, 0.003])]
             points = solver.solve(frame_with(cages, time=float(number))).points
             for found, x in ((inputs, level.from_coarse @ np.concatenate(cages)), (results, np.concatenate(points))):
                 found.append(len(crossings(Soup.of(level, x))))
