@@ -14,7 +14,7 @@ from torch import Tensor
 from ..mesh.lanes import Launch
 from .distance import weights_of
 from .parts import Parts
-from .sweep import Swept
+from .sweep import Listed, Swept
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,7 +68,12 @@ def weights(
 
 
 def near_pairs(
-    parts: Parts, x: Float[Tensor, "vertices 3"], within: float, *, exempt: Bool[Tensor, " vertices"] | None = None
+    parts: Parts,
+    x: Float[Tensor, "vertices 3"],
+    within: float,
+    *,
+    exempt: Bool[Tensor, " vertices"] | None = None,
+    listed: Listed | None = None,
 ) -> NearPairs:
     """Every vertex and face, and every two edges, that share no vertex and are nearer than a distance.
 
@@ -77,10 +82,17 @@ def near_pairs(
         x: Positions [m].
         within: The distance [m].
         exempt: No pair with one of these vertices, or None.
+        listed: Pairs that are asked alone, if all that are so near must be among them; or None.
     """
     at = x.double()
     none = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-    pairs = Swept(parts, at, torch.zeros_like(at), within=within).near(none if exempt is None else exempt)
+    if listed is not None and within <= 2.0 * (listed.reach - listed.far(x)):
+        pairs = listed.pairs
+    else:
+        pairs = Swept(parts, at, torch.zeros_like(at), within=within).near(none)
     weight = weights(at, pairs.corners, pairs.face, lanes=parts.level.lanes)
     way = (weight.unsqueeze(2) * at[pairs.corners.long()]).sum(dim=1)
-    return NearPairs(pairs.corners, weight.to(x), way.to(x), pairs.face)
+    kept = way.norm(dim=1) < within
+    if exempt is not None:
+        kept &= ~exempt[pairs.corners.long()].any(dim=1)
+    return NearPairs(pairs.corners[kept], weight[kept].to(x), way[kept].to(x), pairs.face[kept])

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.lanes import LEAST_QUERIES, Launch
+from .cluster_kernels import has, overlap
 from .impact import distance_of, impact_of
 from .parts import Parts, Topology
 
@@ -20,6 +21,8 @@ wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(wp.float64(1.0e30))
 """Corner of a box that holds nothing."""
+SPARE = 0.05
+"""What is left at least, as a part of a reach, between parts of a pair that is not listed."""
 ROUNDING = wp.constant(wp.float64(2.4e-7))
 """What boxes in single precision are widened by, of their corners' distance from the origin."""
 
@@ -48,6 +51,10 @@ class Sweep:
     mean: wp.array(dtype=wp.vec3d)
     spread: wp.array(dtype=wp.float64)
     asked: wp.array(dtype=wp.int32)
+    edge_low: wp.array(dtype=wp.vec3f)
+    edge_high: wp.array(dtype=wp.vec3f)
+    face_low: wp.array(dtype=wp.vec3f)
+    face_high: wp.array(dtype=wp.vec3f)
 
 
 @wp.struct
@@ -83,6 +90,18 @@ def single(v: wp.vec3d):
     return wp.vec3f(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 
+@wp.func
+def lowest_of(v: wp.vec3d):
+    """In single precision, no higher."""
+    return single(v - ROUNDING * wp.abs(v))
+
+
+@wp.func
+def highest_of(v: wp.vec3d):
+    """In single precision, no lower."""
+    return single(v + ROUNDING * wp.abs(v))
+
+
 @wp.kernel
 def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
     """The boxes of a cluster's corners, where they start and all along, and how they move."""
@@ -111,6 +130,15 @@ def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
     sweep.mean[i] = mean
     sweep.spread[i] = spread
     sweep.asked[i] = asked
+    for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
+        a, b = motion.start[parts.edges[k][0]], motion.start[parts.edges[k][1]]
+        sweep.edge_low[k] = lowest_of(wp.min(a, b))
+        sweep.edge_high[k] = highest_of(wp.max(a, b))
+    for k in range(parts.first_face[i], parts.first_face[i + 1]):
+        t = parts.faces[k]
+        p, q, r = motion.start[t[0]], motion.start[t[1]], motion.start[t[2]]
+        sweep.face_low[k] = lowest_of(wp.min(p, wp.min(q, r)))
+        sweep.face_high[k] = highest_of(wp.max(p, wp.max(q, r)))
 
 
 @wp.func
@@ -153,23 +181,12 @@ def value_of(  # noqa: PLR0911 - each pair is refused as early as can be
     d: wp.int32,
     parts: Topology,
     motion: Motion,
-    reach: wp.float64,
 ):
     """Part of their ways that a vertex and a face, or two edges, may go, or their distance over the one asked for.
 
     It is 1 where they are not to be asked.
-
-    Pairs are refused first where their boxes at the start are farther apart than a reach, the cheapest thing to see.
     """
     none = wp.float64(1.0)
-    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
-    low, high = wp.min(z, w), wp.max(z, w)
-    if face:
-        low, high = wp.min(y, low), wp.max(y, high)
-        if outside(x, x, low, high, reach):
-            return none
-    elif outside(wp.min(x, y), wp.max(x, y), low, high, reach):
-        return none
     if is_one(parts, a, c) or is_one(parts, a, d) or is_one(parts, b, wp.where(face, a, c)):
         return none
     if not face and is_one(parts, b, d):
@@ -178,6 +195,7 @@ def value_of(  # noqa: PLR0911 - each pair is refused as early as can be
         return none
     if motion.exempt[a] or motion.exempt[b] or motion.exempt[c] or motion.exempt[d]:
         return none
+    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
     if motion.within > wp.float64(0.0):
         return distance_of(face, x, y, z, w) / motion.within
     u, v, p, q = motion.way[a], motion.way[b], motion.way[c], motion.way[d]
@@ -193,9 +211,14 @@ def faces_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp
         at = motion.start[v]
         if outside(at, at, sweep.from_low[j], sweep.from_high[j], reach):
             continue
+        low, high = lowest_of(at - wp.vec3d(reach)), highest_of(at + wp.vec3d(reach))
         for m in range(parts.first_face[j], parts.first_face[j + 1]):
+            if not overlap(low, high, sweep.face_low[m], sweep.face_high[m]):
+                continue
             t = parts.faces[m]
-            value = value_of(True, v, t[0], t[1], t[2], parts, motion, reach)
+            if has(t, v):
+                continue
+            value = value_of(True, v, t[0], t[1], t[2], parts, motion)
             if value < wp.float64(1.0):
                 write(found, i, count, wp.vec4i(v, t[0], t[1], t[2]), value, True)
                 count += 1
@@ -211,9 +234,15 @@ def edges_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp
         near, far = motion.start[e[0]], motion.start[e[1]]
         if outside(wp.min(near, far), wp.max(near, far), sweep.from_low[j], sweep.from_high[j], reach):
             continue
+        low = lowest_of(wp.min(near, far) - wp.vec3d(reach))
+        high = highest_of(wp.max(near, far) + wp.vec3d(reach))
         for m in range(wp.where(i == j, k + 1, parts.first_edge[j]), parts.first_edge[j + 1]):
+            if not overlap(low, high, sweep.edge_low[m], sweep.edge_high[m]):
+                continue
             f = parts.edges[m]
-            value = value_of(False, e[0], e[1], f[0], f[1], parts, motion, reach)
+            if e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
+                continue
+            value = value_of(False, e[0], e[1], f[0], f[1], parts, motion)
             if value < wp.float64(1.0):
                 write(found, i, count, wp.vec4i(e[0], e[1], f[0], f[1]), value, False)
                 count += 1
@@ -255,6 +284,21 @@ def pairs_of(
     found.count[i] = count
 
 
+@wp.kernel
+def values_of(
+    first: wp.int32,
+    parts: Topology,
+    motion: Motion,
+    corners: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.bool),
+    value: wp.array(dtype=wp.float64),
+):
+    """The value of each pair of a list."""
+    i = first + wp.tid()
+    c = corners[i]
+    value[i] = value_of(face[i], c[0], c[1], c[2], c[3], parts, motion)
+
+
 class Swept:
     """All parts and the space that they sweep while each vertex moves along a straight line."""
 
@@ -277,7 +321,7 @@ class Swept:
         self._within = within
         self._parts, self._device = parts, str(start.device)
         self._start = start - (start.mean(dim=0) if len(start) else start.new_zeros(3))
-        self._boxes = _boxes(parts.count, self._device)
+        self._boxes = _boxes(parts, self._device)
         none = torch.zeros(len(start), dtype=torch.bool, device=start.device)
         self._launch(sweep_boxes, self._motion(way, asked=none, exempt=none), self._boxes)
         self._tree = wp.Bvh(self._boxes.low, self._boxes.high)
@@ -306,7 +350,7 @@ class Swept:
 
     def _pairs(self, motion: Any) -> Pairs:
         """The pairs that are asked for."""
-        now, size, device = _boxes(self._parts.count, self._device), self._parts.count, self._start.device
+        now, size, device = _boxes(self._parts, self._device), self._parts.count, self._start.device
         self._launch(sweep_boxes, motion, now)
         count, begin = (torch.zeros(size + extra, dtype=torch.int32, device=device) for extra in (0, 1))
         out = _room(begin, 0)
@@ -330,16 +374,61 @@ class Swept:
 
     def _motion(self, way: Tensor, *, asked: Tensor, exempt: Tensor) -> Any:
         """What kernels are told of the vertices."""
-        motion = Motion()
-        motion.within = self._within
-        motion.start, motion.way = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (self._start, way))
-        motion.asked, motion.exempt = (wp.from_torch(each.contiguous()) for each in (asked, exempt))
-        return motion
+        return _motion(self._start, way, asked=asked, exempt=exempt, within=self._within)
 
     def _launch(self, kernel: wp.Kernel, *inputs: object) -> None:
         """Run over the clusters."""
         given = {"device": self._device, "lanes": self._parts.level.lanes, "least": LEAST_QUERIES}
         Launch(kernel, self._parts.count, [self._parts.topology, *inputs], **given)({})
+
+
+class Listed:
+    """All pairs that can touch while no vertex leaves where it is by more than a reach: many short moves ask them alone.
+
+    Attributes:
+        x: Where the vertices are [m], float64.
+        reach: How far they may go [m].
+        pairs: Every pair nearer than twice that.
+    """
+
+    def __init__(self, parts: Parts, x: Float[Tensor, "vertices 3"], reach: float) -> None:
+        """Find the pairs."""
+        self.x, self.reach, self._parts = x.double(), reach, parts
+        none = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+        apart = 2.0 * (1.0 + SPARE) * reach
+        self.pairs = Swept(parts, self.x, torch.zeros_like(self.x), within=apart).near(none)
+
+    def far(self, x: Float[Tensor, "vertices 3"]) -> float:
+        """How far any vertex is from where it was [m]."""
+        return float((x.double() - self.x).norm(dim=1).max()) if len(x) else 0.0
+
+    def impacts(
+        self,
+        start: Float[Tensor, "vertices 3"],
+        way: Float[Tensor, "vertices 3"],
+        *,
+        share: float,
+        floor: float,
+        asked: Bool[Tensor, " vertices"],
+        exempt: Bool[Tensor, " vertices"],
+    ) -> Pairs:
+        """As `Swept.impacts`, for ways that do not leave the reach."""
+        motion, value = _motion(start, way, asked=asked, exempt=exempt), torch.ones_like(self.pairs.value)
+        motion.share, motion.floor = share, floor
+        inputs = [self._parts.topology, motion, wp.from_torch(self.pairs.corners, dtype=wp.vec4i)]
+        inputs += [wp.from_torch(self.pairs.face), wp.from_torch(value)]
+        Launch(values_of, len(value), inputs, device=str(start.device), lanes=self._parts.level.lanes)({})
+        met = value < 1.0
+        return Pairs(self.pairs.corners[met], value[met], self.pairs.face[met])
+
+
+def _motion(start: Tensor, way: Tensor, *, asked: Tensor, exempt: Tensor, within: float = 0.0) -> Any:
+    """What kernels are told of the vertices."""
+    motion = Motion()
+    motion.start, motion.way = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (start, way))
+    motion.asked, motion.exempt = (wp.from_torch(each.contiguous()) for each in (asked, exempt))
+    motion.within = within
+    return motion
 
 
 def _room(like: Tensor, count: int) -> Pairs:
@@ -348,8 +437,9 @@ def _room(like: Tensor, count: int) -> Pairs:
     return Pairs(like.new_zeros((count, 4)), value, torch.zeros(count, dtype=torch.bool, device=like.device))
 
 
-def _boxes(size: int, device: str) -> Any:
+def _boxes(parts: Parts, device: str) -> Any:
     """Room for what is known of clusters."""
+    size = parts.count
     sweep = Sweep()
     for name in ("low", "high"):
         setattr(sweep, name, wp.zeros(size, dtype=wp.vec3f, device=device))
@@ -357,4 +447,7 @@ def _boxes(size: int, device: str) -> Any:
     sweep.mean = wp.zeros(size, dtype=wp.vec3d, device=device)
     sweep.spread = wp.zeros(size, dtype=wp.float64, device=device)
     sweep.asked = wp.zeros(size, dtype=wp.int32, device=device)
+    for name, count in (("edge", len(parts.level.edges)), ("face", len(parts.level.triangles))):
+        for end in ("low", "high"):
+            setattr(sweep, f"{name}_{end}", wp.zeros(count, dtype=wp.vec3f, device=device))
     return sweep

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..collide.near import near_pairs
 from ..collide.parts import Parts
+from ..collide.sweep import Listed
 from ..forces.seam import Seam
 from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
@@ -48,7 +49,7 @@ AHEAD = 0.5
 STALE, FEW, MOST = 0.1, 1e-3, 0.35
 """Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
 has, and everywhere where more than the last part has."""
-HALF, MARGIN = 0.5, 0.3
+HALF, MARGIN = 0.5, 0.1
 LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
 EVERYWHERE = 0.5
@@ -223,7 +224,9 @@ class ClothView:
             return busy
         return torch.ones_like(self._level.free[:, 0])
 
-    def term(self, x: Float[Tensor, "vertices 3"], *, keep_pairs: bool = False) -> SelfContact | Spheres | None:
+    def term(
+        self, x: Float[Tensor, "vertices 3"], *, keep_pairs: bool = False, listed: Listed | None = None
+    ) -> SelfContact | Spheres | None:
         """The force between parts that are near one another, or None where no parts are.
 
         Sides are those of the first positions asked for in which nothing crosses; what crosses is drawn out.
@@ -232,11 +235,12 @@ class ClothView:
             x: Positions [m].
             keep_pairs: Whether the pairs of the last positions serve, at their closest points of now, where nothing
                 crossed there and no large part of the cloth has moved since.
+            listed: Near pairs of cloth that walks, or None.
         """
         if self._settings.cloth == "spheres":
             return self._spheres(x)
         if self._settings.promise:
-            return self._complete(x)
+            return self._complete(x, listed)
         pairs, crossings = self._near(x, keep_pairs=keep_pairs)
         self.tangled = crossings.count > 0
         if self._sides is None or self.tangled:
@@ -249,14 +253,14 @@ class ClothView:
             gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=stiffness))
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
-    def _complete(self, x: Tensor) -> SelfContact | None:
+    def _complete(self, x: Tensor, listed: Listed | None) -> SelfContact | None:
         """The force between all parts that are near, each on its side; what crosses is drawn out."""
         crossings = self.look(x).crossings
         self.tangled = crossings.count > 0
         sewn = np.zeros((0, 2), np.int64) if self._seam is None else self._seam.pairs
         crossed = self._mesh.crossed(crossings) if crossings.count else None
         within = float(self._thickness.max()) + MARGIN * float(self._level.spacing.mean())
-        near = near_pairs(self._lasting.parts(self._level, sewn), x, within, exempt=crossed)
+        near = near_pairs(self._lasting.parts(self._level, sewn), x, within, exempt=crossed, listed=listed)
         corners = near.corners.long()
         at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
         thickness = self._thickness[self._level.vertex_garment[corners[:, [0, 3]]].long()].mean(dim=1)

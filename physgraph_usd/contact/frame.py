@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..collide.sweep import Listed
 from ..forces.contact import Contact
 from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact, Spheres
@@ -91,11 +92,13 @@ class LevelContact:
         """Whether cloth crosses cloth at positions x [m]."""
         return self.cloth is not None and self.cloth.look(x).crossings.count > 0
 
-    def terms(self, x: Float[Tensor, "vertices 3"], *, keep_pairs: bool = False) -> tuple[Touch, ...]:
+    def terms(
+        self, x: Float[Tensor, "vertices 3"], *, keep_pairs: bool = False, listed: Listed | None = None
+    ) -> tuple[Touch, ...]:
         """The forces of what is near positions x [m]; empty where nothing is. Pairs are kept as by `ClothView.term`."""
         self.let_through(x)
         bodies = None if self.bodies is None else self.bodies.term(x)
-        cloth = None if self.cloth is None else self.cloth.term(x, keep_pairs=keep_pairs)
+        cloth = None if self.cloth is None else self.cloth.term(x, keep_pairs=keep_pairs, listed=listed)
         return tuple(term for term in (bodies, cloth) if term is not None)
 
     def look_in_folds(self, wanted: bool) -> None:
@@ -112,10 +115,14 @@ class LevelContact:
         if self.bodies is not None and self.target is not None:
             self.bodies.let_through(x, self.target)
 
-    def moved(self, x: Tensor, wanted: Tensor) -> Tensor:
+    def moved(self, x: Tensor, wanted: Tensor, listed: Listed | None = None) -> Tensor:
         """Positions as near to wanted ones as is safe [m], seams closed."""
         wanted = self.closed(wanted)
-        return wanted if self.promise is None else self.promise.move(x, wanted)
+        return wanted if self.promise is None else self.promise.move(x, wanted, listed=listed)
+
+    def listed(self, x: Tensor, known: Listed | None) -> Listed | None:
+        """As `Promise.listed`; None without cloth."""
+        return None if self.promise is None else self.promise.listed(x, known)
 
     def walked(self, x: Tensor, wanted: Tensor) -> Tensor:
         """The same for the far move from the frame before."""

@@ -54,15 +54,16 @@ def solve_promised(
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
         x = view.moved(x, leave_saddle(make_system(view.terms(x), x), level, x, outward=outward))
-    carry, last, terms = None, None, view.terms(x)
+    carry, last, terms, listed = None, None, (), None
     for number in range(ROUNDS):
-        terms = view.terms(x) if number else terms
+        listed = view.listed(x, listed)
+        terms = view.terms(x, listed=listed)
         system = make_system(terms, x)
         resume = carry if last is not None and system.shares_metric(last) else None
         of_round = _budget_of(budget, system, first=not number)
         y, report, ended = _descended(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         reports.append(report)
-        x, last = view.moved(x, y), system
+        x, last = view.moved(x, y, listed), system
         carry = ended if x is y else None if ended.setbacks else replace(ended, x=x)
         if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and x is y):
             break

@@ -11,6 +11,7 @@ Exempt are pairs that touch at the start (distance 0), and pairs with a vertex t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from ..collide.near import weights
 from ..collide.parts import Parts
-from ..collide.sweep import Pairs, Swept
+from ..collide.sweep import Listed, Pairs, Swept
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
@@ -55,6 +56,7 @@ def safe_move(
     *,
     floor: float,
     exempt: Bool[Tensor, " vertices"] | None = None,
+    listed: Listed | None = None,
 ) -> Moved:
     """Move vertices as far towards wanted positions as no pair of parts comes too near.
 
@@ -68,6 +70,7 @@ def safe_move(
         parts: What may touch what.
         floor: Distance under which a pair keeps nine tenths of what it has [m]: gaps end there.
         exempt: Vertices to which nothing is promised, or None.
+        listed: Pairs that are asked alone where neither the start nor what is wanted leaves their reach, or None.
 
     Returns:
         Positions, ``wanted`` itself where nothing is in the way, and how far vertices have come.
@@ -78,10 +81,11 @@ def safe_move(
     none = torch.zeros(len(way), dtype=torch.bool, device=way.device)
     exempt = none if exempt is None else exempt
     x, asked = wanted, (way != 0).any(dim=1)
-    swept = Swept(parts, at, way)
+    covered = listed is not None and max(listed.far(start), listed.far(wanted)) <= listed.reach
+    impacts = partial(listed.impacts, at) if listed is not None and covered else Swept(parts, at, way).impacts
     clear = torch.zeros_like(way)
     for attempt in range(len(way) + SHORTENINGS):
-        met = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, exempt=exempt)
+        met = impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, exempt=exempt)
         if not len(met.value):
             break
         least = torch.ones_like(share)
