@@ -173,7 +173,7 @@ def is_one(parts: Topology, a: wp.int32, b: wp.int32):
 
 
 @wp.func
-def value_of(  # noqa: PLR0911 - each pair is refused as early as can be
+def value_of(
     face: wp.bool,
     a: wp.int32,
     b: wp.int32,
@@ -383,7 +383,7 @@ class Swept:
 
 
 class Listed:
-    """All pairs that can touch while no vertex leaves where it is by more than a reach: many short moves ask them alone.
+    """All pairs that can touch while no vertex leaves where it is by more than a reach: short moves ask them alone.
 
     Attributes:
         x: Where the vertices are [m], float64.

@@ -17,6 +17,8 @@ from .metric import SMOOTH, HeldMetric
 
 ROUNDS, STEPS = 10, 4
 """Most rounds of a level, and steps of each."""
+NEAR = 10.0
+"""Tolerances of remaining move under which a warm frame makes no more steps than its budget has."""
 UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
 """Most rounds that draw out what crosses: from cold at the cage, and in a warm frame."""
 
@@ -65,9 +67,19 @@ def solve_promised(
         reports.append(report)
         x, last = view.moved(x, y, listed), system
         carry = ended if x is y else None if ended.setbacks else replace(ended, x=x)
-        if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and x is y):
+        if _ends(report, short=x is not y) or (smoothing is None and _serves(report, budget, number + 1)):
             break
     return x, reports, terms
+
+
+def _ends(report: LevelReport, *, short: bool) -> bool:
+    """Whether no round follows one of this report; it does where one that settled was cut short."""
+    return report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not short)
+
+
+def _serves(report: LevelReport, budget: Budget, rounds: int) -> bool:
+    """Whether a warm frame has made its steps and is near enough to rest."""
+    return rounds * STEPS >= budget.steps and report.remaining_move < NEAR * budget.tolerance
 
 
 def _drawn_out(
