@@ -76,8 +76,8 @@ class QuasiNewton:
     def step(self, system: System, carry: Carry) -> Carry:
         """One secant step with a backtracking line search; the energy never rises by more than rounding.
 
-        A step that had to be shortened much drops the secants: they misled it, and its own is mostly rounding. The
-        next one knows the present state's stiffness.
+        A step that had to be shortened much drops the secants: they misled it, and its own is mostly rounding. Where
+        the next one has to be, too, the metric misled both, and the one after knows the present state's stiffness.
         """
         memory = self._softened(system, carry) if carry.memory.stiff >= self._history else carry.memory
         direction = two_loop(carry.force, memory.image, memory.pairs)
@@ -90,7 +90,10 @@ class QuasiNewton:
         x, energy, force = found
         move = x - carry.x
         if _dot(move, move) < SHORTENED**2 * _dot(direction, direction):
-            return self._begin(system, x, energy, force, inverse=self._present(system, x))
+            again = memory.shortened and not memory.stiff
+            inverse = self._present(system, x) if again or not self._use_metric else None
+            begun = self._begin(system, x, energy, force, inverse=inverse)
+            return replace(begun, memory=replace(begun.memory, shortened=True))
         image = self._image(system, memory.inverse, force)
         pair = pair_of(move, carry.force - force, memory.image - image)
         pairs = memory.pairs if pair is None else (*memory.pairs, pair)[-self._history :]
@@ -139,6 +142,7 @@ class _Memory:
         pairs: Secants.
         inverse: First guess of the inverse Hessian; None for H0^-1.
         image: That of the present force.
+        shortened: Whether it begins with a step that had to be shortened much.
         stiff: Number of the step since the metric was stiffened, from 1 on; 0 where it was not.
     """
 
@@ -146,6 +150,7 @@ class _Memory:
     inverse: Solver | None
     image: Tensor
     stiff: int = 0
+    shortened: bool = False
 
 
 def backtrack(
