@@ -55,9 +55,9 @@ def cloth_shot(
     stage = new_stage(path, metres=EDGE)
     mesh = add_sheet(stage, CLOTH, times=times, size=size, kind=kind)
     attribute = mesh.GetPointsAttr()
-    first = np.array(attribute.Get(times[0]))
+    still = np.array(attribute.Get(times[0])) if frozen else None
     for time in times:
-        points = first if frozen else np.asarray(attribute.Get(time))
+        points = np.asarray(attribute.Get(time)) if still is None else still
         attribute.Set(vec3(points * (broken or {}).get(time, 1.0)), time)
     return Path(save(stage))
 
