@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import reduce
 from statistics import median
 
 import numpy as np
@@ -21,6 +22,7 @@ from .mesh.subdivide import Refinement
 from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State, out_of_bounds, refuse_far
 from .solve_settings import SolveSettings
+from .strain import has_collapsed, size_left
 
 
 class Refiner:
@@ -71,6 +73,7 @@ class Refiner:
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
         self._last: list[Known | None] = [None] * len(scene.garments)
         self._before: list[Known | None] = [None] * len(scene.garments)
+        self._unsolved = set[int]()  # Garments whose last result is no solution.
         self._time: float | None = None
 
     @staticmethod
@@ -149,18 +152,15 @@ class Refiner:
         telemetry: list[dict[str, object]] = [{"start": "left out: the garment has no sample here"}] * count
         reused = [False] * count
         for part in self._parts.of(frame.garments):
-            known = [self._last[index] for index in part]
-            same = self._same(part, frame, known)
+            same = self._same(part, frame, [self._last[index] for index in part])
             for index in part:
-                reused[index] = same
+                reused[index] = same and index not in self._unsolved
             if not any(asked[index] for index in part):
                 continue
-            entries: list[dict[str, object]] = [{"start": "reused: the input equals the last frame's"}] * len(part)
-            if not same:
-                known, entries = self._solve_part(part, frame, gap=gap)
-            for index, each, entry in zip(part, known, entries, strict=True):
-                if asked[index] and each is not None:
-                    points[index], telemetry[index] = each.points, entry
+            self._unsolved -= {index for index in part if asked[index]}
+            for index, each, entry in zip(part, *self._answer(part, frame, same=same, gap=gap), strict=True):
+                if asked[index]:
+                    points[index], telemetry[index] = each, entry
         self._time = frame.time
         for index, passed in enumerate(self._passed.look(frame)):
             telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
@@ -186,10 +186,24 @@ class Refiner:
         offsets = [[f.offset if body in own else None for body in near] for own, f in zip(felt, frames, strict=True)]
         return self._bodies.touching(near, offsets)
 
+    def _answer(
+        self, part: tuple[int, ...], frame: Frame, *, same: bool, gap: bool
+    ) -> tuple[list[np.ndarray], list[dict[str, object]]]:
+        """Fine positions of garments and their telemetry: upsampled, taken over, or solved."""
+        first, points = self._scene.garments[part[0]], frame.garments[part[0]].points
+        if has_collapsed(first, points):  # It is alone, and the next frame starts from the last one solved.
+            self._unsolved.add(part[0])
+            told = {"start": "not solved: the cage has collapsed", "collapsed": size_left(first, points)}
+            return [reduce(lambda x, step: np.asarray(step.linear @ x), self.refinements[part[0]], points)], [told]
+        if not same:
+            return self._solve_part(part, frame, gap=gap)
+        entries: list[dict[str, object]] = [{"start": "reused: the input equals the last frame's"}] * len(part)
+        return [each.points for each in (self._last[index] for index in part) if each is not None], entries
+
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
-    ) -> tuple[list[Known | None], list[dict[str, object]]]:
-        """Solve garments together and keep what their next frame needs; returns that and their telemetry."""
+    ) -> tuple[list[np.ndarray], list[dict[str, object]]]:
+        """Solve garments together and keep what their next frame needs; returns their positions and telemetry."""
         frames = [frame.garments[index] for index in part]
         group, near = self.group_of(part), self._near(part, frames)
         last = [self._last[index] for index in part]
@@ -221,7 +235,7 @@ class Refiner:
             self._last[index] = Known(
                 frame.time, each, frame.colliders, near, part, solved.points[place], own[place], solved.crossing[place]
             )
-        return [self._last[index] for index in part], [entry] * len(part)
+        return solved.points, [entry] * len(part)
 
     def _broken(self, part: tuple[int, ...], frame: Frame, near: Sequence[int]) -> float | None:
         """Time code of the last frame, if garments' input left its place in it alone."""
@@ -244,7 +258,7 @@ class Refiner:
         finest, rest = (chain[-1].mesh, None) if chain else (garment.mesh, garment.rest)
         triangles = finest.triangulate(rest).triangles
         edges = edges_of(triangles, len(points)).vertices
-        known = self._last[index]
+        known = None if index in self._unsolved else self._last[index]
         crossing = np.zeros(len(points), bool) if known is None else known.crossing
         crossing = crossing | body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
         depth = penetration_map(surfaces, points, edges, device=self._device)

@@ -1,13 +1,15 @@
-"""Which frames the solver left unsettled: what the warning, `--strict` and the report say of them."""
+"""Which frames the solver left unsettled or unsolved: what the warning, `--strict` and the report say of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from itertools import groupby
 from typing import Any
 
 from .integrate.solve import FAR
+
+COLLAPSED = "collapsed"
 
 
 @dataclass(frozen=True)
@@ -16,16 +18,20 @@ class Unsettled:
 
     Attributes:
         level: The level at which it did not.
-        remaining_move: RMS of H0^-1 F there, in local edge lengths.
-        stopped: Why its steps ended, as `LevelReport` says it.
+        remaining_move: RMS of H0^-1 F there, in local edge lengths; None where there was nothing to solve.
+        stopped: Why its steps ended, as `LevelReport` says it, or `COLLAPSED`.
+        size: Of the cage over its rest shape's, where it has collapsed.
     """
 
     level: int
-    remaining_move: float
+    remaining_move: float | None
     stopped: str
+    size: float | None = None
 
     def __str__(self) -> str:
         """In words."""
+        if self.size is not None:
+            return f"the cage has shrunk to {self.size:.2g} of its rest shape's size"
         why = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
         return f"level {self.level} would still move by {self.remaining_move:.2g} edges ({why})"
 
@@ -34,12 +40,14 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
     """Whether one garment's frame did not settle.
 
     It did not where a level's last descent ended because no step lowered the energy while it was not at rest, or where
-    the finest level's remaining move is over `FAR` tolerances.
+    the finest level's remaining move is over `FAR` tolerances. A cage that has collapsed was not solved at all.
 
     Args:
         entry: The frame's telemetry of the garment.
         tolerance: Of the solve, in local edge lengths.
     """
+    if "collapsed" in entry:
+        return Unsettled(0, None, COLLAPSED, float(entry["collapsed"]))
     last = {each["level"]: each for each in entry.get("levels", ())}
     finest = max(last, default=0)
     for level in sorted(last, reverse=True):
@@ -72,18 +80,24 @@ def unsettled_frames(
 
 
 def told_unsettled(found: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A warning a garment: the frame that is farthest from rest, and the time codes of all others."""
+    """Warnings of each garment: its frame that is farthest from rest, its first that collapsed, and all other ones."""
     said = []
     for path, each in groupby(found, key=lambda entry: str(entry["path"])):
-        worst, *others = sorted(each, key=lambda entry: -entry["remaining_move"])
-        at, codes = _code(worst["time"]), ", ".join(_code(entry["time"]) for entry in others)
-        how = Unsettled(worst["level"], worst["remaining_move"], worst["stopped"])
-        said.append(
-            f"<{path}> at time code {at}: the frame did not settle: {how}; more --steps may help"
-            + (f"; nor did time code {codes}" if codes else "")
-        )
+        entries = list(each)
+        collapsed = [entry for entry in entries if entry["stopped"] == COLLAPSED]
+        moving = [entry for entry in entries if entry["stopped"] != COLLAPSED]
+        moving.sort(key=lambda entry: -entry["remaining_move"])
+        said += _told(path, moving, "the frame did not settle: {}; more --steps may help", others="nor did")
+        remedy = "cache that frame again, or leave it out with --frames"
+        said += _told(path, collapsed, f"{{}}; the frame is upsampled, not solved: {remedy}", others="so it is at")
     return said
 
 
-def _code(time: float | None) -> str:
-    return "default" if time is None else f"{time:g}"
+def _told(path: str, entries: Sequence[Mapping[str, Any]], said: str, *, others: str) -> list[str]:
+    """A warning of the first entry, with the time codes of the others; none of no entries."""
+    if not entries:
+        return []
+    first, *codes = ["default" if entry["time"] is None else f"{entry['time']:g}" for entry in entries]
+    how = Unsettled(**{own.name: entries[0][own.name] for own in fields(Unsettled)})
+    more = f"; {others} time code {', '.join(codes)}" if codes else ""
+    return [f"<{path}> at time code {first}: {said.format(how)}{more}"]

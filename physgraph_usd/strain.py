@@ -21,6 +21,9 @@ LEAST_SHARE = 0.01
 COVERED = 0.9
 """Share of a part's faces inside a subset that gives it its name."""
 MOST_NAMED = 3
+COLLAPSED = 0.01
+"""Size of a cage over its rest shape's below which there is nothing to solve: edges that are centimetres long at rest
+are shorter there than cloth is thick, so all of it touches all of it."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,17 @@ def stretched(path: str, source: str, parts: Sequence[StrainedPart]) -> str:
         f"<{path}>: in most frames the cage is larger than its rest shape ({source}), to which refined cloth shrinks: "
         f"{named}{more}; give --rest auto or --rest FRAME, or author primvars:rest"
     )
+
+
+def size_left(garment: Garment, points: np.ndarray) -> float:
+    """How large a cage at positions [m], shape (V, 3), is along its longest axis over its rest shape; 1 without one."""
+    sizes = [float(np.ptp(each, axis=0).max()) if len(each) else 0.0 for each in (points, garment.rest)]
+    return sizes[0] / sizes[1] if sizes[1] > 0 else 1.0
+
+
+def has_collapsed(garment: Garment, points: np.ndarray) -> bool:
+    """Whether a cage at positions [m], shape (V, 3), has shrunk to nothing."""
+    return size_left(garment, points) < COLLAPSED
 
 
 def _face_areas(garment: Garment, points: np.ndarray) -> np.ndarray:

@@ -55,8 +55,9 @@ def cloth_shot(
     stage = new_stage(path, metres=EDGE)
     mesh = add_sheet(stage, CLOTH, times=times, size=size, kind=kind)
     attribute = mesh.GetPointsAttr()
+    still = np.array(attribute.Get(times[0])) if frozen else None
     for time in times:
-        points = np.asarray(attribute.Get(times[0] if frozen else time))
+        points = np.asarray(attribute.Get(time)) if still is None else still
         attribute.Set(vec3(points * (broken or {}).get(time, 1.0)), time)
     return Path(save(stage))
 

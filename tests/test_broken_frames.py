@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
-from shots import CLOTH, cloth_shot, fine, refine
+from layers import world_metres
+from pxr import Usd
+from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine
+from stages import add_sheet, new_stage, save, vec3
 
 from benchmarks.glitches import BEFORE, GLITCHES, run
 
@@ -36,6 +41,52 @@ def test_a_warning_names_the_frame(tmp_path: Path, scale: float):
     assert not [each for each in unbroken.warnings if "leaves its place" in each]
     pair = [fine(shot, tmp_path / name, 6.0) for name in ("fine.usdc", "unbroken.usdc")]
     assert np.abs(pair[0] - pair[1]).max() < 1e-3
+
+
+def test_a_cage_in_one_point_is_upsampled_at_once():
+    """Solved, each of its boxes overlaps all others: level 2 took over four minutes."""
+    told = run(2, 1, travel=0.0, glitch=GLITCHES["cage in one point"])
+    points, entry = told[BEFORE]
+    assert np.ptp(points, axis=0).max() < 1e-9
+    assert entry["start"].startswith("not solved")
+    assert told[BEFORE + 1][1]["start"] == "warm"
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+@pytest.mark.parametrize("when", [1.0, 3.0])
+def test_a_collapsed_frame_is_told_of_and_counts_as_unsettled(tmp_path: Path, when: float, frozen: bool):
+    shot = cloth_shot(tmp_path / "shot.usdc", broken={when: 1e-3}, frozen=frozen)
+    whole = cloth_shot(tmp_path / "whole.usdc", frozen=frozen)
+    began = perf_counter()
+    report = refine(shot, tmp_path / "fine.usdc", strict=True)
+    assert perf_counter() - began < 60.0
+    (warning,) = (each for each in report.warnings if each.startswith(f"<{CLOTH}> at time code {when:g}: "))
+    assert "0.001 of its rest shape's size" in warning
+    assert "--frames" in warning
+    assert [(entry["path"], entry["time"]) for entry in report.unsettled] == [(CLOTH, when)]
+    assert (report.exit_code, faults(tmp_path / "fine.usdc", shot)) == (3, [])
+    json.loads(report.to_json(), parse_constant=pytest.fail)
+    coarse = world_metres(Usd.Stage.Open(str(shot)), CLOTH, when)
+    assert np.abs(fine(shot, tmp_path / "fine.usdc", when)[: len(coarse)] - coarse).max() < 1e-6
+    refine(whole, tmp_path / "unbroken.usdc")
+    pair = [fine(shot, tmp_path / name, 4.0) for name in ("fine.usdc", "unbroken.usdc")]
+    assert np.abs(pair[0] - pair[1]).max() < 1e-3
+
+
+def test_one_garment_of_two_collapses(tmp_path: Path):
+    """The other one, which it lies upon, is solved as if it were alone."""
+    stage = new_stage(tmp_path / "shot.usda", metres=EDGE)
+    for name, height in (("cloth", 0.0), ("lining", 0.02)):
+        mesh = add_sheet(stage, f"/World/{name}", times=TIMES, size=(6, 4))
+        for time in TIMES:
+            points = np.asarray(mesh.GetPointsAttr().Get(time)) + np.array([0.0, 0.0, height])
+            mesh.GetPointsAttr().Set(vec3(points * (0.0 if (name, time) == ("lining", 3.0) else 1.0)), time)
+    report = refine(Path(save(stage)), tmp_path / "fine.usdc")
+    assert [(entry["path"], entry["time"]) for entry in report.unsettled] == [("/World/lining", 3.0)]
+    cloth, lining = zip(*(frame["garments"] for frame in report.frames), strict=True)
+    assert "together" in cloth[1]
+    assert "together" not in cloth[2]
+    assert lining[3]["start"] == cloth[3]["start"] == "warm"
 
 
 def test_cloth_that_moves_on_or_turns_round_is_not_broken(tmp_path: Path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from layers import COAT, dress_up, errors, make_shot, write_layer
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
-from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_shot
+from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_shot
 
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SchemaError, StageError
 from physgraph_usd.usd.carry import to_numpy
@@ -101,7 +101,41 @@ def test_a_rest_shape_that_is_no_array_is_refused_by_name(tmp_path: Path, name: 
         open_shot(save(stage))
 
 
+class TestPlacement:
+    @pytest.mark.parametrize("scale", [1e150, 1e-150])
+    def test_a_scale_that_is_no_length_is_refused(self, tmp_path: Path, scale: float):
+        stage = new_stage(tmp_path / "s.usda")
+        matrix = Gf.Matrix4d(1.0).SetScale(scale)
+        add_sheet(stage, CLOTH, times=(1.0,), size=(3, 2)).AddTransformOp().Set(matrix)
+        with pytest.raises(GarmentError, match=f"scales by {scale:.3g}".replace("+", r"\+")):
+            open_shot(save(stage))
+
+    def test_infinite_default_points_are_repaired_with_a_word(self, tmp_path: Path):
+        """The product with the placement warned: infinity times zero."""
+        stage = new_stage(tmp_path / "s.usda")
+        points = add_sheet(stage, CLOTH, times=(1.0, 2.0), size=(3, 2)).GetPointsAttr()
+        broken = np.array(points.Get(1.0))
+        broken[3] = np.inf
+        points.Set(Vt.Vec3fArray.FromNumpy(broken))
+        shot = open_shot(save(stage))
+        assert [str(each) for each in shot.warnings if "default points have NaN or infinite" in str(each)]
+        assert np.isfinite(shot.scene.garments[0].rest).all()
+
+
 class TestBodies:
+    @pytest.mark.parametrize("kind", ["Plane", "Sphere", "Mesh"])
+    def test_a_scale_whose_cube_is_no_number(self, tmp_path: Path, kind: str):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, CLOTH, times=(1.0,), size=(3, 2))
+        if kind == "Mesh":
+            add_sheet(stage, "/World/body", times=(1.0,), size=(3, 2), tagged=False)
+        body = UsdGeom.Xformable(stage.DefinePrim("/World/body", kind))
+        body.GetPrim().AddAppliedSchema(COLLIDER_API)
+        author(body.GetPrim(), "physgraph:collider:side", "front")
+        body.AddTransformOp().Set(Gf.Matrix4d(1.0).SetScale(1e150))
+        pose = open_shot(save(stage)).frame(1.0).colliders[0]
+        assert pose is None or not np.isinf(pose.corners()).any()
+
     @pytest.mark.parametrize(
         ("name", "kind", "value"),
         [

@@ -97,10 +97,11 @@ def bits_beside(
     cluster: wp.array(dtype=wp.int32),
     bits: wp.array(dtype=wp.uint64),
 ):
-    """Which of the first parts of a cluster lie beside a vertex."""
-    for k in range(entries[v], entries[v + 1]):
-        if cluster[k] == j:
-            return bits[k]
+    """Which of the first parts of a cluster lie beside a vertex; its entries are sorted, for some have thousands."""
+    end = entries[v + 1]
+    k = wp.lower_bound(cluster, entries[v], end, j)
+    if k < end and cluster[k] == j:
+        return bits[k]
     return wp.uint64(0)
 
 

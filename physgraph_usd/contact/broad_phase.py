@@ -15,6 +15,7 @@ from ..colliders.mesh import MeshBody
 from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ..colliders.primitives import ShapeSurface
 from ..scene import Garment, GarmentFrame
+from ..strain import has_collapsed
 from .bodies import Touching
 
 REACH = 2.0
@@ -42,16 +43,16 @@ class Parts:
         """Numbers of the garments that are solved together, in order.
 
         Cages count as near where two of their vertices are closer than the cloth is expected to leave them by, with an
-        edge to spare, since a vertex may be near an edge's middle.
+        edge to spare, since a vertex may be near an edge's middle. A cage that has collapsed is near none.
         """
         count = len(frames)
+        whole = [not has_collapsed(garment, own.points) for garment, own in zip(self._garments, frames, strict=True)]
         near = np.zeros((count, count), bool)
         trees: dict[int, cKDTree] = {}
         for a in range(count if self._together else 0):
             for b in range(a + 1, count):
-                near[a, b] = touch_one_another(self._garments[a], self._garments[b]) and self._close(
-                    a, b, frames, trees
-                )
+                feel = whole[a] and whole[b] and touch_one_another(self._garments[a], self._garments[b])
+                near[a, b] = feel and self._close(a, b, frames, trees)
         graph: Any = sparse.csr_matrix(near)
         labels = csgraph.connected_components(graph, directed=False)[1]
         return [tuple(np.flatnonzero(labels == label).tolist()) for label in dict.fromkeys(labels.tolist())]

@@ -102,6 +102,7 @@ class ColliderReader:
             return None, (self._out(time, "its sizes or its axis are none that a shape can have"),)
         linear = matrix[:3, :3] @ axes
         if kind == "plane":
+            linear = linear / max(float(np.abs(linear).max()), np.finfo(float).tiny)  # Cubes of a scale can overflow.
             normal = np.cross(linear[:, 0], linear[:, 1]) * np.sign(np.linalg.det(linear) or 1.0)
             if not np.linalg.norm(normal) > 0:
                 return None, (self._out(time, "its transform flattens it"),)

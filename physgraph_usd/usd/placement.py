@@ -11,6 +11,8 @@ from ..errors import GarmentError
 from .stage import Notice
 
 _SINGULAR = 1e-9
+_EXTREME = 1e30
+"""A scale beyond which, or under one over which, no volume is a number."""
 _REMEDY = "give the prim and its ancestors a scale other than zero there, or leave that time out with --frames"
 
 
@@ -40,7 +42,7 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
     """Turn USD's row-vector matrix into a column-vector matrix to metres, refusing what cannot be inverted.
 
     Raises:
-        GarmentError: When it is singular, not finite or projective.
+        GarmentError: When it is singular, not finite, projective or of a scale that is no length.
     """
     matrix = np.array(rows, dtype=np.float64).T.copy()
     path = str(prim.GetPath())
@@ -50,6 +52,9 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
     if stretches[2] <= _SINGULAR * stretches[0]:
         said = f"its transform to the world is singular: it scales by {stretches[0]:.3g}, {stretches[1]:.3g}"
         raise GarmentError(path, f"{said} and {stretches[2]:.3g}", time=time, remedy=_REMEDY)
+    if not 1.0 / _EXTREME < stretches[0] < _EXTREME:
+        said = f"its transform to the world scales by {stretches[0]:.3g}"
+        raise GarmentError(path, said, time=time, remedy=f"give a scale of {1 / _EXTREME:g} to {_EXTREME:g}")
     if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise GarmentError(
             path, "its transform to the world is projective", time=time, remedy="author affine transforms"
@@ -59,14 +64,16 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
 
 
 def place(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Apply a (4, 4) column-vector matrix to points, shape (V, 3)."""
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
+    """Apply a (4, 4) column-vector matrix to points, shape (V, 3); what is not finite stays so, for who reads it."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
     """Whether the authored winding is clockwise seen from outside, in the world."""
     left_handed = UsdGeom.Mesh(prim).GetOrientationAttr().Get(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.leftHanded
-    return left_handed != bool(np.linalg.det(matrix[:3, :3]) < 0)
+    linear = matrix[:3, :3] / max(float(np.abs(matrix[:3, :3]).max()), np.finfo(float).tiny)
+    return left_handed != bool(np.linalg.det(linear) < 0)
 
 
 def check_placement(prim: Usd.Prim, metres: float, times: Sequence[float]) -> tuple[Notice, ...]:
