@@ -47,6 +47,13 @@ def test_mutants_end_in_a_layer_or_a_named_error(bases: Path, tmp_path: Path, pa
     assert len({each.result for each in outcomes}) > 1
 
 
+def test_a_loose_point_does_not_hold_up_the_last_resort(bases: Path, tmp_path: Path):
+    """Rings round what crosses never reach it; they grew without end."""
+    outcome = attempt(40414, KINDS, bases, tmp_path / "loose")
+    assert outcome.said == ["shot 'bodies'", "/World/cloth: 2 pairs at one place, 1 loose points, 6 faces"]
+    assert outcome.result == "done"
+
+
 def test_a_number_is_always_the_same_mutant(bases: Path, tmp_path: Path):
     for number in (0, 16, 21, 40):
         one, two = (make(number, KINDS, bases, tmp_path / f"{number}{copy}")[1] for copy in "ab")

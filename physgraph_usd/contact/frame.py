@@ -20,7 +20,7 @@ from ..level import Level
 from .bodies import FrameBodies, LevelBodies, moves
 from .cloth import ClothContact, ClothView
 from .cloth_mesh import ClothMesh
-from .last_resort import FIRST, returned, taken_back
+from .last_resort import FIRST, returned, taken_back, widened
 from .mend import smoothed
 from .metric import HeldMetric
 from .promise import Promise
@@ -383,11 +383,11 @@ class FrameContact:
         good, mesh = (cloth.allowed or cloth.before).x, self._cloth_mesh
         where, rings, crossing = torch.zeros_like(self._levels[-1].free[:, 0]), FIRST, worst
         while not bool(where.all()):
-            where = mesh.grown(where | cloth.round_crossings(crossing, rings=0), rings)
+            where = widened(mesh, where, cloth.round_crossings(crossing, rings=0), rings)
             crossing = bodies.project(returned(mesh, x, good, where=where, rings=rings))[0]
             if not cloth.worse(crossing):
                 return crossing
-            rings *= 2
+            rings = min(2 * rings, len(x))
         return worst
 
     @cached_property

@@ -43,10 +43,21 @@ def taken_back(
     good, rings = goods[-1], FIRST
     out, back = x, torch.zeros_like(mesh.level.free[:, 0])
     while cloth.worse(out) and not bool(back.all()):
-        back = mesh.grown(back | cloth.round_crossings(out, rings=0), rings)
+        back = widened(mesh, back, cloth.round_crossings(out, rings=0), rings)
         out = cloth.closed(returned(mesh, x, good.x, where=back, rings=rings))
-        rings *= 2
+        rings = min(2 * rings, len(x))
     return out
+
+
+def widened(
+    mesh: ClothMesh, where: Bool[Tensor, " vertices"], more: Bool[Tensor, " vertices"], rings: int
+) -> Bool[Tensor, " vertices"]:
+    """Vertices, more of them, and some rings round all; every one where that adds none.
+
+    Rings end where a piece of cloth does, and a loose vertex is in none.
+    """
+    out = mesh.grown(where | more, rings)
+    return out if bool((out & ~where).any()) else torch.ones_like(where)
 
 
 def returned(

@@ -189,7 +189,8 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
         return None
     face, triangles, edges = _fan(counts, indices)
     left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
-    if left != (np.linalg.det(matrix[:3, :3]) < 0):
+    # By the signs of stretches: a scale's cube can overflow.
+    if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
         triangles, edges = triangles[:, ::-1], edges[:, ::-1]
     colors = _colors(mesh, code, len(counts))[face]
     return DrawnMesh(str(mesh.GetPath()), place, triangles, edges, colors, len(counts))
