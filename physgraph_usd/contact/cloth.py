@@ -50,6 +50,8 @@ STALE, FEW, MOST = 0.1, 1e-3, 0.35
 """Pairs are found anew beside vertices that have moved by more than so many edges, unless fewer than this part of them
 has, and everywhere where more than the last part has."""
 HALF, MARGIN = 0.5, 0.1
+"""Of cloth that walks: the part of their distance at rest that pairs keep at most, so that a flat sheet pushes nothing;
+and how much farther than the thickness pairs are asked for, in mean edges."""
 LOCAL = 0.2
 """Part of the vertices that may have moved for crossings to be looked for beside those only."""
 EVERYWHERE = 0.5
@@ -176,8 +178,18 @@ class ClothView:
     def _mesh(self) -> ClothMesh:
         """The level's hierarchy, which all frames share, sewn as in this one."""
         mesh = self._lasting.mesh(self._level)
-        mesh.sew(np.zeros((0, 2), np.int64) if self._seam is None else self._seam.pairs)
+        mesh.sew(self._sewn)
         return mesh
+
+    @property
+    def _sewn(self) -> np.ndarray:
+        """Pairs of vertices sewn together, shape (N, 2)."""
+        return np.zeros((0, 2), np.int64) if self._seam is None else self._seam.pairs
+
+    @property
+    def parts(self) -> Parts:
+        """What may touch what, sewn as in this frame."""
+        return self._lasting.parts(self._level, self._sewn)
 
     @cached_property
     def before(self) -> ClothState:
@@ -248,6 +260,10 @@ class ClothView:
         if pairs is None:
             return None
         gaps = self._gap_finder.gaps(pairs, x, start=self._sides, crossings=crossings)
+        return self._pushing(gaps, crossings, x)
+
+    def _pushing(self, gaps: Gaps, crossings: Crossings, x: Tensor) -> SelfContact | None:
+        """The force of pairs, and of what draws out what crosses; None where there is neither."""
         if crossings.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=stiffness))
@@ -257,10 +273,9 @@ class ClothView:
         """The force between all parts that are near, each on its side; what crosses is drawn out."""
         crossings = self.look(x).crossings
         self.tangled = crossings.count > 0
-        sewn = np.zeros((0, 2), np.int64) if self._seam is None else self._seam.pairs
         crossed = self._mesh.crossed(crossings) if crossings.count else None
         within = float(self._thickness.max()) + MARGIN * float(self._level.spacing.mean())
-        near = near_pairs(self._lasting.parts(self._level, sewn), x, within, exempt=crossed, listed=listed)
+        near = near_pairs(self.parts, x, within, exempt=crossed, listed=listed)
         corners = near.corners.long()
         at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
         thickness = self._thickness[self._level.vertex_garment[corners[:, [0, 3]]].long()].mean(dim=1)
@@ -273,10 +288,7 @@ class ClothView:
             torch.minimum(thickness, HALF * at_rest).contiguous(),
             self._settings.cloth_stiffness * share,
         )
-        if crossings.count:
-            step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
-            gaps = gaps.with_more(gaps_out(self._mesh, crossings, x, step=step, stiffness=stiffness))
-        return SelfContact(self._level, gaps) if len(gaps.corners) else None
+        return self._pushing(gaps, crossings, x)
 
     def _spheres(self, x: Tensor) -> Spheres | None:
         """The paper's form: every two vertices nearer than R that are no near neighbours (PAPER P10, A13, A27)."""

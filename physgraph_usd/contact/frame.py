@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -38,10 +37,11 @@ HOLDS = 6
 MIXED = 4
 """Rings round what crosses in a warm start that start from the coarse levels instead; it fades over as many more."""
 SMOOTHINGS = 8
+"""Passes that smooth wrinkles of cloth between overlapping parts."""
 FLOOR = 0.06
 """Of the thickness: gaps under it shrink by a tenth a move at most."""
 PUSHES = 4
-"""Passes that smooth wrinkles of cloth between overlapping parts."""
+"""How often cloth that walks is pushed out of bodies and moved there in turn."""
 Touch = Contact | SelfContact | Spheres
 """A term that stands for something near."""
 
@@ -218,9 +218,8 @@ class FrameContact:
             if cloth is not None and level is self._levels[-1] and self._judge is not None:
                 cloth.allowed = self._judge.before
             promise = None
-            if cloth is not None and self._settings.promise and self._cloth is not None:
-                sewn = np.zeros((0, 2), np.int64) if seam is None else seam.pairs
-                promise = Promise(self._cloth.parts(level, sewn), FLOOR * float(self._thickness.min()), cloth)
+            if cloth is not None and self._settings.promise:
+                promise = Promise(cloth.parts, FLOOR * float(self._thickness.min()), cloth)
             self._views[level.index] = LevelContact(bodies, cloth, self._settings.rounds, seam, promise=promise)
         return self._views[level.index]
 
