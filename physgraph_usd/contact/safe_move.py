@@ -5,8 +5,9 @@ at ``start``. Then it has at what `safe_move` returns, and nothing crosses there
 straight way between the two positions, just as they are rounded, each pair keeps a positive distance, so no pair can
 have changed sides. Neither what is wanted, how far it is, nor who wants it matters.
 
-Exempt are pairs that touch at the start (distance 0), and pairs with a vertex that is given as exempt. A start in double
-precision whose gaps are smaller than the rounding of what is wanted in single precision cannot be returned, nor promised.
+Exempt are pairs that touch at the start (distance 0), and pairs with a vertex that is given as exempt. Where the
+start is in double precision and what is wanted in single, gaps under its rounding cannot be returned, and are not
+promised.
 """
 
 from __future__ import annotations
