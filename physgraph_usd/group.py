@@ -324,21 +324,26 @@ class Group:
                 below, x, smooth = x, level.from_below.apply(x), level.smooth_from_below
             if index == last and anew and predicted is not None and contact is not None:
                 predicted = x = contact.mixed(predicted, x)
+            view = None if contact is None else contact.at(level)
             module = lasting.module(coarse)
             warm = predicted if index == last else None
             pull = start.slowed * self._settings.tether
             tie = None if warm is None or self._settings.temporal != "tether" else (pull, warm)
             budget = self._settings.budget(last - index, clock, more=choice.steps, warm=warm is not None)
-            view = None if contact is None else contact.at(level)
+            smoothing = None if warm is not None else lasting.without_facets(x, below, smooth)
+            if view is not None and view.promise is not None and smoothing is not None and index > first:
+                assert level.flat_from_below is not None
+                flat = level.flat_from_below.apply(below)
+                x, smoothing = flat, x + smoothing - flat
             if view is not None and view.promise is not None and warm is not None and before is not None:
-                x = view.walked(before, warm)
+                x = view.moved(before, warm)
                 view.target = warm
             alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
             x, made, touched = self._solve_level(
                 alone,
                 level,
                 x=x,
-                smoothing=None if warm is not None else lasting.without_facets(x, below, smooth),
+                smoothing=smoothing,
                 start=start,
                 view=view,
                 budget=budget,

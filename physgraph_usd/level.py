@@ -17,7 +17,7 @@ from .mesh.defects import FLAT
 from .mesh.diagonals import quad_edges
 from .mesh.lengths import EdgeLengths, TriangleNormals
 from .mesh.stencil import Stencil
-from .mesh.subdivide import Refinement, smooth, subdivide_times
+from .mesh.subdivide import Refinement, on_triangles, smooth, subdivide_times
 from .mesh.topology import TriangleSplit, edges_of, find_edges, hinges_of
 from .scene import Garment
 
@@ -67,6 +67,7 @@ class Level:
         smooth_from_coarse: Smooth map from the cage, shape (V, C).
         from_below: Linear map from the level below, None at the first level.
         smooth_from_below: Smooth map from there, None at the first level.
+        flat_from_below: Map onto the triangles of the level below, None at the first level.
         lanes: Most threads that a kernel over the level uses on the CPU.
     """
 
@@ -99,6 +100,7 @@ class Level:
     smooth_from_coarse: sp.csr_matrix
     from_below: Stencil | None
     smooth_from_below: Stencil | None
+    flat_from_below: Stencil | None
     lanes: int = 1
 
     @property
@@ -184,11 +186,12 @@ def build_levels(
     levels: list[Level] = []
     for index in range(depth + 1):
         parts = [_garment_level(g, chain, index) for g, chain in zip(garments, refinements, strict=True)]
-        below: list[Stencil | None] = [None, None]
+        below: list[Stencil | None] = [None] * 3
         if index:
-            maps = zip(*((part.linear_step, part.smooth_step) for part in parts), strict=True)
-            whole = [sp.csr_matrix(sp.block_diag(each)) for each in maps] or [sp.csr_matrix((0, 0))] * 2
+            maps = zip(*((part.linear_step, part.smooth_step, part.flat_step) for part in parts), strict=True)
+            whole = [sp.csr_matrix(sp.block_diag(each)) for each in maps] or [sp.csr_matrix((0, 0))] * 3
             below = [Stencil(each, dtype=dtype, device=device, lanes=lanes) for each in whole]
+            below[2] = below[2] if (whole[2] != whole[0]).nnz else below[0]
         levels.append(_join(index, parts, below, dtype=dtype, device=device, lanes=lanes))
     return tuple(levels)
 
@@ -210,18 +213,21 @@ class _GarmentLevel:
     smooth: sp.csr_matrix
     linear_step: sp.csr_matrix
     smooth_step: sp.csr_matrix
+    flat_step: sp.csr_matrix
 
 
 def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
     """Carry one garment to a level, or to the end of its chain of refinements, at which it stays."""
     mesh, chain = garment.mesh, whole[:index]
-    linear = smoothing = linear_step = smooth_step = sp.identity(mesh.vertex_count, format="csr")
-    for refinement in chain:
+    linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    for number, refinement in enumerate(chain):
+        split = mesh.triangulate(None if number else garment.rest)
+        flat_step = on_triangles(mesh, refinement, split)
         linear_step, smooth_step = refinement.linear, sp.csr_matrix(smooth(mesh, refinement))
         smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
         mesh = refinement.mesh
     if index > len(chain):
-        linear_step = smooth_step = sp.identity(mesh.vertex_count, format="csr")
+        linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
     rest = np.asarray(linear @ np.asarray(garment.rest, dtype=np.float64))
     split = _sound(mesh.triangulate(rest if not chain else None), rest)
     triangles, hinges = split.triangles, hinges_of(split.triangles)
@@ -243,6 +249,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         smooth=smoothing,
         linear_step=linear_step,
         smooth_step=smooth_step,
+        flat_step=flat_step,
     )
 
 
@@ -286,6 +293,7 @@ def _join(
         smooth_from_coarse=sp.csr_matrix(sp.block_diag([part.smooth for part in parts])),
         from_below=below[0],
         smooth_from_below=below[1],
+        flat_from_below=below[2],
         lanes=lanes,
     )
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..mesh.lanes import Launch
 from .distance import weights_of
 from .parts import Parts
-from .sweep import Listed, Swept
+from .sweep import Listed, Reach, Swept
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,31 +68,25 @@ def weights(
 
 
 def near_pairs(
-    parts: Parts,
-    x: Float[Tensor, "vertices 3"],
-    within: float,
-    *,
-    exempt: Bool[Tensor, " vertices"] | None = None,
-    listed: Listed | None = None,
+    parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, listed: Listed | None = None
 ) -> NearPairs:
-    """Every vertex and face, and every two edges, that share no vertex and are nearer than a distance.
+    """Every vertex and face, and every two edges, that share no vertex and are as near as is asked for.
 
     Args:
         parts: The parts.
         x: Positions [m].
-        within: The distance [m].
-        exempt: No pair with one of these vertices, or None.
-        listed: Pairs that are asked alone, if all that are so near must be among them; or None.
+        near: How near; what is near at rest may come too where it is not as near as the radii say.
+        listed: Pairs among which those are, by what they were found with, or None.
     """
     at = x.double()
-    none = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-    if listed is not None and within <= 2.0 * (listed.reach - listed.far(x)):
+    if listed is not None and listed.covers(x):
         pairs = listed.pairs
     else:
-        pairs = Swept(parts, at, torch.zeros_like(at), within=within).near(none)
-    weight = weights(at, pairs.corners, pairs.face, lanes=parts.level.lanes)
-    way = (weight.unsqueeze(2) * at[pairs.corners.long()]).sum(dim=1)
-    kept = way.norm(dim=1) < within
-    if exempt is not None:
-        kept &= ~exempt[pairs.corners.long()].any(dim=1)
+        pairs = Swept(parts, at, torch.zeros_like(at), near=near).near()
+    weight, corners = weights(at, pairs.corners, pairs.face, lanes=parts.level.lanes), pairs.corners.long()
+    way = (weight.unsqueeze(2) * at[corners]).sum(dim=1)
+    radius = near.radius[corners]
+    of_face = radius[:, 0] + radius[:, 1:].amax(dim=1)
+    of_edges = radius[:, :2].amax(dim=1) + radius[:, 2:].amax(dim=1)
+    kept = way.norm(dim=1) < torch.where(pairs.face, of_face, of_edges)
     return NearPairs(pairs.corners[kept], weight[kept].to(x), way[kept].to(x), pairs.face[kept])

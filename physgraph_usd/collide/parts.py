@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 import warp as wp
 from jaxtyping import Int
 
@@ -23,12 +24,16 @@ class Topology:
     vertices: wp.array(dtype=wp.int32)
     first_edge: wp.array(dtype=wp.int32)
     edges: wp.array(dtype=wp.vec2i)
+    edge_number: wp.array(dtype=wp.int32)
     first_face: wp.array(dtype=wp.int32)
     faces: wp.array(dtype=wp.vec3i)
+    face_number: wp.array(dtype=wp.int32)
     garment: wp.array(dtype=wp.int32)
     meets: wp.array(dtype=wp.int32)
     garments: wp.int32
     label: wp.array(dtype=wp.int32)
+    owner: wp.array(dtype=wp.int32)
+    rest: wp.array(dtype=wp.vec3d)
 
 
 class Parts:
@@ -38,6 +43,9 @@ class Parts:
         level: The level.
         count: Number of clusters.
         topology: What kernels read.
+        links: Vertices that hang together: the edges, and what is sewn, shape (N, 2), int64.
+        lengths: Of these at rest, 0 where sewn [m], shape (N,), float64.
+        shortest: The shortest edge at each vertex at rest [m], shape (V,), float64.
     """
 
     def __init__(self, level: Level, meets: np.ndarray, label: Int[np.ndarray, " vertices"] | None = None) -> None:
@@ -56,15 +64,31 @@ class Parts:
         self.count = clusters.count
         table = self.topology = Topology()
         table.first_vertex, table.vertices = clusters.vertices
-        table.first_edge, table.edges = clusters.edges[:2]
-        table.first_face, table.faces = clusters.faces[:2]
+        table.first_edge, table.edges, table.edge_number = clusters.edges
+        table.first_face, table.faces, table.face_number = clusters.faces
         table.first_corner, table.corners = (self._array(each) for each in _corners(clusters))
         table.garment, table.garments = clusters.garment, len(meets)
         table.meets = self._array(np.asarray(meets).ravel())
+        sewn = np.zeros((0, 2), np.int64) if label is None else _sewn(label)
+        self.links = torch.as_tensor(np.concatenate([edges.astype(np.int64), sewn]), device=level.device)
+        shortest = torch.full_like(level.rest[:, 0].double(), torch.inf)
+        length = level.rest_length.double().repeat_interleave(2)
+        self.shortest = shortest.scatter_reduce(0, level.edges.long().reshape(-1), length, "amin")
+        self.lengths = torch.cat([level.rest_length.double(), level.rest.new_zeros(len(sewn)).double()])
+        table.owner = self._array(level.vertex_garment.cpu().numpy())
+        self._rest = level.rest.double().contiguous()
+        table.rest = wp.from_torch(self._rest, dtype=wp.vec3d)
         table.label = self._array(np.arange(level.vertex_count) if label is None else label)
 
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=self.level.device)
+
+
+def _sewn(label: np.ndarray) -> np.ndarray:
+    """Each vertex that is not the first of its label, and that one, shape (N, 2)."""
+    first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1]]
+    later = np.flatnonzero(first != np.arange(len(label)))
+    return np.stack([later, first[later]], axis=1)
 
 
 def _corners(clusters: ClusteredParts) -> tuple[np.ndarray, np.ndarray]:

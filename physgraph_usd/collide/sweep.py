@@ -21,6 +21,8 @@ wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(wp.float64(1.0e30))
 """Corner of a box that holds nothing."""
+SLOTS = 128
+"""Pairs of a cluster that there is room for before they are counted."""
 SPARE = 0.05
 """What is left at least, as a part of a reach, between parts of a pair that is not listed."""
 ROUNDING = wp.constant(wp.float64(2.4e-7))
@@ -29,20 +31,25 @@ ROUNDING = wp.constant(wp.float64(2.4e-7))
 
 @wp.struct
 class Motion:
-    """Where vertices are, how far they want to go, which pairs are asked, and a distance where nothing moves."""
+    """Where vertices are, how far they want to go, which pairs are asked, and what is near where nothing moves."""
 
     start: wp.array(dtype=wp.vec3d)
     way: wp.array(dtype=wp.vec3d)
     asked: wp.array(dtype=wp.bool)
-    exempt: wp.array(dtype=wp.bool)
+    tangle: wp.array(dtype=wp.int32)
     share: wp.float64
     floor: wp.float64
-    within: wp.float64
+    is_still: wp.bool
+    radius: wp.array(dtype=wp.float64)
+    play: wp.array(dtype=wp.float64)
+    may: wp.array(dtype=wp.float64)
+    half: wp.float64
 
 
 @wp.struct
 class Sweep:
-    """Of each cluster: the boxes that its parts sweep and start in, their mean way, and how far they leave it."""
+    """Of each cluster: the boxes that its parts sweep and start in, their mean way, how far they leave it, and how
+    near it looks."""
 
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)
@@ -50,6 +57,7 @@ class Sweep:
     from_high: wp.array(dtype=wp.vec3d)
     mean: wp.array(dtype=wp.vec3d)
     spread: wp.array(dtype=wp.float64)
+    radius: wp.array(dtype=wp.float64)
     asked: wp.array(dtype=wp.int32)
     edge_low: wp.array(dtype=wp.vec3f)
     edge_high: wp.array(dtype=wp.vec3f)
@@ -66,6 +74,22 @@ class Found:
     corners: wp.array(dtype=wp.vec4i)
     value: wp.array(dtype=wp.float64)
     face: wp.array(dtype=wp.bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """How near what is near is.
+
+    Attributes:
+        radius: Two parts are near within the sum of their radii, the greatest of their corners' [m], shape (V,), float64.
+        play: Those of one garment only within a part of their distance at rest and twice the least of these [m], shape
+            (V,).
+        half: That part.
+    """
+
+    radius: Float[Tensor, " vertices"]
+    play: Float[Tensor, " vertices"]
+    half: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +132,7 @@ def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
     i = first + wp.tid()
     least, most = wp.vec3d(FAR), wp.vec3d(-FAR)
     lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
-    total, asked = wp.vec3d(), wp.int32(0)
+    total, asked, radius = wp.vec3d(), wp.int32(0), wp.float64(0.0)
     begin, end = parts.first_corner[i], parts.first_corner[i + 1]
     for k in range(begin, end):
         v = parts.corners[k]
@@ -116,19 +140,21 @@ def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
         least, most = wp.min(least, at), wp.max(most, at)
         lowest, highest = wp.min(lowest, wp.min(at, at + way)), wp.max(highest, wp.max(at, at + way))
         total += way
+        radius = wp.max(radius, motion.radius[v] + motion.may[v])
         if motion.asked[v]:
             asked = 1
     mean = total / wp.float64(wp.max(end - begin, 1))
     spread = wp.float64(0.0)
     for k in range(begin, end):
         spread = wp.max(spread, wp.length(motion.way[parts.corners[k]] - mean))
-    slack = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest)) + wp.vec3d(motion.within)
+    slack = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest)) + wp.vec3d(radius)
     sweep.low[i] = single(lowest - slack)
     sweep.high[i] = single(highest + slack)
     sweep.from_low[i] = least
     sweep.from_high[i] = most
     sweep.mean[i] = mean
     sweep.spread[i] = spread
+    sweep.radius[i] = radius
     sweep.asked[i] = asked
     for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
         a, b = motion.start[parts.edges[k][0]], motion.start[parts.edges[k][1]]
@@ -151,9 +177,10 @@ def outside(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.v
 
 
 @wp.func
-def reach_of(motion: Motion, sweep: Sweep, i: wp.int32, j: wp.int32):
+def reach_of(sweep: Sweep, i: wp.int32, j: wp.int32):
     """How much nearer parts of two clusters can come, or the distance asked for."""
-    return wp.length(sweep.mean[i] - sweep.mean[j]) + sweep.spread[i] + sweep.spread[j] + motion.within
+    move = wp.length(sweep.mean[i] - sweep.mean[j]) + sweep.spread[i] + sweep.spread[j]
+    return move + sweep.radius[i] + sweep.radius[j]
 
 
 @wp.func
@@ -170,6 +197,43 @@ def write(found: Found, i: wp.int32, count: wp.int32, corners: wp.vec4i, value: 
 def is_one(parts: Topology, a: wp.int32, b: wp.int32):
     """Whether two vertices are one, or sewn together."""
     return parts.label[a] == parts.label[b]
+
+
+@wp.func
+def sum_of(face: wp.bool, a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64):
+    """The greatest value of a pair's first part and that of its second."""
+    if face:
+        return a + wp.max(b, wp.max(c, d))
+    return wp.max(a, b) + wp.max(c, d)
+
+
+@wp.func
+def box_gap(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Greatest distance along an axis between the boxes of two parts."""
+    low, high, other_low, other_high = a, a, wp.min(c, d), wp.max(c, d)
+    if face:
+        other_low, other_high = wp.min(b, other_low), wp.max(b, other_high)
+    else:
+        low, high = wp.min(a, b), wp.max(a, b)
+    apart = wp.max(low - other_high, other_low - high)
+    return wp.max(apart[0], wp.max(apart[1], apart[2]))
+
+
+@wp.func
+def nearness(face: wp.bool, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32, parts: Topology, motion: Motion):
+    """Distance of a pair over that within which it is near, which is less where it is near at rest; 1 beyond it."""
+    one = wp.float64(1.0)
+    r, p, m = motion.radius, motion.play, motion.may
+    within, may = sum_of(face, r[a], r[b], r[c], r[d]), sum_of(face, m[a], m[b], m[c], m[d])
+    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
+    if box_gap(face, x, y, z, w) >= within + may:
+        return one
+    distance = distance_of(face, x, y, z, w)
+    if distance < within + may and parts.owner[a] == parts.owner[d]:
+        at_rest = distance_of(face, parts.rest[a], parts.rest[b], parts.rest[c], parts.rest[d])
+        play = wp.float64(2.0) * wp.min(wp.min(p[a], p[b]), wp.min(p[c], p[d]))
+        within = wp.min(within, motion.half * at_rest + play)
+    return wp.min(distance / (within + may), one)
 
 
 @wp.func
@@ -193,11 +257,12 @@ def value_of(
         return none
     if not (motion.asked[a] or motion.asked[b] or motion.asked[c] or motion.asked[d]):
         return none
-    if motion.exempt[a] or motion.exempt[b] or motion.exempt[c] or motion.exempt[d]:
+    tangle = motion.tangle[a]
+    if tangle >= 0 and motion.tangle[b] == tangle and motion.tangle[c] == tangle and motion.tangle[d] == tangle:
         return none
     x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
-    if motion.within > wp.float64(0.0):
-        return distance_of(face, x, y, z, w) / motion.within
+    if motion.is_still:
+        return nearness(face, a, b, c, d, parts, motion)
     u, v, p, q = motion.way[a], motion.way[b], motion.way[c], motion.way[d]
     return impact_of(face, x, y, z, w, u, v, p, q, motion.share, motion.floor)
 
@@ -205,7 +270,7 @@ def value_of(
 @wp.func
 def faces_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp.int32, j: wp.int32, count: wp.int32):
     """Write the pairs of a cluster's vertices and another's faces; the number of the cluster's pairs so far."""
-    reach = reach_of(motion, sweep, i, j)
+    reach = reach_of(sweep, i, j)
     for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
         v = parts.vertices[k]
         at = motion.start[v]
@@ -228,7 +293,7 @@ def faces_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp
 @wp.func
 def edges_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp.int32, j: wp.int32, count: wp.int32):
     """The same of the edges of two clusters, each pair once."""
-    reach = reach_of(motion, sweep, i, j)
+    reach = reach_of(sweep, i, j)
     for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
         e = parts.edges[k]
         near, far = motion.start[e[0]], motion.start[e[1]]
@@ -262,11 +327,10 @@ def pairs_of(
 ):
     """Count the pairs of a cluster's vertices with faces, and of its edges with those of no lower cluster.
 
-    They are written from where a cluster's begin, so far as there is room.
+    They are written from where a cluster's begin, so far as there is room; a cluster without any is not asked.
     """
     i = first + wp.tid()
-    is_second = found.begin[found.count.shape[0]] > 0
-    if low[i][0] > high[i][0] or (is_second and found.begin[i + 1] == found.begin[i]):
+    if low[i][0] > high[i][0] or found.begin[i + 1] == found.begin[i]:
         return
     count, j = wp.int32(0), wp.int32(0)
     query = wp.bvh_query_aabb(tree, low[i], high[i])
@@ -275,7 +339,7 @@ def pairs_of(
             continue
         if sweep.asked[i] == 0 and sweep.asked[j] == 0:
             continue
-        reach = reach_of(motion, sweep, i, j)
+        reach = reach_of(sweep, i, j)
         if outside(sweep.from_low[i], sweep.from_high[i], sweep.from_low[j], sweep.from_high[j], reach):
             continue
         count = faces_met(parts, motion, sweep, found, i, j, count)
@@ -308,7 +372,8 @@ class Swept:
         start: Float[Tensor, "vertices 3"],
         way: Float[Tensor, "vertices 3"],
         *,
-        within: float = 0.0,
+        near: Reach | None = None,
+        may: Float[Tensor, " vertices"] | None = None,
     ) -> None:
         """Build the hierarchy.
 
@@ -316,14 +381,15 @@ class Swept:
             parts: The parts.
             start: Positions [m], float64.
             way: How far each vertex goes [m], float64.
-            within: Distance that is asked for where nothing moves [m].
+            near: How near parts are asked for where nothing moves, or None.
+            may: How much nearer each vertex may come [m], float64, or None.
         """
-        self._within = within
+        self._near, self._may = near, may
         self._parts, self._device = parts, str(start.device)
         self._start = start - (start.mean(dim=0) if len(start) else start.new_zeros(3))
         self._boxes = _boxes(parts, self._device)
         none = torch.zeros(len(start), dtype=torch.bool, device=start.device)
-        self._launch(sweep_boxes, self._motion(way, asked=none, exempt=none), self._boxes)
+        self._launch(sweep_boxes, self._motion(way, asked=none), self._boxes)
         self._tree = wp.Bvh(self._boxes.low, self._boxes.high)
 
     def impacts(
@@ -333,7 +399,7 @@ class Swept:
         share: float,
         floor: float,
         asked: Bool[Tensor, " vertices"],
-        exempt: Bool[Tensor, " vertices"],
+        tangle: Int[Tensor, " vertices"] | None = None,
     ) -> Pairs:
         """Every pair of parts that would come too near.
 
@@ -342,39 +408,50 @@ class Swept:
             share: Part of their distance that pairs keep at least.
             floor: Distance under which they keep nine tenths of it [m].
             asked: Only pairs with one of these vertices are asked.
-            exempt: No pair with one of these is.
+            tangle: The tangle that each vertex is in, int32, -1 where in none: pairs of one alone are not asked; or None.
         """
-        motion = self._motion(way, asked=asked, exempt=exempt)
+        motion = self._motion(way, asked=asked, tangle=tangle)
         motion.share, motion.floor = share, floor
-        return self._pairs(motion)
+        return self._found(pairs_of, motion)
 
-    def _pairs(self, motion: Any) -> Pairs:
+    def found(self, kernel: wp.Kernel) -> Pairs:
+        """What a kernel with the parameters of `pairs_of` finds where nothing moves."""
+        every = torch.ones(len(self._start), dtype=torch.bool, device=self._start.device)
+        return self._found(kernel, self._motion(torch.zeros_like(self._start), asked=every))
+
+    def _found(self, kernel: wp.Kernel, motion: Any) -> Pairs:
         """The pairs that are asked for."""
         now, size, device = _boxes(self._parts, self._device), self._parts.count, self._start.device
         self._launch(sweep_boxes, motion, now)
-        count, begin = (torch.zeros(size + extra, dtype=torch.int32, device=device) for extra in (0, 1))
-        out = _room(begin, 0)
-        for _ in range(2):  # They are counted, and then written.
-            found = Found()
-            found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
-            found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
-            found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
-            self._launch(pairs_of, motion, now, self._tree.id, self._boxes.low, self._boxes.high, found)
-            begin[1:] = count.cumsum(dim=0)
-            total = int(begin[-1])
-            if not total or len(out.value):
-                break
-            out = _room(begin, total)
-        return out
+        begin = torch.arange(size + 1, dtype=torch.int32, device=device) * SLOTS
+        slots, count = _room(begin, SLOTS * size), torch.zeros_like(begin[:size])
+        self._write(kernel, motion, now, begin=begin, count=count, out=slots)
+        over = count > SLOTS
+        kept = ((torch.arange(SLOTS, device=device) < count.unsqueeze(1)) & ~over.unsqueeze(1)).reshape(-1)
+        first = Pairs(slots.corners[kept], slots.value[kept], slots.face[kept])
+        if not bool(over.any()):
+            return first
+        begin[0] = 0  # Those without room are written again, now that they are counted.
+        begin[1:] = (count * over).cumsum(dim=0)
+        rest = _room(begin, int(begin[-1]))
+        self._write(kernel, motion, now, begin=begin, count=count, out=rest)
+        return Pairs(*(torch.cat([getattr(each, name) for each in (first, rest)]) for name in ("corners", "value", "face")))
 
-    def near(self, exempt: Bool[Tensor, " vertices"]) -> Pairs:
-        """Every pair of parts within the distance asked for, but for those with an exempt vertex."""
-        still = torch.zeros_like(self._start)
-        return self._pairs(self._motion(still, asked=torch.ones_like(exempt), exempt=exempt))
+    def _write(self, kernel: wp.Kernel, motion: Any, now: Any, *, begin: Tensor, count: Tensor, out: Pairs) -> None:
+        """Count each cluster's pairs, and write those that there is room for."""
+        found = Found()
+        found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
+        found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
+        found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
+        self._launch(kernel, motion, now, self._tree.id, self._boxes.low, self._boxes.high, found)
 
-    def _motion(self, way: Tensor, *, asked: Tensor, exempt: Tensor) -> Any:
+    def near(self) -> Pairs:
+        """Every pair of parts as near as is asked for."""
+        return self.found(pairs_of)
+
+    def _motion(self, way: Tensor, *, asked: Tensor, tangle: Tensor | None = None) -> Any:
         """What kernels are told of the vertices."""
-        return _motion(self._start, way, asked=asked, exempt=exempt, within=self._within)
+        return _motion(self._start, way, asked=asked, tangle=tangle, near=self._near, may=self._may)
 
     def _launch(self, kernel: wp.Kernel, *inputs: object) -> None:
         """Run over the clusters."""
@@ -383,24 +460,31 @@ class Swept:
 
 
 class Listed:
-    """All pairs that can touch while no vertex leaves where it is by more than a reach: short moves ask them alone.
+    """All pairs that are near, or can touch, while no vertex leaves where it is by more than it may: short moves ask
+    them alone.
 
     Attributes:
-        x: Where the vertices are [m], float64.
-        reach: How far they may go [m].
-        pairs: Every pair nearer than twice that.
+        pairs: The pairs.
     """
 
-    def __init__(self, parts: Parts, x: Float[Tensor, "vertices 3"], reach: float) -> None:
-        """Find the pairs."""
-        self.x, self.reach, self._parts = x.double(), reach, parts
-        none = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-        apart = 2.0 * (1.0 + SPARE) * reach
-        self.pairs = Swept(parts, self.x, torch.zeros_like(self.x), within=apart).near(none)
+    def __init__(
+        self, parts: Parts, x: Float[Tensor, "vertices 3"], *, near: Reach, may: Float[Tensor, " vertices"]
+    ) -> None:
+        """Find the pairs.
 
-    def far(self, x: Float[Tensor, "vertices 3"]) -> float:
-        """How far any vertex is from where it was [m]."""
-        return float((x.double() - self.x).norm(dim=1).max()) if len(x) else 0.0
+        Args:
+            parts: The parts.
+            x: Positions [m].
+            near: What is near.
+            may: How far each vertex may go [m], float64.
+        """
+        self._x, self._may, self._parts = x.double(), may, parts
+        still = torch.zeros_like(self._x)
+        self.pairs = Swept(parts, self._x, still, near=near, may=(1.0 + SPARE) * may).near()
+
+    def covers(self, x: Float[Tensor, "vertices 3"], part: float = 1.0) -> bool:
+        """Whether no vertex at x [m] is farther from where it was than that part of what it may be."""
+        return bool(((x.double() - self._x).norm(dim=1) <= part * self._may).all())
 
     def impacts(
         self,
@@ -410,10 +494,10 @@ class Listed:
         share: float,
         floor: float,
         asked: Bool[Tensor, " vertices"],
-        exempt: Bool[Tensor, " vertices"],
+        tangle: Int[Tensor, " vertices"] | None = None,
     ) -> Pairs:
         """As `Swept.impacts`, for ways that do not leave the reach."""
-        motion, value = _motion(start, way, asked=asked, exempt=exempt), torch.ones_like(self.pairs.value)
+        motion, value = _motion(start, way, asked=asked, tangle=tangle), torch.ones_like(self.pairs.value)
         motion.share, motion.floor = share, floor
         inputs = [self._parts.topology, motion, wp.from_torch(self.pairs.corners, dtype=wp.vec4i)]
         inputs += [wp.from_torch(self.pairs.face), wp.from_torch(value)]
@@ -422,12 +506,28 @@ class Listed:
         return Pairs(self.pairs.corners[met], value[met], self.pairs.face[met])
 
 
-def _motion(start: Tensor, way: Tensor, *, asked: Tensor, exempt: Tensor, within: float = 0.0) -> Any:
+def _motion(
+    start: Tensor,
+    way: Tensor,
+    *,
+    asked: Tensor,
+    tangle: Tensor | None,
+    near: Reach | None = None,
+    may: Tensor | None = None,
+) -> Any:
     """What kernels are told of the vertices."""
     motion = Motion()
     motion.start, motion.way = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (start, way))
-    motion.asked, motion.exempt = (wp.from_torch(each.contiguous()) for each in (asked, exempt))
-    motion.within = within
+    motion.asked = wp.from_torch(asked.contiguous())
+    none = torch.full_like(asked, -1, dtype=torch.int32) if tangle is None else tangle.contiguous()
+    motion.tangle = wp.from_torch(none)
+    motion.is_still = near is not None
+    nothing = torch.zeros_like(start[:, 0])
+    radius, play = (nothing, nothing) if near is None else (near.radius, near.play)
+    motion.radius, motion.play, motion.may = (
+        wp.from_torch(each.contiguous()) for each in (radius, play, nothing if may is None else may)
+    )
+    motion.half = 0.0 if near is None else near.half
     return motion
 
 
@@ -445,6 +545,7 @@ def _boxes(parts: Parts, device: str) -> Any:
         setattr(sweep, name, wp.zeros(size, dtype=wp.vec3f, device=device))
         setattr(sweep, f"from_{name}", wp.zeros(size, dtype=wp.vec3d, device=device))
     sweep.mean = wp.zeros(size, dtype=wp.vec3d, device=device)
+    sweep.radius = wp.zeros(size, dtype=wp.float64, device=device)
     sweep.spread = wp.zeros(size, dtype=wp.float64, device=device)
     sweep.asked = wp.zeros(size, dtype=wp.int32, device=device)
     for name, count in (("edge", len(parts.level.edges)), ("face", len(parts.level.triangles))):

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..collide.near import near_pairs
 from ..collide.parts import Parts
-from ..collide.sweep import Listed
+from ..collide.sweep import Listed, Reach
 from ..forces.seam import Seam
 from ..forces.self_contact import Gaps, SelfContact, Spheres
 from ..level import Level
@@ -32,6 +32,7 @@ from .mend import falling_off, smoothed
 from .nearest import Nearest, Pairs
 from .regions import Regions
 from .settings import ContactSettings
+from .tangles import Tangles
 from .untangle import gaps_out
 
 ZONE = 2
@@ -192,6 +193,13 @@ class ClothView:
         return self._lasting.parts(self._level, self._sewn)
 
     @cached_property
+    def near(self) -> Reach:
+        """How near parts are that may push one another before they are looked for again."""
+        play = 0.5 * MARGIN * self._level.spacing.double()
+        thickness = 0.5 * self._thickness.double()[self._level.vertex_garment.long()]
+        return Reach(thickness + play, play, HALF)
+
+    @cached_property
     def before(self) -> ClothState:
         """The upsampled cage; what was looked at last stays known."""
         return self._look(self._base, None)
@@ -217,16 +225,13 @@ class ClothView:
 
     def _look(self, x: Tensor, known: ClothState | None) -> ClothState:
         """Find what crosses; where few vertices have moved since what is known, only beside them."""
-        if known is not None and known.near and known.version == known.x._version and known.crossings.all_listed:
+        if known is not None and known.near and known.version == known.x._version:
             moved = (x != known.x).any(dim=1)
             if float(moved.to(x.dtype).mean()) < LOCAL:
                 self._mesh.move(x)
                 return ClothState(x, self._mesh.crossings_since(known.crossings, moved), version=x._version)
-        busy = self._busy(x, 0.0)
-        if not bool(busy.any()):
-            return ClothState(x, Crossings.none(x.device), near=False, version=x._version)
         self._mesh.move(x)
-        return ClothState(x, self._mesh.crossings(busy), version=x._version)
+        return ClothState(x, self._mesh.crossings(torch.ones_like(self._level.free[:, 0])), version=x._version)
 
     def _busy(self, x: Tensor, reach: float) -> Bool[Tensor, " vertices"]:
         """Vertices in patches that may come nearer to another than a reach [m], or all of them."""
@@ -274,18 +279,23 @@ class ClothView:
         crossings = self.look(x).crossings
         self.tangled = crossings.count > 0
         crossed = self._mesh.crossed(crossings) if crossings.count else None
-        within = float(self._thickness.max()) + MARGIN * float(self._level.spacing.mean())
-        near = near_pairs(self.parts, x, within, exempt=crossed, listed=listed)
+        near = near_pairs(self.parts, x, self.near, listed=listed)
         corners = near.corners.long()
+        garment = self._level.vertex_garment[corners[:, [0, 3]]].long()
         at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
-        thickness = self._thickness[self._level.vertex_garment[corners[:, [0, 3]]].long()].mean(dim=1)
+        at_rest = torch.where(garment[:, 0] == garment[:, 1], at_rest, torch.inf)
+        offset = torch.minimum(self._thickness[garment].mean(dim=1), HALF * at_rest)
+        kept = near.way.norm(dim=1) < offset + MARGIN * self._level.spacing[corners].amin(dim=1)
+        if crossed is not None:
+            kept &= ~crossed[corners].any(dim=1)
+        corners, face = corners[kept], near.face[kept]
         area = self._level.vertex_area[corners]
-        share = torch.where(near.face, area[:, 0], area.amin(dim=1) / 3.0)
+        share = torch.where(face, area[:, 0], area.amin(dim=1) / 3.0)
         gaps = Gaps(
-            near.corners,
-            near.weight,
-            torch.nn.functional.normalize(near.way, dim=1, eps=1e-30).contiguous(),
-            torch.minimum(thickness, HALF * at_rest).contiguous(),
+            near.corners[kept],
+            near.weight[kept],
+            torch.nn.functional.normalize(near.way[kept], dim=1, eps=1e-30).contiguous(),
+            offset[kept].contiguous(),
             self._settings.cloth_stiffness * share,
         )
         return self._pushing(gaps, crossings, x)
@@ -391,6 +401,15 @@ class ClothView:
         """Whether more crosses than may, in all or between garments."""
         state = self.look(x)
         return state.crossings.count > 0 and self._excess(state, self.allowed or self.before) > 0
+
+    def tangles(self, x: Float[Tensor, "vertices 3"], *, rings: int) -> Tangles | None:
+        """The tangles at x [m] and some rings round them; None where nothing crosses."""
+        found = self.look(x).crossings
+        return Tangles.find(self._mesh, found, rings=rings) if found.count else None
+
+    def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
+        """Take it that nothing crosses at x [m]: it was reached from where nothing did."""
+        self._looked = ClothState(x, Crossings.none(x.device), version=x._version)
 
     def grown(self, some: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
         """Some vertices and those within some rings of them."""

@@ -15,8 +15,10 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.cluster_kernels import clusters_beside, pierced
+from ..collide.cluster_kernels import clusters_beside
 from ..collide.clusters import ClusteredParts
+from ..collide.crossings import Crossings, crossings
+from ..collide.parts import Parts
 from ..level import Level
 from ..mesh.lanes import Launch
 from ..mesh.topology import adjacency, find_edges, joined_by, owned_sides
@@ -44,32 +46,6 @@ class _Own:
 
 _Asked = tuple[Bool[Tensor, " vertices"], _Own]
 """Vertices that are asked, and what makes no pairs with them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Crossings:
-    """Edges that pass through faces.
-
-    Attributes:
-        edge: Shape (N,).
-        face: Shape (N,).
-        count: Number of such pairs; at most four faces an edge are listed.
-    """
-
-    edge: Int[Tensor, " crossings"]
-    face: Int[Tensor, " crossings"]
-    count: int
-
-    @staticmethod
-    def none(device: torch.device) -> Crossings:
-        """No crossings."""
-        empty = torch.zeros(0, dtype=torch.int64, device=device)
-        return Crossings(empty, empty, 0)
-
-    @property
-    def all_listed(self) -> bool:
-        """Whether no edge passes through more faces than are listed."""
-        return self.count == len(self.edge)
 
 
 class ClothMesh:
@@ -112,6 +88,7 @@ class ClothMesh:
         given = {"device": level.device, "lanes": level.lanes}
         self._find_normals = Launch(vertex_normals, level.vertex_count, [*about, *points], **given)
         self._has_normals = False
+        self._meets, self._parts = meets, None
         self._at: tuple[Tensor, int] | None = None
 
     @cached_property
@@ -128,7 +105,7 @@ class ClothMesh:
         """From now on take pairs of vertices for one: what is beside either is beside both, and no pair with it."""
         if np.array_equal(pairs, self.sewn):
             return
-        self.sewn, count = pairs, self.level.vertex_count
+        self.sewn, count, self._parts = pairs, self.level.vertex_count, None
         for name in ("whole", "within_two", "_itself"):
             self.__dict__.pop(name, None)
         same = sp.identity(count, dtype=np.float32, format="csr")
@@ -237,15 +214,12 @@ class ClothMesh:
         return found
 
     def crossings(self, busy: Bool[Tensor, " vertices"]) -> Crossings:
-        """Edges with a busy end that pass through faces."""
-        count = torch.zeros(len(self.level.edges), dtype=torch.int32, device=busy.device)
-        faces = torch.empty((len(count), 4), dtype=torch.int32, device=busy.device)
-        clusters, inputs = self._moved, [_vectors(self._position), _flags(busy)]
-        inputs += [*clusters.edges, *clusters.edge_boxes, *clusters.faces, *clusters.face_boxes]
-        clusters.run_shared(pierced, [*inputs, wp.from_torch(count), wp.from_torch(faces, dtype=wp.vec4i)])
-        edge = torch.nonzero(count).squeeze(1)
-        listed = torch.nonzero(torch.arange(4, device=edge.device) < count[edge].unsqueeze(1))
-        return Crossings(edge[listed[:, 0]], faces[edge].long()[listed[:, 0], listed[:, 1]], int(count.sum()))
+        """Edges that pass through faces."""
+        assert self._at is not None
+        label = joined_by(self.sewn, self.level.vertex_count) if len(self.sewn) else None
+        if self._parts is None:
+            self._parts = Parts(self.level, self._meets, label)
+        return crossings(self._parts, self._at[0])
 
     def crossings_since(self, known: Crossings, moved: Bool[Tensor, " vertices"]) -> Crossings:
         """What crosses now, by what crossed before some vertices moved: only what lies beside those is asked.
@@ -254,13 +228,7 @@ class ClothMesh:
             known: What crossed, all of it listed.
             moved: Vertices that have moved since.
         """
-        near = self._beside(moved, 0.0)
-        found = self.crossings(near)
-        ends = self.level.edges[known.edge].long()
-        kept = ~near[ends].any(dim=1) & ~moved[self.triangles[known.face]].any(dim=1)
-        edge, face = torch.cat([known.edge[kept], found.edge]), torch.cat([known.face[kept], found.face])
-        order = torch.argsort(edge, stable=True)
-        return Crossings(edge[order], face[order], found.count + int(kept.sum()))
+        return self.crossings(moved)
 
     def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
         """Vertices at most some edges away from given ones."""

@@ -124,11 +124,6 @@ class LevelContact:
         """As `Promise.listed`; None without cloth."""
         return None if self.promise is None else self.promise.listed(x, known)
 
-    def walked(self, x: Tensor, wanted: Tensor) -> Tensor:
-        """The same for the far move from the frame before."""
-        wanted = self.closed(wanted)
-        return wanted if self.promise is None else self.promise.walk(x, wanted)
-
     def uncrossed(
         self, x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"]
     ) -> Float[Tensor, "vertices 3"]:

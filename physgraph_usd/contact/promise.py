@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..collide.parts import Parts
@@ -17,10 +17,9 @@ REACH = 0.15
 """Edges that cloth may go before near pairs are listed anew."""
 GOES = 3
 """How often a move is taken up again where something was in the way: what was in the way may have gone."""
-LATE, RINGS, SPREADS = 0.25, 8, 16
-"""Edges that cloth lags behind from where it holds up what is beside it, within so many rings, in so many passes."""
-TANGLED = 2
-"""Rings round what crosses at the start to which nothing is promised but that no more crosses."""
+TANGLED, TRIES = 2, 4
+"""Rings round what crosses at the start to which nothing is promised but that no more crosses, and how often what
+crosses more is held to the promise before all is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +38,9 @@ class Promise:
 
     def listed(self, x: Float[Tensor, "vertices 3"], known: Listed | None) -> Listed:
         """The pairs that short moves from x [m] ask; known ones while at least half of their reach is left."""
-        if known is not None and known.far(x) <= 0.5 * known.reach:
+        if known is not None and known.covers(x, 0.5):
             return known
-        return Listed(self.parts, x, REACH * float(self.parts.level.spacing.mean()))
+        return Listed(self.parts, x, near=self.view.near, may=REACH * self.parts.shortest)
 
     def move(
         self,
@@ -52,35 +51,30 @@ class Promise:
     ) -> Tensor:
         """Positions as near to what is wanted as is safe [m], ``wanted`` itself where nothing is in the way.
 
-        Round what crosses at the start cloth may pass through itself, so long as no more crosses after that.
+        In a tangle, round what crosses at the start, cloth may pass through itself, so long as no more of it crosses
+        after that.
         """
-        crossed = self.view.look(start.to(wanted)).crossings
-        if not crossed.count:
-            return self._go(start, wanted, None, listed)
-        x = self._go(start, wanted, self.view.round_crossings(start.to(wanted), rings=TANGLED), listed)
-        return x if self.view.look(x).crossings.count <= crossed.count else self._go(start, wanted, None, listed)
-
-    def walk(self, start: Float[Tensor, "vertices 3"], wanted: Float[Tensor, "vertices 3"]) -> Tensor:
-        """The same for a far move: what is held up holds up the cloth beside it, so that it is not torn."""
-        x = self.move(start, wanted)
-        lag = (wanted.double() - x.double()).to(wanted)
-        late = lag.norm(dim=1) > LATE * self.parts.level.spacing
-        if not bool(late.any()):
+        tangles = self.view.tangles(start.to(wanted), rings=TANGLED)
+        if tangles is None:
+            x = self._go(start, wanted, None, listed)
+            self.view.remember(x)
             return x
-        around = self.view.grown(late, RINGS)
-        values, held = lag * late.unsqueeze(1), late.unsqueeze(1)
-        for _ in range(SPREADS):
-            share = self.view.mean_beside(values, around)
-            values = torch.where(held, lag, torch.where(around.unsqueeze(1), share, values))
-        return self.move(start, wanted - values)
+        free, before = tangles.label.clone(), tangles.counts(self.view.look(start.to(wanted)).crossings)
+        for attempt in range(TRIES):
+            x = self._go(start, wanted, free if attempt < TRIES - 1 else None, listed)
+            worse = tangles.counts(self.view.look(x).crossings) > before
+            if not bool(worse.any()):
+                break
+            free[worse[tangles.label.long()] & (tangles.label >= 0)] = -1
+        return x
 
     def _go(
-        self, start: Tensor, wanted: Tensor, exempt: Bool[Tensor, " vertices"] | None, listed: Listed | None
+        self, start: Tensor, wanted: Tensor, tangle: Int[Tensor, " vertices"] | None, listed: Listed | None
     ) -> Tensor:
-        """The same, with nothing promised to some vertices."""
+        """The same, with nothing promised to what is in a tangle against what is in the same."""
         x = start
         for _ in range(GOES):
-            moved = safe_move(x, wanted, self.parts, floor=self.floor, exempt=exempt, listed=listed)
+            moved = safe_move(x, wanted, self.parts, floor=self.floor, tangle=tangle, listed=listed)
             x, short = moved.x, int(moved.short.sum())
             if not short:
                 break

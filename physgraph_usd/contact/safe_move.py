@@ -5,7 +5,7 @@ at ``start``. Then it has at what `safe_move` returns, and nothing crosses there
 straight way between the two positions, just as they are rounded, each pair keeps a positive distance, so no pair can
 have changed sides. Neither what is wanted, how far it is, nor who wants it matters.
 
-Exempt are pairs that touch at the start (distance 0), and pairs with a vertex that is given as exempt. Where the
+Exempt are pairs that touch at the start (distance 0), and pairs all of whose vertices are given as in one tangle. Where the
 start is in double precision and what is wanted in single, gaps under its rounding cannot be returned, and are not
 promised.
 """
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.near import weights
@@ -27,6 +27,9 @@ KEPT = 0.2
 """Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
 BACK = 0.9
 """Part of the way to an impact that its vertices go: others, cut in turn, may come nearer than they were to."""
+STRAINS, LEAST = 0.1, 0.01
+"""Part of its length that an edge changes by at most where vertices beside one another are cut, and a change of that
+which counts for nothing."""
 SHORTENINGS = 16
 """Passes in which vertices that would touch go less far; after them they stay, so that there is an end."""
 
@@ -57,7 +60,7 @@ def safe_move(
     parts: Parts,
     *,
     floor: float,
-    exempt: Bool[Tensor, " vertices"] | None = None,
+    tangle: Int[Tensor, " vertices"] | None = None,
     listed: Listed | None = None,
 ) -> Moved:
     """Move vertices as far towards wanted positions as no pair of parts comes too near.
@@ -71,7 +74,8 @@ def safe_move(
         wanted: Where to go [m], of the same dtype.
         parts: What may touch what.
         floor: Distance under which a pair keeps nine tenths of what it has [m]: gaps end there.
-        exempt: Vertices to which nothing is promised, or None.
+        tangle: The tangle that each vertex is in, int32, -1 where in none: to what is in one nothing is promised
+            against what is in the same; or None.
         listed: Pairs that are asked alone where neither the start nor what is wanted leaves their reach, or None.
 
     Returns:
@@ -80,24 +84,38 @@ def safe_move(
     at = start.double()
     way = wanted.double() - at
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
-    none = torch.zeros(len(way), dtype=torch.bool, device=way.device)
-    exempt = none if exempt is None else exempt
     x, asked = wanted, (way != 0).any(dim=1)
-    covered = listed is not None and max(listed.far(start), listed.far(wanted)) <= listed.reach
+    covered = listed is not None and listed.covers(start) and listed.covers(wanted)
     impacts = partial(listed.impacts, at) if listed is not None and covered else Swept(parts, at, way).impacts
     clear = torch.zeros_like(way)
     for attempt in range(len(way) + SHORTENINGS):
-        met = impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, exempt=exempt)
+        met = impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, tangle=tangle)
         if not len(met.value):
             break
         least = torch.ones_like(share)
         corner = met.corners.long().reshape(-1)
         least.scatter_reduce_(0, corner, BACK * met.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < SHORTENINGS else torch.where(least < 1.0, 0.0, share)
-        asked, clear = shorter < share, _away(met, at + share.unsqueeze(1) * way, at, clear)
-        share = shorter
+        known, clear = share, _away(met, at + share.unsqueeze(1) * way, at, clear)
+        share = _spread(shorter, way, parts)
+        asked = share < known
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
     return Moved(x, share, clear)
+
+
+def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
+    """Less of their ways where what lies beside is cut short, so that no edge is strained by much more than `STRAINS`."""
+    length = way.norm(dim=1)
+    late = length * (1.0 - share)
+    first, second = parts.links.T
+    within = STRAINS * parts.lengths
+    while True:
+        new = late.scatter_reduce(0, second, late[first] - within, "amax")
+        new = new.scatter_reduce(0, first, new[second] - within, "amax")
+        if not bool((new > late + LEAST * within.mean()).any()):
+            break
+        late = new
+    return torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))
 
 
 def _away(met: Pairs, end: Tensor, start: Tensor, known: Tensor) -> Float[Tensor, "vertices 3"]:

@@ -13,7 +13,7 @@ from functools import reduce
 import numpy as np
 from scipy import sparse
 
-from .topology import PolygonMesh, find_edges
+from .topology import PolygonMesh, TriangleSplit, find_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +135,27 @@ def _linear(mesh: PolygonMesh) -> sparse.csr_matrix:
     matrix = sparse.csr_matrix((weights, columns, offsets), shape=(len(lengths), mesh.vertex_count))
     matrix.sum_duplicates()
     return matrix
+
+
+def on_triangles(mesh: PolygonMesh, refinement: Refinement, split: TriangleSplit) -> sparse.csr_matrix:
+    """The linear placement with the centres of quads on the diagonals that split them, shape (V_child, V_parent).
+
+    So placed, and with fans from first corners, the child lies on the parent's triangles and crosses what they cross,
+    but for what larger polygons become.
+
+    Args:
+        mesh: The parent.
+        refinement: Its subdivision.
+        split: Its triangles.
+    """
+    triangle = np.flatnonzero(np.diff(split.face, prepend=-1))
+    face = split.face[triangle]
+    quad = mesh.counts[face] == 4
+    centre, ends = face_points(mesh)[face[quad]], split.triangles[triangle[quad]][:, [0, 2]]
+    kept = np.ones(refinement.mesh.vertex_count)
+    kept[centre] = 0.0
+    half = sparse.csr_matrix((np.full(ends.size, 0.5), (np.repeat(centre, 2), ends.ravel())), refinement.linear.shape)
+    return sparse.csr_matrix(sparse.diags(kept) @ refinement.linear + half)
 
 
 def subdivide_times(mesh: PolygonMesh, levels: int) -> tuple[Refinement, ...]:
