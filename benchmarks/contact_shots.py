@@ -4,7 +4,6 @@
         [--way-out 3] [--device cuda] [FOLDER]
 
 Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
-In the walking form, which is being built beside ours, cloth walks from where it was by moves that make nothing cross.
 Prints a row a shot: the sums over frames and garments. The paper's form stands without our last projection, but with
 our mending of what newly crosses. With --way-out cloth between overlapping parts of a body is pushed out by ways so
 many cage edges long, in place of half of one.
@@ -33,7 +32,6 @@ from physgraph_usd.usd.reader import Shot, open_shot
 FORMS = {
     "ours": ContactSettings(),
     "paper": ContactSettings(form="linear", cloth="spheres", projections=0, lifts=0),
-    "walking": ContactSettings(promise=True),
     "elastic": ContactSettings(form="off", cloth="off"),
 }
 SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "crossing": 1, "skirt": 20, "tshirt": 30}
@@ -41,6 +39,7 @@ SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "cross
 REAL = {
     "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], ["/shot/char/body_geo"], 36),
     "02_makehuman_usdskel_dm.usdc": (["/shot/char/top", "/shot/char/shorts"], ["/shot/char/body"], 20),
+    "04_tiered_dress_kick_zup.usdc": (["/shot/tiered_dress"], ["/shot/mannequin"], 0),
     "06_torus_pull.usda": (["/shot/cloth"], ["/shot/torus"], 36),
     "08_sphere_spin_xformcollider.usdc": (["/shot/set/cloth"], ["/shot/set/rig/sphere"], 30),
     "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], ["/shot/CesiumMan"], 30),

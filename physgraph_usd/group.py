@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,14 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .attempts import TORN, best_of
 from .contact.bodies import FrameBodies, Touching
 from .contact.cloth import ClothContact
 from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.promised import solve_promised
-from .contact.rounds import solve_rounds, solve_touching
 from .contact.seams import Seams
 from .contact.settings import ContactSettings
+from .contact.solve import solve_touching
 from .detail import Carried, Followers, MovingFrames, Solved
 from .errors import SolveError
 from .forces.base import ForceModule
@@ -111,40 +108,22 @@ class Group:
         Raises:
             SolveError: A term of the potential is not finite.
         """
-        settings, attempt = self._settings, partial(self._attempt, frames, at, touching, moved)
-        if settings.contact.promise:
-            return attempt(kept)[0]
-        return best_of(attempt, kept, counts=settings.contact.cloth != "off", again=settings.budget_ms is None)
-
-    def _attempt(
-        self,
-        frames: Sequence[GarmentFrame],
-        at: float | None,
-        touching: Sequence[Touching],
-        moved: float,
-        kept: Carried | None,
-        *,
-        anew: bool = False,
-    ) -> tuple[Solved, float]:
-        """Solve one frame once; also the 99th percentile of the edges' strain."""
         clock = time.perf_counter()
         forces = self._forces_for(frames)
         world, origin, coarse = self._placed(frames)
-        start = self._start(kept, coarse, world, moved=moved, again=anew)
-        contact = self._contact(touching, coarse, origin, frames)
+        start = self._start(kept, coarse, world, moved=moved)
+        contact = self._contact(touching, coarse, origin, frames, target=start.detailed)
         aim = coarse if contact is None else contact.aim
         prepared = time.perf_counter()
         try:
-            given = {"contact": contact, "anew": anew, "before": kept and kept.about(origin)}
-            x, reports, module, told = self._descend(forces, aim, start, clock, **given)
+            before = None if kept is None else kept.about(origin)
+            x, reports, module, told = self._descend(forces, aim, start, clock, contact=contact, before=before)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         result = self._scaled(aim, x, frames, at=at)
         finished: dict[str, object] = {}
         if contact is not None:
-            scaled = result is not x
-            result, start_next, finished = contact.finish(result)
-            x = x if scaled else start_next
+            result, finished = contact.finish(result)
         solved = time.perf_counter()
         carried = self._carried(coarse, x, world, origin=origin, held=start.held)
         strain = edge_strain(self.levels[-1], result)
@@ -163,13 +142,11 @@ class Group:
         points = self._followers.placed(points, world)
         crosses = np.zeros(len(points), bool) if crossing is None else crossing.cpu().numpy()
         own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
-        # What the last push out of bodies stretches is not carried on.
-        torn = strain["p99"] if strain["p99"] <= TORN else edge_strain(self.levels[-1], x)["p99"]
-        return Solved(own[0], carried, telemetry, own[1]), torn
+        return Solved(own[0], carried, telemetry, own[1])
 
     def _carried(self, coarse: Tensor, x: Tensor, world: np.ndarray, *, origin: np.ndarray, held: int) -> Carried:
-        """What the next frame needs; where cloth walks, its positions too."""
-        fine = x.double() + torch.as_tensor(origin).to(x.device) if self._settings.contact.promise else None
+        """What the next frame needs."""
+        fine = x.double() + torch.as_tensor(origin).to(x.device)
         return replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world), held=held, fine=fine)
 
     def energies(
@@ -247,14 +224,12 @@ class Group:
             raise SolveError(f"{named(self.garments, at)}: {said} or detailScale")
         return result
 
-    def _start(
-        self, kept: Carried | None, coarse: Tensor, world: np.ndarray, *, moved: float = np.inf, again: bool = False
-    ) -> Start:
+    def _start(self, kept: Carried | None, coarse: Tensor, world: np.ndarray, *, moved: float = np.inf) -> Start:
         """Where a frame starts."""
         kept = None if self._settings.temporal == "off" else kept
         moved = moved if self._settings.temporal == "tether" else np.inf  # Nothing else slows it down.
         given = {"frames": self._frames, "finest": self.levels[-1], "reset": self._settings.reset}
-        return start_of(kept, coarse, torch.as_tensor(world), **given, moved=moved, again=again)
+        return start_of(kept, coarse, torch.as_tensor(world), **given, moved=moved)
 
     def _contact(
         self,
@@ -264,6 +239,7 @@ class Group:
         frames: Sequence[GarmentFrame],
         *,
         settings: ContactSettings | None = None,
+        target: Tensor | None = None,
     ) -> FrameContact | None:
         """What a frame's cloth may touch, or None when there is nothing; as the group is set unless told otherwise."""
         settings = settings or self._settings.contact
@@ -280,10 +256,8 @@ class Group:
         bodies = None
         if touching:
             bodies = FrameBodies.begin(self.levels, touching, coarse, origin=origin, settings=settings)
-        thickness = [frame.fabric.thickness for frame in frames]
-        return FrameContact(
-            self.levels, coarse, bodies=bodies, cloth=cloth, thickness=thickness, settings=settings, seams=seams
-        )
+        own = {"thickness": [frame.fabric.thickness for frame in frames], "settings": settings, "seams": seams}
+        return FrameContact(self.levels, coarse, bodies=bodies, cloth=cloth, **own, target=target)
 
     def _judge(
         self,
@@ -306,15 +280,13 @@ class Group:
         clock: float,
         *,
         contact: FrameContact | None,
-        anew: bool,
         before: Tensor | None = None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
-        """Walk the levels; a warm start goes to the finest, unless what crosses starts anew. Also says why."""
+        """Walk the levels; a warm start goes to the finest. Also says why."""
         predicted, last = start.detailed, len(self.levels) - 1
         choice = self._choose(forces[0], coarse, contact, warm=predicted is not None)
-        anew = anew and predicted is not None and contact is not None and contact.crossed
-        first = 0 if choice.nested or anew else last
-        x = predicted if predicted is not None and not anew else self.levels[first].base.apply(coarse)
+        first = 0 if choice.nested else last
+        x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         below, smooth = coarse, self.levels[first].smooth_base
         reports: list[LevelReport] = []
         module = ForceModule(())
@@ -322,8 +294,6 @@ class Group:
             level, lasting = self.levels[index], forces[index]
             if index > first and level.from_below is not None and level.smooth_from_below is not None:
                 below, x, smooth = x, level.from_below.apply(x), level.smooth_from_below
-            if index == last and anew and predicted is not None and contact is not None:
-                predicted = x = contact.mixed(predicted, x)
             view = None if contact is None else contact.at(level)
             module = lasting.module(coarse)
             warm = predicted if index == last else None
@@ -331,13 +301,11 @@ class Group:
             tie = None if warm is None or self._settings.temporal != "tether" else (pull, warm)
             budget = self._settings.budget(last - index, clock, more=choice.steps, warm=warm is not None)
             smoothing = None if warm is not None else lasting.without_facets(x, below, smooth)
-            if view is not None and view.promise is not None and smoothing is not None and index > first:
-                assert level.flat_from_below is not None
+            if view is not None and smoothing is not None and level.flat_from_below is not None and index > first:
                 flat = level.flat_from_below.apply(below)
                 x, smoothing = flat, x + smoothing - flat
-            if view is not None and view.promise is not None and warm is not None and before is not None:
+            if view is not None and warm is not None and before is not None:
                 x = view.moved(before, warm)
-                view.target = warm
             alone = lasting.lasting_system(coarse, tie) if self._systems_last else lasting.system(module, tie)
             x, made, touched = self._solve_level(
                 alone,
@@ -352,8 +320,7 @@ class Group:
                 made[-1].energies = module.energies(x)
             reports += made
             module = ForceModule((*module.forces, *touched))
-        told: dict[str, object] = {"start": "warm: from the coarse levels round what crossed"} if anew else {}
-        return x, reports, module, told | ({"chosen": choice.reason} if choice.reason else {})
+        return x, reports, module, {"chosen": choice.reason} if choice.reason else {}
 
     def _choose(self, cage: LevelForces, coarse: Tensor, contact: FrameContact | None, *, warm: bool) -> Choice:
         """Which levels a frame is solved at, and the integrator, which is made ready."""
@@ -370,8 +337,6 @@ class Group:
         if who not in self._integrators:
             self._integrators[who] = choice.integrator(build)
         self._integrator = self._integrators[who]
-        if contact is not None and (choice.nested or warm):
-            contact.forget()  # The choice looked at the upsampled cage, which is not where the level starts.
         return choice
 
     def _remaining(self, forces: LevelForces, coarse: Tensor) -> float:
@@ -404,26 +369,18 @@ class Group:
             x, report = solve_level(alone, integrator, x, level=level.index, budget=budget)
             return x, [report], ()
 
-        def system(touched: Sequence[Touch], at: Tensor) -> System:
+        def system(touched: Sequence[Touch], at: Tensor, known: System | None) -> System:
             if not touched and view.seam is None:
                 return alone
             assert isinstance(alone.field, ForceModule)
             assert isinstance(alone.metric, Metric)
             field = alone.field.joined_by(touched)
             field = field if view.seam is None else SewnForces(field, view.seam)
-            held = view.metric(alone.metric, touched, at)
+            held = view.metric(alone.metric, touched, at, known=None if known is None else known.metric)
             return System(field, held, free=level.free, spacing=level.spacing, level=level)
 
-        if start.rests:
-            touched = view.terms(x)
-            return solve_rounds(
-                system, integrator, x, terms=touched, view=view, level=level.index, budget=budget, rounds=1
-            )
-        if view.promise is not None:
-            own = {"smoothing": smoothing, "outward": self._outward}
-            return solve_promised(system, integrator, x, view=view, level=level, **own, budget=budget)
-        given = {"finest": level is self.levels[-1], "smoothing": smoothing, "outward": self._outward}
-        return solve_touching(system, integrator, x, view=view, level=level, **given, still=start.still, budget=budget)
+        own = {"smoothing": smoothing, "outward": self._outward, "budget": budget}
+        return solve_touching(system, integrator, x, view=view, level=level, **own)
 
     def _telemetry(
         self, module: ForceModule, x: Tensor, coarse: Tensor, reports: list[LevelReport]

@@ -57,7 +57,6 @@ def start_of(
     finest: Level,
     reset: Reset,
     moved: float = np.inf,
-    again: bool = False,
 ) -> Start:
     """Carry the last frame's detail along, unless the cage jumped or it would tear the cloth.
 
@@ -69,7 +68,6 @@ def start_of(
         finest: The finest level.
         reset: When a frame starts cold.
         moved: How far what the cloth may touch has moved since [m]; infinite where more than poses has changed.
-        again: Whether what is kept is of this frame.
     """
     if kept is None:
         return Start("cold")
@@ -84,12 +82,12 @@ def start_of(
         return Start(f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}")
     moves = (coarse - shifted.coarse).norm(dim=1)
     farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
-    held, slowed = slowing(kept.held, farthest, again=again)
+    held, slowed = slowing(kept.held, farthest)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
     return Start(why, detailed, motion < STILL, held, slowed)
 
 
-def slowing(held: int, motion: float, *, again: bool = False) -> tuple[int, float]:
+def slowing(held: int, motion: float) -> tuple[int, float]:
     """For how many frames a pose has now been held, and how many times as stiffly the tether holds cloth in it.
 
     Never so stiffly that the cloth would be slower than what moves slowly: the cage, or what touches it.
@@ -97,9 +95,8 @@ def slowing(held: int, motion: float, *, again: bool = False) -> tuple[int, floa
     Args:
         held: For how many frames it had been before.
         motion: How far any point of cage or bodies has moved since, in mean cage edges.
-        again: Whether this frame was counted before.
     """
     if motion >= STILL:
         return 0, 1.0
-    held += not again
+    held += 1
     return held, min(SLOWER ** min(held, 64), SLOWEST, (STILL / max(motion, 1e-9)) ** 2)

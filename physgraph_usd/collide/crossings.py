@@ -12,9 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..mesh.piercing import volume
-from .cluster_kernels import has, overlap
 from .parts import Parts, Topology
-from .sweep import Found, Motion, Pairs, Sweep, Swept, is_one, write
+from .sweep import Found, Motion, Pairs, Sweep, Swept, has, is_one, overlap, write
 
 wp.set_module_options({"enable_backward": False})
 

@@ -67,9 +67,7 @@ def weights(
     return out
 
 
-def near_pairs(
-    parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, listed: Listed | None = None
-) -> NearPairs:
+def near_pairs(parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, listed: Listed | None = None) -> NearPairs:
     """Every vertex and face, and every two edges, that share no vertex and are as near as is asked for.
 
     Args:

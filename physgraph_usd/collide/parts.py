@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from ..level import Level
 from ..mesh.topology import adjacency, owned_sides
-from .clusters import ClusteredParts
+from .clusters import Clusters
 
 
 @wp.struct
@@ -58,9 +58,7 @@ class Parts:
         """
         self.level = level
         edges, triangles = (each.cpu().numpy() for each in (level.edges, level.triangles))
-        clusters = ClusteredParts(
-            level, adjacency(edges, level.vertex_count), owned_sides(edges, triangles), meets=meets
-        )
+        clusters = Clusters(level, adjacency(edges, level.vertex_count), owned_sides(edges, triangles))
         self.count = clusters.count
         table = self.topology = Topology()
         table.first_vertex, table.vertices = clusters.vertices
@@ -91,7 +89,7 @@ def _sewn(label: np.ndarray) -> np.ndarray:
     return np.stack([later, first[later]], axis=1)
 
 
-def _corners(clusters: ClusteredParts) -> tuple[np.ndarray, np.ndarray]:
+def _corners(clusters: Clusters) -> tuple[np.ndarray, np.ndarray]:
     """The first corner of each cluster, and the vertices of its parts, each once."""
     owned = [
         np.stack([np.repeat(np.arange(clusters.count), np.diff(first.numpy())), vertex], axis=1)

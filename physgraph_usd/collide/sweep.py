@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.lanes import LEAST_QUERIES, Launch
-from .cluster_kernels import has, overlap
 from .impact import distance_of, impact_of
 from .parts import Parts, Topology
 
@@ -81,7 +80,8 @@ class Reach:
     """How near what is near is.
 
     Attributes:
-        radius: Two parts are near within the sum of their radii, the greatest of their corners' [m], shape (V,), float64.
+        radius: Two parts are near within the sum of their radii, the greatest of their corners' [m], shape (V,),
+            float64.
         play: Those of one garment only within a part of their distance at rest and twice the least of these [m], shape
             (V,).
         half: That part.
@@ -106,6 +106,21 @@ class Pairs:
     corners: Int[Tensor, "pairs 4"]
     value: Float[Tensor, " pairs"]
     face: Bool[Tensor, " pairs"]
+
+
+@wp.func
+def has(t: wp.vec3i, v: wp.int32):
+    """Whether a triangle has a vertex."""
+    return t[0] == v or t[1] == v or t[2] == v
+
+
+@wp.func
+def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.vec3f):
+    """Whether two boxes meet; all six comparisons are made, for a wrong guess at a branch costs more."""
+    first = wp.where(low[0] <= other_high[0], 1, 0) & wp.where(low[1] <= other_high[1], 1, 0)
+    second = wp.where(low[2] <= other_high[2], 1, 0) & wp.where(other_low[0] <= high[0], 1, 0)
+    third = wp.where(other_low[1] <= high[1], 1, 0) & wp.where(other_low[2] <= high[2], 1, 0)
+    return (first & second & third) == 1
 
 
 @wp.func
@@ -408,7 +423,8 @@ class Swept:
             share: Part of their distance that pairs keep at least.
             floor: Distance under which they keep nine tenths of it [m].
             asked: Only pairs with one of these vertices are asked.
-            tangle: The tangle that each vertex is in, int32, -1 where in none: pairs of one alone are not asked; or None.
+            tangle: The tangle that each vertex is in, int32, -1 where in none: pairs of one alone are not asked; or
+                None.
         """
         motion = self._motion(way, asked=asked, tangle=tangle)
         motion.share, motion.floor = share, floor
@@ -435,7 +451,9 @@ class Swept:
         begin[1:] = (count * over).cumsum(dim=0)
         rest = _room(begin, int(begin[-1]))
         self._write(kernel, motion, now, begin=begin, count=count, out=rest)
-        return Pairs(*(torch.cat([getattr(each, name) for each in (first, rest)]) for name in ("corners", "value", "face")))
+        return Pairs(
+            *(torch.cat([getattr(each, name) for each in (first, rest)]) for name in ("corners", "value", "face"))
+        )
 
     def _write(self, kernel: wp.Kernel, motion: Any, now: Any, *, begin: Tensor, count: Tensor, out: Pairs) -> None:
         """Count each cluster's pairs, and write those that there is room for."""

@@ -173,11 +173,6 @@ class LevelBodies:
         """The vertices that each body lost; None where there are none."""
         return tuple(track.lost for track in self._tracks)
 
-    def hold(self, held: Bool[Tensor, " vertices"] | None) -> None:
-        """From now on leave these vertices where they are between overlapping parts of a body."""
-        for track in self._tracks:
-            track.held = held
-
     def _out(self, x: Tensor) -> tuple[Tensor, int]:
         """Push out to the least clearance, body by body; the positions and the passes made.
 
@@ -331,7 +326,6 @@ class FrameBodies:
         base: Float[Tensor, "vertices 3"],
         x: Float[Tensor, "vertices 3"],
         *,
-        held: Bool[Tensor, " vertices"] | None = None,
         lost: Sequence[Bool[Tensor, " vertices"] | None] = (),
     ) -> dict[str, object]:
         """What is in each body and what crosses it, before and after, as plain values.
@@ -340,7 +334,6 @@ class FrameBodies:
             finest: The finest level.
             base: The upsampled cage [m].
             x: The result [m].
-            held: Vertices that count as pinched between overlapping parts, however short the way out, or None.
             lost: `LevelBodies.lost`.
         """
         bodies: dict[str, object] = {}
@@ -355,9 +348,7 @@ class FrameBodies:
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
             through, longest = len(track.pierced(finest, x, after.abs())), track.longest
             first = penetration(surface, finest, base + shift, before, longest=longest, inside=inside)
-            last = penetration(
-                surface, finest, x + shift, after, longest=longest, held=held, lost=own, crossings=through
-            )
+            last = penetration(surface, finest, x + shift, after, longest=longest, lost=own, crossings=through)
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {"before": asdict(first), "after": asdict(last)}
         return {"bodies": bodies}

@@ -1,9 +1,8 @@
-"""The cage that the fine cloth follows where the input leaves it no room, or through itself.
+"""The cage that the fine cloth follows where the input leaves it no room.
 
-Two things no fine cloth can follow. Where parts of a skinned body overlap, the cage goes deep through both, and cloth
-that is pushed out of them tears. Where cages cross, the guide draws the fine cloth through itself again. There, and
-there only, the solve follows a repaired cage: cloth between overlapping parts is drawn taut from where it goes in to
-where it comes out, and pieces that crossed go back to their side. The report's figures still count from the input.
+Where parts of a skinned body overlap, the cage goes deep through both, and cloth that is pushed out of them tears.
+There, and there only, the solve follows a repaired cage: cloth between overlapping parts is drawn taut from where it
+goes in to where it comes out. The report's figures still count from the input.
 """
 
 from __future__ import annotations
@@ -18,47 +17,27 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.topology import patches_with
-from .apart import drawn_apart
 from .bodies import LevelBodies
 from .cloth_mesh import ClothMesh
 
-WORTH = 0.9
-"""Part of the input's crossings under which a cage must come for the fine cloth to follow it."""
 FAIRINGS, PASSES = 3, 2
 """How often drawn cloth is smoothed and pushed out in turn, and passes of the smoothing."""
 
 
 def repaired_cage(
-    cage: Level,
-    coarse: Float[Tensor, "coarse 3"],
-    *,
-    bodies: LevelBodies | None,
-    mesh: ClothMesh,
-    gap: float,
-    crosses: bool = True,
+    cage: Level, x: Float[Tensor, "coarse 3"], *, bodies: LevelBodies, mesh: ClothMesh
 ) -> Float[Tensor, "coarse 3"]:
-    """The cage that the fine cloth is to follow; the input itself where nothing is pinched and nothing crosses.
+    """The cage with cloth between overlapping parts of a body as a taut membrane, and what can leave it outside.
 
     Args:
         cage: The cage's level.
-        coarse: Its positions [m].
-        bodies: The cage's view of the bodies, or None without.
+        x: Its positions [m].
+        bodies: The cage's view of the bodies.
         mesh: The cage's faces.
-        gap: Distance at which cloth drawn apart lies [m].
-        crosses: Whether the input may cross itself.
 
     Returns:
-        Positions [m].
+        Positions [m]; x itself where nothing is pinched.
     """
-    taut = coarse if bodies is None else _drawn_taut(cage, coarse, bodies, mesh)
-    if not crosses and taut is coarse:
-        return coarse
-    out, before, after = drawn_apart(mesh, taut, gap=gap)
-    return out if after < WORTH * before or taut is not coarse else coarse
-
-
-def _drawn_taut(cage: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Tensor:
-    """Cloth between overlapping parts of a body as a taut membrane, and what can leave it outside."""
     hidden = _hidden_between(cage, x, bodies, mesh)
     if not bool(hidden.any()):
         return x

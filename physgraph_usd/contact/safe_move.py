@@ -5,8 +5,8 @@ at ``start``. Then it has at what `safe_move` returns, and nothing crosses there
 straight way between the two positions, just as they are rounded, each pair keeps a positive distance, so no pair can
 have changed sides. Neither what is wanted, how far it is, nor who wants it matters.
 
-Exempt are pairs that touch at the start (distance 0), and pairs all of whose vertices are given as in one tangle. Where the
-start is in double precision and what is wanted in single, gaps under its rounding cannot be returned, and are not
+Exempt are pairs that touch at the start (distance 0), and pairs all of whose vertices are given as in one tangle. Where
+the start is in double precision and what is wanted in single, gaps under its rounding cannot be returned, and are not
 promised.
 """
 
@@ -104,7 +104,7 @@ def safe_move(
 
 
 def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
-    """Less of their ways where what lies beside is cut short, so that no edge is strained by much more than `STRAINS`."""
+    """Less of their ways where what lies beside is cut short, so that no edge is strained by more than `STRAINS`."""
     length = way.norm(dim=1)
     late = length * (1.0 - share)
     first, second = parts.links.T

@@ -18,14 +18,12 @@ class ContactSettings:
         cloth_stiffness: The same of pairs.
         sphere_stiffness: k_sc of spheres, in stretch stiffnesses (PAPER A13).
         pressure: k_c over the garment's area of the linear form, in weights of the cloth.
-        rounds: How often in a level's steps closest points are found anew.
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
         lifts: How often it moves faces outwards that a body comes through.
         way_out: How far vertices that get between overlapping parts of a body are pushed out at most, in the cage's
             mean edges. What the input has there stays.
         measured: Whether what is off is measured all the same.
-        promise: Whether cloth moves safely, from where it was, in place of being mended.
     """
 
     form: str = "quadratic"
@@ -34,13 +32,11 @@ class ContactSettings:
     cloth_stiffness: float = 15.0
     sphere_stiffness: float = 1.5
     pressure: float = 5.0
-    rounds: int = 3
     clearance: float = 0.25
     projections: int = 10
     lifts: int = 40
     way_out: float = 0.5
     measured: bool = False
-    promise: bool = False
 
     @property
     def sees_bodies(self) -> bool:

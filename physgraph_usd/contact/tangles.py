@@ -1,4 +1,22 @@
-"""Tangles: what crosses at the start of a move, each with what lies round it, to which less is promised."""
+"""Tangles: what crosses, with what lies round it, and the force that draws it apart by shortening its contours.
+
+Where an edge passes through a face, the two surfaces meet along a contour that runs from there into the faces at the
+edge. If the edge moves by d relative to the face, its point on the face moves by d - (N.d / N.E) E, and the contour
+grows shorter by G.d with
+
+    G = sum_F  R_F - (R_F.E / N.E) N
+
+(after Volino and Magnenat-Thalmann 2006).
+
+| symbol | meaning |
+|---|---|
+| E | unit direction of the edge |
+| N | unit normal of the face |
+| F | a face at the edge |
+| R_F | unit direction of the contour, from the edge into F |
+
+Moved along G, contours shrink, whichever side is the right one. A straight contour from rim to rim does not.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +24,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..collide.crossings import Crossings
+from ..forces.self_contact import Gaps
+from ..level import Level
 from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
+
+GRAZING = 0.2
+"""Least |N.E|: an edge that lies almost in the face would be sent far along the normal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,16 +51,17 @@ class Tangles:
     _mesh: ClothMesh
 
     @staticmethod
-    def find(mesh: ClothMesh, crossings: Crossings, *, rings: int) -> Tangles:
+    def find(mesh: ClothMesh, corners: Int[Tensor, "crossings 5"], *, rings: int) -> Tangles:
         """What crosses, and what is within some rings of it; what hangs together there, or crosses, is one.
 
         Args:
             mesh: The cloth.
-            crossings: What crosses.
+            corners: Vertices of each edge and face that cross.
             rings: How far round that.
         """
-        region = mesh.grown(mesh.crossed(crossings), rings)
-        edges, corners = mesh.level.edges.long(), mesh.corners_of(crossings)
+        region = torch.zeros_like(mesh.level.free[:, 0])
+        region[corners.reshape(-1)] = True
+        region, edges = mesh.grown(region, rings), mesh.level.edges.long()
         inside = edges[region[edges].all(dim=1)]
         across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
         piece = joined_by(torch.cat([inside, across]).cpu().numpy(), mesh.level.vertex_count)
@@ -50,3 +74,76 @@ class Tangles:
         """How much crosses in each."""
         of = self.label[self._mesh.corners_of(crossings)].amax(dim=1).long()
         return torch.bincount(of.clamp_min(0), minlength=self.number)
+
+
+def ways_out(
+    mesh: ClothMesh, crossings: Crossings, x: Float[Tensor, "vertices 3"]
+) -> tuple[Float[Tensor, "crossings 3"], Float[Tensor, "crossings 4"]]:
+    """For each crossing the direction in which its edge should move, relative to its face, and where it is.
+
+    Args:
+        mesh: The cloth.
+        crossings: What crosses.
+        x: Positions [m].
+
+    Returns:
+        Directions, at most of length 1, and the place: along the edge, then barycentric on the face.
+    """
+    ends, face = mesh.level.edges[crossings.edge].long(), mesh.triangles[crossings.face]
+    a, b = x[ends[:, 0]], x[ends[:, 1]]
+    p, q, r = (x[face[:, i]] for i in range(3))
+    along = torch.nn.functional.normalize(b - a, dim=1, eps=1e-30)
+    area = torch.linalg.cross(q - p, r - p)
+    normal = torch.nn.functional.normalize(area, dim=1, eps=1e-30)
+    into = (normal * (b - a)).sum(dim=1)
+    at = ((normal * (p - a)).sum(dim=1) / torch.where(into.abs() > 0, into, torch.ones_like(into))).clamp(0.0, 1.0)
+    point = a + at.unsqueeze(1) * (b - a)
+    cosine = (normal * along).sum(dim=1)
+    cosine = torch.where(cosine < 0, cosine.clamp_max(-GRAZING), cosine.clamp_min(GRAZING))
+    way = torch.zeros_like(a)
+    for third in mesh.opposite[crossings.edge].T:
+        there = third >= 0
+        side = torch.linalg.cross(b - a, x[third.clamp_min(0)] - a)
+        contour = torch.nn.functional.normalize(torch.linalg.cross(normal, side), dim=1, eps=1e-30)
+        inwards = x[third.clamp_min(0)] - a
+        inwards = inwards - (inwards * along).sum(dim=1, keepdim=True) * along
+        contour = torch.where((contour * inwards).sum(dim=1, keepdim=True) < 0, -contour, contour)
+        share = (contour * along).sum(dim=1) / cosine
+        way = way + torch.where(there.unsqueeze(1), contour - share.unsqueeze(1) * normal, torch.zeros_like(way))
+    place = torch.cat([at.unsqueeze(1), _barycentric(point, p, q, r)], dim=1)
+    return way / way.norm(dim=1, keepdim=True).clamp_min(1.0), place
+
+
+def gaps_out(
+    mesh: ClothMesh, crossings: Crossings, x: Float[Tensor, "vertices 3"], *, step: float, stiffness: float
+) -> Gaps:
+    """Planes that draw crossing edges out of their faces by a step at most.
+
+    Args:
+        mesh: The cloth.
+        crossings: What crosses at x.
+        x: Positions [m].
+        step: How far the edge and the face are moved apart [m].
+        stiffness: k_c [N/m^3].
+    """
+    level: Level = mesh.level
+    way, place = ways_out(mesh, crossings, x)
+    ends, face = level.edges[crossings.edge].long(), mesh.triangles[crossings.face]
+    corners = torch.cat([torch.cat([ends[:, i : i + 1], face], dim=1) for i in range(2)])
+    share = torch.cat([1.0 - place[:, 0], place[:, 0]])
+    weight = torch.cat([torch.ones_like(place[:, :1]), -place[:, 1:]], dim=1).repeat(2, 1)
+    length = way.norm(dim=1).repeat(2)
+    normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30).repeat(2, 1)
+    here = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
+    strength = stiffness * share * level.vertex_area[corners[:, 0]]
+    return Gaps(corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step * length, strength)
+
+
+def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor, "points 3"]:
+    """Barycentric coordinates of points in triangles, clamped to them."""
+    normal = torch.linalg.cross(q - p, r - p)
+    whole = normal.square().sum(dim=1).clamp_min(1e-30)
+    first = (torch.linalg.cross(r - q, point - q) * normal).sum(dim=1) / whole
+    second = (torch.linalg.cross(p - r, point - r) * normal).sum(dim=1) / whole
+    weight = torch.stack([first, second, 1.0 - first - second], dim=1).clamp_min(0.0)
+    return weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-30)

@@ -30,7 +30,6 @@ class Track:
         at: Positions at which distances were found [m], shape (V, 3).
         known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
-        held: Vertices that stay between overlapping parts, however short the way out, shape (V,), or None.
         lost: Vertices that lay between overlapping parts in the input, and stay while inside, shape (V,), or None.
         passing: Vertices whose way to where they belong leads through the body, which lets them, shape (V,), or None.
         inside: Closest points of the vertices with negative distances, as they were found first; or None.
@@ -44,7 +43,6 @@ class Track:
     at: Tensor
     known: Tensor
     longest: float
-    held: Tensor | None = None
     lost: Tensor | None = None
     passing: Tensor | None = None
     inside: Nearest | None = None
@@ -83,9 +81,8 @@ class Track:
             near = found.some(within)
             way = self.surface.exit(asked[within], near)
             distance[within], point[within], outward[within] = way.distance, way.point, way.normal
-            held = None if self.held is None else self.held[which[within]]
             lost = None if self.lost is None else self.lost[which[within]]
-            kept[within] = ~pinched(self.surface, asked[within], near, way, longest=self.longest, held=held, lost=lost)
+            kept[within] = ~pinched(self.surface, asked[within], near, way, longest=self.longest, lost=lost)
         away = (asked - point) / distance.clamp_min(ON_SURFACE).unsqueeze(1) * sign.unsqueeze(1)
         outward = outward * self._outward(which).unsqueeze(1)
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)

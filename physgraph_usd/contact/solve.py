@@ -1,4 +1,4 @@
-"""The solve of one level by the promise: detect, step, move safely, detect again."""
+"""The solve of one level that may touch something: detect, step, move safely, detect again."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ NEAR = 10.0
 """Tolerances of remaining move under which a warm frame makes no more steps than its budget has."""
 UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
 """Most rounds that draw out what crosses: from cold at the cage, and in a warm frame."""
+MakeSystem = Callable[[Sequence[Touch], Tensor, System | None], System]
+"""Makes a level's system with contact terms at positions; the last round's tells of its metric, which may serve on."""
 
 
-def solve_promised(
-    make_system: Callable[[Sequence[Touch], Tensor], System],
+def solve_touching(
+    make_system: MakeSystem,
     integrator: Integrator,
     x: Float[Tensor, "vertices 3"],
     *,
@@ -37,7 +39,7 @@ def solve_promised(
     """Solve one level from positions in which what is apart is on its side.
 
     Args:
-        make_system: Makes the level's system with contact terms at positions.
+        make_system: Makes the level's system.
         integrator: Any integrator.
         x: Start positions [m].
         view: The level's view of what it may touch.
@@ -55,12 +57,12 @@ def solve_promised(
     x, reports = _drawn_out(make_system, integrator, view.closed(x), view=view, level=level, budget=budget)
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
-        x = view.moved(x, leave_saddle(make_system(view.terms(x), x), level, x, outward=outward))
+        x = view.moved(x, leave_saddle(make_system(view.terms(x), x, None), level, x, outward=outward))
     carry, last, terms, listed = None, None, (), None
     for number in range(ROUNDS):
         listed = view.listed(x, listed)
         terms = view.terms(x, listed=listed)
-        system = make_system(terms, x)
+        system = make_system(terms, x, last)
         resume = carry if last is not None and system.shares_metric(last) else None
         of_round = _budget_of(budget, system, first=not number)
         y, report, ended = _descended(system, integrator, x, level=level.index, budget=of_round, resume=resume)
@@ -83,7 +85,7 @@ def _serves(report: LevelReport, budget: Budget, rounds: int) -> bool:
 
 
 def _drawn_out(
-    make_system: Callable[[Sequence[Touch], Tensor], System],
+    make_system: MakeSystem,
     integrator: Integrator,
     x: Tensor,
     *,
@@ -92,15 +94,15 @@ def _drawn_out(
     budget: Budget,
 ) -> tuple[Tensor, list[LevelReport]]:
     """Rounds of few steps in which contours shorten, at the cage and where the last level or frame left any."""
-    most = UNTANGLINGS if level.index == 0 else WARM_UNTANGLINGS
+    cold = level.index == 0
     reports: list[LevelReport] = []
-    short = replace(budget, steps=STEPS, tolerance=0.0, extra=0)
-    while len(reports) < most:
-        terms = view.terms(x)
-        if not view.tangled:
+    short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0)
+    while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
+        if not (view.tangled(x) if cold else view.crosses(x)):
             break
-        y, report = solve_level(make_system(terms, x), integrator, x, level=level.index, budget=short)
-        x = view.moved(x, y)
+        terms = view.terms(x, order=cold)
+        y, report = solve_level(make_system(terms, x, None), integrator, x, level=level.index, budget=short)
+        x = view.drawn(x, y) if cold else view.moved(x, y)
         reports.append(report)
     return x, reports
 
@@ -109,7 +111,7 @@ def _budget_of(budget: Budget, system: System, *, first: bool) -> Budget:
     """The budget of a round: what a held metric calls a small move is that much smaller."""
     shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
     rest = budget.rest if first else 1.0
-    return replace(budget, steps=STEPS, extra=0, tolerance=shrunk * budget.tolerance, rest=rest)
+    return replace(budget, steps=min(STEPS, budget.steps), extra=0, tolerance=shrunk * budget.tolerance, rest=rest)
 
 
 def _descended(
