@@ -52,7 +52,8 @@ class Carried:
         detail: Fine positions minus the smooth base [m], shape (V, 3).
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
         held: For how many frames the pose had been held.
-        fine: Fine positions [m], world space, float64, where cloth walks from frame to frame; else None.
+        fine: Fine positions [m], world space, float64, from which cloth walks on; None before it was solved.
+        clean: Whether nothing of what was solved together crosses there.
     """
 
     coarse: Float[Tensor, "coarse 3"]
@@ -60,6 +61,7 @@ class Carried:
     frames: Float[Tensor, "coarse 3 3"]
     held: int = 0
     fine: Float[Tensor, "vertices 3"] | None = None
+    clean: bool = False
 
     def about(self, origin: np.ndarray) -> Float[Tensor, "vertices 3"] | None:
         """Fine positions about an origin [m], float64, where cloth walks; else None."""
@@ -71,7 +73,8 @@ def join(parts: Sequence[Carried]) -> Carried:
     whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
     fine = [part.fine for part in parts if part.fine is not None]
     walked = torch.cat(fine) if len(fine) == len(parts) else None
-    return Carried(*whole, held=min(part.held for part in parts), fine=walked)
+    clean = all(part.clean for part in parts)
+    return Carried(*whole, held=min(part.held for part in parts), fine=walked, clean=clean)
 
 
 def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> list[Carried]:
@@ -90,6 +93,7 @@ def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> l
             carried.frames[c],
             held=carried.held,
             fine=None if carried.fine is None else carried.fine[f],
+            clean=carried.clean,
         )
         for c, f in pairs
     ]

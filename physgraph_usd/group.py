@@ -117,15 +117,18 @@ class Group:
         prepared = time.perf_counter()
         try:
             before = None if kept is None else kept.about(origin)
+            if contact is not None and before is not None and kept is not None and kept.clean:
+                contact.at(self.levels[-1]).remember(before)
             x, reports, module, told = self._descend(forces, aim, start, clock, contact=contact, before=before)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         result = self._scaled(aim, x, frames, at=at)
         finished: dict[str, object] = {}
+        clean = contact is not None and not contact.at(self.levels[-1]).crosses(x)
         if contact is not None:
             result, finished = contact.finish(result)
         solved = time.perf_counter()
-        carried = self._carried(coarse, x, world, origin=origin, held=start.held)
+        carried = self._carried(coarse, x, world, origin=origin, held=start.held, clean=clean)
         strain = edge_strain(self.levels[-1], result)
         telemetry = self._telemetry(module, result, coarse, reports) | {"strain": strain, "start": start.why} | told
         judge = self._judge(contact, touching, coarse, origin=origin, frames=frames)
@@ -144,10 +147,13 @@ class Group:
         own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
         return Solved(own[0], carried, telemetry, own[1])
 
-    def _carried(self, coarse: Tensor, x: Tensor, world: np.ndarray, *, origin: np.ndarray, held: int) -> Carried:
+    def _carried(
+        self, coarse: Tensor, x: Tensor, world: np.ndarray, *, origin: np.ndarray, held: int, clean: bool
+    ) -> Carried:
         """What the next frame needs."""
         fine = x.double() + torch.as_tensor(origin).to(x.device)
-        return replace(self._frames.store(coarse, x), coarse=torch.as_tensor(world), held=held, fine=fine)
+        own = {"coarse": torch.as_tensor(world), "held": held, "fine": fine, "clean": clean}
+        return replace(self._frames.store(coarse, x), **own)
 
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()

@@ -191,7 +191,7 @@ def build_levels(
             maps = zip(*((part.linear_step, part.smooth_step, part.flat_step) for part in parts), strict=True)
             whole = [sp.csr_matrix(sp.block_diag(each)) for each in maps] or [sp.csr_matrix((0, 0))] * 3
             below = [Stencil(each, dtype=dtype, device=device, lanes=lanes) for each in whole]
-            below[2] = below[2] if (whole[2] != whole[0]).nnz else below[0]
+            below[2] = below[2] if abs(whole[2] - whole[0]).sum() > 0 else below[0]
         levels.append(_join(index, parts, below, dtype=dtype, device=device, lanes=lanes))
     return tuple(levels)
 

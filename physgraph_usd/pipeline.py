@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import reduce
 from statistics import median
 
@@ -212,6 +213,8 @@ class Refiner:
             last = [self._before[index] for index in part]
         known = [each for each in last if each is not None]
         kept = None if gap or len(known) < len(part) else join([each.carried for each in known])
+        if kept is not None and any(each.part != part for each in known):
+            kept = replace(kept, clean=False)  # What was solved apart may cross.
         while True:
             touching = self._touching(part, frames, near)
             moved = self._moved(part, frame, near, known)

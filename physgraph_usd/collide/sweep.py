@@ -451,9 +451,7 @@ class Swept:
         begin[1:] = (count * over).cumsum(dim=0)
         rest = _room(begin, int(begin[-1]))
         self._write(kernel, motion, now, begin=begin, count=count, out=rest)
-        return Pairs(
-            *(torch.cat([getattr(each, name) for each in (first, rest)]) for name in ("corners", "value", "face"))
-        )
+        return joined(first, rest)
 
     def _write(self, kernel: wp.Kernel, motion: Any, now: Any, *, begin: Tensor, count: Tensor, out: Pairs) -> None:
         """Count each cluster's pairs, and write those that there is room for."""
@@ -502,7 +500,11 @@ class Listed:
 
     def covers(self, x: Float[Tensor, "vertices 3"], part: float = 1.0) -> bool:
         """Whether no vertex at x [m] is farther from where it was than that part of what it may be."""
-        return bool(((x.double() - self._x).norm(dim=1) <= part * self._may).all())
+        return not bool(self.beyond(x, part).any())
+
+    def beyond(self, x: Float[Tensor, "vertices 3"], part: float = 1.0) -> Bool[Tensor, " vertices"]:
+        """Which vertices are."""
+        return (x.double() - self._x).norm(dim=1) > part * self._may
 
     def impacts(
         self,
@@ -522,6 +524,54 @@ class Listed:
         Launch(values_of, len(value), inputs, device=str(start.device), lanes=self._parts.level.lanes)({})
         met = value < 1.0
         return Pairs(self.pairs.corners[met], value[met], self.pairs.face[met])
+
+
+class ListedAndSwept:
+    """Listed pairs for what stays within their reach, and all pairs of what does not."""
+
+    def __init__(
+        self,
+        parts: Parts,
+        start: Float[Tensor, "vertices 3"],
+        way: Float[Tensor, "vertices 3"],
+        listed: Listed | None,
+    ) -> None:
+        """Take what is swept and listed.
+
+        Args:
+            parts: The parts.
+            start: Positions [m], float64.
+            way: How far each vertex goes at most, along straight lines [m], float64.
+            listed: The pairs, or None.
+        """
+        self._start, self._listed = start, listed
+        self._far = None if listed is None else listed.beyond(start) | listed.beyond(start + way)
+        covered = self._far is not None and not bool(self._far.any())
+        self._swept = None if covered else Swept(parts, start, way)
+
+    def impacts(
+        self,
+        way: Float[Tensor, "vertices 3"],
+        *,
+        share: float,
+        floor: float,
+        asked: Bool[Tensor, " vertices"],
+        tangle: Int[Tensor, " vertices"] | None = None,
+    ) -> Pairs:
+        """As `Swept.impacts`."""
+        given = {"share": share, "floor": floor, "tangle": tangle}
+        if self._listed is None or self._far is None:
+            assert self._swept is not None
+            return self._swept.impacts(way, asked=asked, **given)
+        near = self._listed.impacts(self._start, way, asked=asked, **given)
+        far = None if self._swept is None else self._swept.impacts(way, asked=self._far, **given)
+        return near if far is None else joined(near, far)
+
+
+def joined(first: Pairs, second: Pairs) -> Pairs:
+    """Pairs of two lists."""
+    parts = ((getattr(first, name), getattr(second, name)) for name in ("corners", "value", "face"))
+    return Pairs(*(torch.cat(each) for each in parts))
 
 
 def _motion(

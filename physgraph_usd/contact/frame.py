@@ -14,6 +14,7 @@ from ..collide.sweep import Listed
 from ..forces.contact import Contact
 from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact, Spheres
+from ..integrate.base import Preconditioner
 from ..integrate.metric import Metric
 from ..level import Level
 from .bodies import FrameBodies, LevelBodies, moves
@@ -56,23 +57,28 @@ class LevelContact:
         terms: Sequence[Touch],
         x: Float[Tensor, "vertices 3"],
         *,
-        known: Metric | HeldMetric | None = None,
+        known: Preconditioner | None = None,
     ) -> Metric | HeldMetric:
         """The metric of a level whose cloth is held by what touches at x [m]; a known one of it while that serves."""
         plain = plain if self.seam is None else plain.merged(self.seam.label)
         if not terms:
             return plain
-        known = known if isinstance(known, HeldMetric) else None
+        last = known if isinstance(known, HeldMetric) else None
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
         if self.crosses(x):
             return HeldMetric(plain, stiff, factored=False)
-        if known is None:
+        if last is None:
             return HeldMetric(plain, stiff) if bool((stiff > 0).any()) else plain  # Things are near, but none pushes.
-        return known if known.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, known.stiff))
+        return last if last.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, last.stiff))
 
     def crosses(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether cloth crosses cloth at positions x [m], where it keeps its sides."""
         return self.promise is not None and self.promise.view.crossings(x).count > 0
+
+    def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
+        """As `ClothView.remember`, where there is a promise."""
+        if self.promise is not None:
+            self.promise.view.remember(x)
 
     def tangled(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether it does, or garments are not in their order."""
@@ -167,9 +173,14 @@ class FrameContact:
         out = repaired_cage(cage, self._coarse, bodies=bodies, mesh=self._cloth.mesh(cage, seam))
         return out if seam is None or out is self._coarse else seam.closed(out)
 
-    @cached_property
+    @property
     def crossed(self) -> bool:
         """Whether the cage crosses itself."""
+        return self._crossed
+
+    @cached_property
+    def _crossed(self) -> bool:
+        """The same, found once."""
         cage = self._levels[0]
         return self.at(cage).crosses(cage.base.apply(self._coarse))
 

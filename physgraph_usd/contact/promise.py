@@ -50,13 +50,12 @@ class Promise:
         In a tangle, round what crosses at the start, cloth may pass through itself, so long as no more of it crosses
         after that.
         """
-        at = start.to(wanted)
-        tangles = self.view.tangles(at)
+        tangles = self.view.tangles(start)
         if tangles is None:
             x = self._go(start, wanted, None, listed)
             self.view.remember(x)
             return x
-        free, before = tangles.label.clone(), tangles.counts(self.view.crossings(at))
+        free, before = tangles.label.clone(), tangles.counts(self.view.crossings(start))
         x = wanted
         for attempt in range(TRIES):
             x = self._go(start, wanted, free if attempt < TRIES - 1 else None, listed)

@@ -13,7 +13,6 @@ promised.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from ..collide.near import weights
 from ..collide.parts import Parts
-from ..collide.sweep import Listed, Pairs, Swept
+from ..collide.sweep import Listed, ListedAndSwept, Pairs
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
@@ -76,7 +75,7 @@ def safe_move(
         floor: Distance under which a pair keeps nine tenths of what it has [m]: gaps end there.
         tangle: The tangle that each vertex is in, int32, -1 where in none: to what is in one nothing is promised
             against what is in the same; or None.
-        listed: Pairs that are asked alone where neither the start nor what is wanted leaves their reach, or None.
+        listed: Pairs that are asked alone of vertices that do not leave their reach, or None.
 
     Returns:
         Positions, ``wanted`` itself where nothing is in the way, and how far vertices have come.
@@ -85,11 +84,10 @@ def safe_move(
     way = wanted.double() - at
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
     x, asked = wanted, (way != 0).any(dim=1)
-    covered = listed is not None and listed.covers(start) and listed.covers(wanted)
-    impacts = partial(listed.impacts, at) if listed is not None and covered else Swept(parts, at, way).impacts
+    swept = ListedAndSwept(parts, at, way, listed)
     clear = torch.zeros_like(way)
     for attempt in range(len(way) + SHORTENINGS):
-        met = impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, tangle=tangle)
+        met = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, tangle=tangle)
         if not len(met.value):
             break
         least = torch.ones_like(share)
