@@ -123,7 +123,13 @@ class LevelBodies:
             if not faces or stalled > STALLED:
                 break
             out, passes = no_farther(lifted, first, LIFT * self._level.spacing), passes + 1
-        return (best if best is first else self.push_out(best)), passes
+        if best is first:
+            return first, passes
+        # What was lifted in vain goes back: it would stand as a spike, and the body still come through.
+        stuck = torch.zeros_like(self._level.free[:, 0])
+        for track in self._tracks if least else ():
+            stuck[self._level.triangles[self._pierced_faces(track, best)].long().reshape(-1)] = True
+        return self.push_out(torch.where(stuck.unsqueeze(1), first, best)), passes
 
     def let_through(self, x: Float[Tensor, "vertices 3"], target: Float[Tensor, "vertices 3"]) -> None:
         """From now on let vertices at x [m] pass through bodies that are between them and a target [m]."""
