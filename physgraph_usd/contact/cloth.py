@@ -7,6 +7,7 @@ nearest alone: cloth that pushes with one part and is held by another would stay
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -72,6 +73,16 @@ def _meet(a: Garment, b: Garment) -> bool:
     return touch_one_another(a, b)
 
 
+@dataclass(frozen=True, eq=False)
+class _Looked:
+    """What crosses at positions, and how often these had been written to."""
+
+    x: Tensor
+    version: int
+    crossings: Crossings
+    tangles: Tangles | None
+
+
 class ClothView:
     """One level's cloth in one frame.
 
@@ -100,7 +111,7 @@ class ClothView:
         """
         self.mesh, self.keeps_sides = lasting.mesh(level, seam), settings.cloth == "pairs"
         self._lasting, self._level, self._settings, self._thickness = lasting, level, settings, thickness
-        self._looked: tuple[Tensor, int, Crossings] | None = None
+        self._looked: _Looked | None = None
 
     @property
     def parts(self) -> Parts:
@@ -116,22 +127,30 @@ class ClothView:
 
     def crossings(self, x: Float[Tensor, "vertices 3"]) -> Crossings:
         """What crosses at x [m]; the answer is kept for the same tensor, unless it was written to since."""
-        if self._looked is None or self._looked[0] is not x or self._looked[1] != x._version:
-            self._looked = x, x._version, crossings(self.parts, x)
-        return self._looked[2]
+        return self._look(x).crossings
+
+    def _look(self, x: Tensor) -> _Looked:
+        """What is known of x, looked for where it is not known."""
+        if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
+            found = crossings(self.parts, x)
+            corners = self.mesh.corners_of(found)
+            tangles = Tangles.find(self.mesh, corners, rings=TANGLED) if found.count else None
+            self._looked = _Looked(x, x._version, found, tangles)
+        return self._looked
 
     def tangles(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> Tangles | None:
         """What crosses at x [m], or is in no order where that counts, and what lies round it; None where nothing is."""
-        corners = self.mesh.corners_of(self.crossings(x))
-        if order and self._lasting.layers is not None:
-            near = near_pairs(self.parts, x, self.near)
-            wrong = near.corners[self._lasting.layers.wrong(self._level, near, x)].long()
-            corners = torch.cat([corners, wrong[:, [0, 1, 2, 3, 3]]])
+        known = self._look(x)
+        if not order or self._lasting.layers is None:
+            return known.tangles
+        near = near_pairs(self.parts, x, self.near)
+        wrong = near.corners[self._lasting.layers.wrong(self._level, near, x)].long()
+        corners = torch.cat([self.mesh.corners_of(known.crossings), wrong[:, [0, 1, 2, 3, 3]]])
         return Tangles.find(self.mesh, corners, rings=TANGLED) if len(corners) else None
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take it that nothing crosses at x [m]: it was reached safely from where nothing did."""
-        self._looked = x, x._version, Crossings.none(x.device)
+        self._looked = _Looked(x, x._version, Crossings.none(x.device), None)
 
     def term(
         self, x: Float[Tensor, "vertices 3"], listed: Listed | None = None, *, order: bool = False
@@ -145,8 +164,9 @@ class ClothView:
         """
         if self._settings.cloth == "spheres":
             return self._spheres(x)
-        found = self.crossings(x)
+        found, tangles = self.crossings(x), self.tangles(x)
         gaps = self._gaps(x, found, listed, order=order)
+        found = found if tangles is None else tangles.hopeful(found)
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
@@ -168,7 +188,9 @@ class ClothView:
             way = torch.where(wrong.unsqueeze(1), -way, way)
         kept = distance < offset + MARGIN * self._level.spacing[corners].amin(dim=1)
         if found.count:
+            tangles = self.tangles(x)
             kept &= ~self.mesh.crossed(found)[corners].any(dim=1)
+            kept &= tangles is None or ~tangles.given_up[corners].all(dim=1)
         corners, area = corners[kept], self._level.vertex_area[corners[kept]]
         share = torch.where(near.face[kept], area[:, 0], area.amin(dim=1) / 3.0)
         normal = torch.nn.functional.normalize(way[kept], dim=1, eps=1e-30).contiguous()

@@ -65,7 +65,7 @@ class LevelContact:
             return plain
         last = known if isinstance(known, HeldMetric) else None
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
-        if self.crosses(x):
+        if self.comes_apart(x):
             return HeldMetric(plain, stiff, factored=False)
         if last is None:
             return HeldMetric(plain, stiff) if bool((stiff > 0).any()) else plain  # Things are near, but none pushes.
@@ -75,14 +75,15 @@ class LevelContact:
         """Whether cloth crosses cloth at positions x [m], where it keeps its sides."""
         return self.promise is not None and self.promise.view.crossings(x).count > 0
 
+    def comes_apart(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> bool:
+        """Whether what crosses there, or is in no order where that counts, may come apart: not what is hopeless."""
+        tangles = None if self.promise is None else self.promise.view.tangles(x, order=order)
+        return tangles is not None and not bool(tangles.hopeless.all())
+
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """As `ClothView.remember`, where there is a promise."""
         if self.promise is not None:
             self.promise.view.remember(x)
-
-    def tangled(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether it does, or garments are not in their order."""
-        return self.promise is not None and self.promise.view.tangles(x, order=True) is not None
 
     def terms(
         self, x: Float[Tensor, "vertices 3"], *, listed: Listed | None = None, order: bool = False

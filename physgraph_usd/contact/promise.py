@@ -55,14 +55,14 @@ class Promise:
             x = self._go(start, wanted, None, listed)
             self.view.remember(x)
             return x
-        free, before = tangles.label.clone(), tangles.counts(self.view.crossings(start))
-        x = wanted
+        free = tangles.label.clone()
+        x = self._go(start, wanted, free, listed)
         for attempt in range(TRIES):
-            x = self._go(start, wanted, free if attempt < TRIES - 1 else None, listed)
-            worse = tangles.counts(self.view.crossings(x)) > before
+            worse = tangles.worse(self.view.crossings(x))
             if not bool(worse.any()):
                 break
-            free[worse[tangles.label.long()] & (tangles.label >= 0)] = -1
+            free[worse if attempt < TRIES - 1 else ~tangles.given_up] = -1
+            x = self._go(start, wanted, free, listed)
         return x
 
     def draw(

@@ -98,7 +98,7 @@ def _drawn_out(
     reports: list[LevelReport] = []
     short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0)
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
-        if not (view.tangled(x) if cold else view.crosses(x)):
+        if not view.comes_apart(x, order=cold):
             break
         terms = view.terms(x, order=cold)
         y, report = solve_level(make_system(terms, x, None), integrator, x, level=level.index, budget=short)
