@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..mesh.piercing import volume
 from .parts import Parts, Topology
-from .sweep import Found, Motion, Pairs, Sweep, Swept, has, is_one, overlap, write
+from .sweep import IMPACTS, Found, Motion, Pairs, Sweep, Swept, has, is_one, overlap, write
 
 wp.set_module_options({"enable_backward": False})
 
@@ -115,7 +115,7 @@ def crossings(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Crossings:
         x: Positions [m].
     """
     at = x.double()
-    numbers: Pairs = Swept(parts, at, torch.zeros_like(at)).found(edges_through)
+    numbers: Pairs = Swept(parts, at, torch.zeros_like(at)).found(edges_through, IMPACTS)
     edge, face = numbers.corners.long()[:, 0], numbers.corners.long()[:, 1]
     order = torch.argsort(edge * max(len(parts.level.triangles), 1) + face)
     return Crossings(edge[order], face[order])

@@ -20,8 +20,8 @@ wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(wp.float64(1.0e30))
 """Corner of a box that holds nothing."""
-SLOTS = 128
-"""Pairs of a cluster that there is room for before they are counted."""
+IMPACTS, NEAR = 8, 128
+"""Pairs of a cluster that there is room for before they are counted: few meet on their way, many are near."""
 SPARE = 0.05
 """What is left at least, as a part of a reach, between parts of a pair that is not listed."""
 ROUNDING = wp.constant(wp.float64(2.4e-7))
@@ -143,34 +143,23 @@ def highest_of(v: wp.vec3d):
 
 @wp.kernel
 def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
-    """The boxes of a cluster's corners, where they start and all along, and how they move."""
+    """The boxes of a cluster's corners, where they start and all along, and those of its edges and faces."""
     i = first + wp.tid()
     least, most = wp.vec3d(FAR), wp.vec3d(-FAR)
     lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
-    total, asked, radius = wp.vec3d(), wp.int32(0), wp.float64(0.0)
-    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
-    for k in range(begin, end):
+    radius = wp.float64(0.0)
+    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
         v = parts.corners[k]
         at, way = motion.start[v], motion.way[v]
         least, most = wp.min(least, at), wp.max(most, at)
         lowest, highest = wp.min(lowest, wp.min(at, at + way)), wp.max(highest, wp.max(at, at + way))
-        total += way
         radius = wp.max(radius, motion.radius[v] + motion.may[v])
-        if motion.asked[v]:
-            asked = 1
-    mean = total / wp.float64(wp.max(end - begin, 1))
-    spread = wp.float64(0.0)
-    for k in range(begin, end):
-        spread = wp.max(spread, wp.length(motion.way[parts.corners[k]] - mean))
     slack = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest)) + wp.vec3d(radius)
     sweep.low[i] = single(lowest - slack)
     sweep.high[i] = single(highest + slack)
     sweep.from_low[i] = least
     sweep.from_high[i] = most
-    sweep.mean[i] = mean
-    sweep.spread[i] = spread
     sweep.radius[i] = radius
-    sweep.asked[i] = asked
     for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
         a, b = motion.start[parts.edges[k][0]], motion.start[parts.edges[k][1]]
         sweep.edge_low[k] = lowest_of(wp.min(a, b))
@@ -180,6 +169,26 @@ def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
         p, q, r = motion.start[t[0]], motion.start[t[1]], motion.start[t[2]]
         sweep.face_low[k] = lowest_of(wp.min(p, wp.min(q, r)))
         sweep.face_high[k] = highest_of(wp.max(p, wp.max(q, r)))
+
+
+@wp.kernel
+def mean_ways(first: wp.int32, parts: Topology, motion: Motion, sweep: Sweep):
+    """The mean way of a cluster's corners, how far they leave it, and whether one is asked."""
+    i = first + wp.tid()
+    total, asked = wp.vec3d(), wp.int32(0)
+    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
+    for k in range(begin, end):
+        v = parts.corners[k]
+        total += motion.way[v]
+        if motion.asked[v]:
+            asked = 1
+    mean = total / wp.float64(wp.max(end - begin, 1))
+    spread = wp.float64(0.0)
+    for k in range(begin, end):
+        spread = wp.max(spread, wp.length(motion.way[parts.corners[k]] - mean))
+    sweep.mean[i] = mean
+    sweep.spread[i] = spread
+    sweep.asked[i] = asked
 
 
 @wp.func
@@ -283,8 +292,17 @@ def value_of(
 
 
 @wp.func
-def faces_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp.int32, j: wp.int32, count: wp.int32):
-    """Write the pairs of a cluster's vertices and another's faces; the number of the cluster's pairs so far."""
+def faces_met(
+    parts: Topology,
+    motion: Motion,
+    sweep: Sweep,
+    found: Found,
+    owner: wp.int32,
+    i: wp.int32,
+    j: wp.int32,
+    count: wp.int32,
+):
+    """Write the pairs of a cluster's vertices and another's faces as a cluster's; the number of its pairs so far."""
     reach = reach_of(sweep, i, j)
     for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
         v = parts.vertices[k]
@@ -300,7 +318,7 @@ def faces_met(parts: Topology, motion: Motion, sweep: Sweep, found: Found, i: wp
                 continue
             value = value_of(True, v, t[0], t[1], t[2], parts, motion)
             if value < wp.float64(1.0):
-                write(found, i, count, wp.vec4i(v, t[0], t[1], t[2]), value, True)
+                write(found, owner, count, wp.vec4i(v, t[0], t[1], t[2]), value, True)
                 count += 1
     return count
 
@@ -342,23 +360,24 @@ def pairs_of(
 ):
     """Count the pairs of a cluster's vertices with faces, and of its edges with those of no lower cluster.
 
-    They are written from where a cluster's begin, so far as there is room; a cluster without any is not asked.
+    They are written from where a cluster's begin, so far as there is room; a cluster without any is not asked. Pairs
+    with one that has no vertex asked are its own.
     """
     i = first + wp.tid()
-    if low[i][0] > high[i][0] or found.begin[i + 1] == found.begin[i]:
+    if low[i][0] > high[i][0] or found.begin[i + 1] == found.begin[i] or sweep.asked[i] == 0:
         return
     count, j = wp.int32(0), wp.int32(0)
     query = wp.bvh_query_aabb(tree, low[i], high[i])
     while wp.bvh_query_next(query, j):
         if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
             continue
-        if sweep.asked[i] == 0 and sweep.asked[j] == 0:
-            continue
         reach = reach_of(sweep, i, j)
         if outside(sweep.from_low[i], sweep.from_high[i], sweep.from_low[j], sweep.from_high[j], reach):
             continue
-        count = faces_met(parts, motion, sweep, found, i, j, count)
-        if j >= i:
+        count = faces_met(parts, motion, sweep, found, i, i, j, count)
+        if sweep.asked[j] == 0:
+            count = faces_met(parts, motion, sweep, found, i, j, i, count)
+        if j >= i or sweep.asked[j] == 0:
             count = edges_met(parts, motion, sweep, found, i, j, count)
     found.count[i] = count
 
@@ -428,42 +447,42 @@ class Swept:
         """
         motion = self._motion(way, asked=asked, tangle=tangle)
         motion.share, motion.floor = share, floor
-        return self._found(pairs_of, motion)
+        return self._found(pairs_of, motion, room=IMPACTS)
 
-    def found(self, kernel: wp.Kernel) -> Pairs:
+    def found(self, kernel: wp.Kernel, room: int) -> Pairs:
         """What a kernel with the parameters of `pairs_of` finds where nothing moves."""
         every = torch.ones(len(self._start), dtype=torch.bool, device=self._start.device)
-        return self._found(kernel, self._motion(torch.zeros_like(self._start), asked=every))
+        return self._found(kernel, self._motion(torch.zeros_like(self._start), asked=every), room=room)
 
-    def _found(self, kernel: wp.Kernel, motion: Any) -> Pairs:
-        """The pairs that are asked for."""
-        now, size, device = _boxes(self._parts, self._device), self._parts.count, self._start.device
-        self._launch(sweep_boxes, motion, now)
-        begin = torch.arange(size + 1, dtype=torch.int32, device=device) * SLOTS
-        slots, count = _room(begin, SLOTS * size), torch.zeros_like(begin[:size])
-        self._write(kernel, motion, now, begin=begin, count=count, out=slots)
-        over = count > SLOTS
-        kept = ((torch.arange(SLOTS, device=device) < count.unsqueeze(1)) & ~over.unsqueeze(1)).reshape(-1)
+    def _found(self, kernel: wp.Kernel, motion: Any, *, room: int) -> Pairs:
+        """The pairs that are asked for; each cluster has room for so many before they are counted."""
+        size, device = self._parts.count, self._start.device
+        self._launch(mean_ways, motion, self._boxes)
+        begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
+        slots, count = _room(begin, room * size), torch.zeros_like(begin[:size])
+        self._write(kernel, motion, begin=begin, count=count, out=slots)
+        over = count > room
+        kept = ((torch.arange(room, device=device) < count.unsqueeze(1)) & ~over.unsqueeze(1)).reshape(-1)
         first = Pairs(slots.corners[kept], slots.value[kept], slots.face[kept])
         if not bool(over.any()):
             return first
         begin[0] = 0  # Those without room are written again, now that they are counted.
         begin[1:] = (count * over).cumsum(dim=0)
         rest = _room(begin, int(begin[-1]))
-        self._write(kernel, motion, now, begin=begin, count=count, out=rest)
+        self._write(kernel, motion, begin=begin, count=count, out=rest)
         return joined(first, rest)
 
-    def _write(self, kernel: wp.Kernel, motion: Any, now: Any, *, begin: Tensor, count: Tensor, out: Pairs) -> None:
+    def _write(self, kernel: wp.Kernel, motion: Any, *, begin: Tensor, count: Tensor, out: Pairs) -> None:
         """Count each cluster's pairs, and write those that there is room for."""
         found = Found()
         found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
         found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
         found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
-        self._launch(kernel, motion, now, self._tree.id, self._boxes.low, self._boxes.high, found)
+        self._launch(kernel, motion, self._boxes, self._tree.id, self._boxes.low, self._boxes.high, found)
 
     def near(self) -> Pairs:
         """Every pair of parts as near as is asked for."""
-        return self.found(pairs_of)
+        return self.found(pairs_of, NEAR)
 
     def _motion(self, way: Tensor, *, asked: Tensor, tangle: Tensor | None = None) -> Any:
         """What kernels are told of the vertices."""
@@ -564,7 +583,9 @@ class ListedAndSwept:
             assert self._swept is not None
             return self._swept.impacts(way, asked=asked, **given)
         near = self._listed.impacts(self._start, way, asked=asked, **given)
-        far = None if self._swept is None else self._swept.impacts(way, asked=self._far, **given)
+        # Of pairs with one that is asked and one that is far: all of whichever are fewer.
+        fewer = asked if int(asked.sum()) < int(self._far.sum()) else self._far
+        far = None if self._swept is None else self._swept.impacts(way, asked=fewer, **given)
         return near if far is None else joined(near, far)
 
 
@@ -601,8 +622,8 @@ def _motion(
 
 def _room(like: Tensor, count: int) -> Pairs:
     """Room for some pairs."""
-    value = torch.ones(count, dtype=torch.float64, device=like.device)
-    return Pairs(like.new_zeros((count, 4)), value, torch.zeros(count, dtype=torch.bool, device=like.device))
+    value = torch.empty(count, dtype=torch.float64, device=like.device)
+    return Pairs(like.new_empty((count, 4)), value, torch.empty(count, dtype=torch.bool, device=like.device))
 
 
 def _boxes(parts: Parts, device: str) -> Any:
