@@ -15,6 +15,7 @@ from sheets import garment_of
 from physgraph_usd.colliders.pose import Collider, MeshPose, Pose
 from physgraph_usd.contact.cloth import ClothContact, ClothView
 from physgraph_usd.contact.frame import FrameContact
+from physgraph_usd.contact.promise import Promise
 from physgraph_usd.contact.seams import Seams
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.fabric import Fabric
@@ -115,18 +116,22 @@ def placed(level: Level, shape: Callable[[np.ndarray], np.ndarray], rest: torch.
 def view_of(
     levels: Sequence[Level],
     garments: Sequence[Garment],
-    base: torch.Tensor,
     *,
     thickness: float = 0.001,
     stiffness: float = 1e5,
     form: str = "pairs",
     seam: Seam | None = None,
 ) -> ClothView:
-    """The finest level's cloth in a frame whose upsampled cage is at given positions."""
+    """The finest level's cloth in a frame."""
     lasting = ClothContact(levels, garments)
-    each = torch.full((len(garments),), thickness, dtype=base.dtype)
+    each = torch.full((len(garments),), thickness, dtype=levels[-1].dtype)
     settings = ContactSettings(cloth=form, cloth_stiffness=stiffness)
-    return ClothView(lasting, levels[-1], base, thickness=each, settings=settings, seam=seam)
+    return ClothView(lasting, levels[-1], thickness=each, settings=settings, seam=seam)
+
+
+def promise_of(levels: Sequence[Level], garments: Sequence[Garment], **given: Any) -> Promise:
+    """What moves the finest level's cloth safely; the rest is as for `view_of`."""
+    return Promise(view_of(levels, garments, **given), 6e-5)
 
 
 def contact_of(

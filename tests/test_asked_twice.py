@@ -161,24 +161,22 @@ QUESTIONS: dict[str, Callable[[Asked], Any]] = {
     "FrameContact.aim": lambda a: a.contact.aim,
     "FrameContact.crossed": lambda a: a.contact.crossed,
     "FrameContact.crowding": lambda a: a.contact.crowding,
-    "FrameContact.mixed": lambda a: a.contact.mixed(a.x, a.y),
     "FrameContact.finish": lambda a: a.contact.finish(a.x),
     "FrameContact.measure": lambda a: a.contact.measure(a.x),
     "LevelContact.terms": lambda a: ForceModule(a.view.terms(a.x)).energies(a.x),
     "LevelContact.terms elsewhere": lambda a: ForceModule(a.view.terms(a.y)).energies(a.y),
     "LevelContact.crosses": lambda a: a.view.crosses(a.x),
     "LevelContact.closed": lambda a: a.view.closed(a.x),
-    "LevelContact.tangled": lambda a: a.view.tangled,
-    "LevelContact.uncrossed": lambda a: a.view.uncrossed(a.y, a.x),
+    "LevelContact.comes_apart": lambda a: a.view.comes_apart(a.x, order=True),
+    "LevelContact.moved": lambda a: a.view.moved(a.x, a.y),
+    "LevelContact.drawn": lambda a: a.view.drawn(a.x, a.y),
+    "LevelContact.out_of_bodies": lambda a: a.view.out_of_bodies(a.x),
     "LevelContact.metric": lambda a: metric(a, a.x),
     "LevelContact.metric elsewhere": lambda a: metric(a, a.y),
 }
 REMEMBERED = {
     "LevelContact.terms": ("LevelContact.terms elsewhere", "planes and pairs of what has hardly moved are kept"),
     "LevelContact.terms elsewhere": ("LevelContact.terms", "planes and pairs of what has hardly moved are kept"),
-    "LevelContact.metric": ("LevelContact.metric elsewhere", "one that holds what touched before serves on"),
-    "LevelContact.metric elsewhere": ("LevelContact.metric", "one that holds what touched before serves on"),
-    "LevelContact.tangled": ("LevelContact.terms", "it tells of the terms asked for last"),
 }
 """What rounds keep from one to the next in `contact`, so that an answer depends on what was asked before: the question
 before that shows it, and why."""

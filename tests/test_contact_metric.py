@@ -8,7 +8,6 @@ import scipy.sparse as sp
 import torch
 
 from physgraph_usd.contact import metric as contact_metric
-from physgraph_usd.contact.cloth import ClothView
 from physgraph_usd.contact.frame import LevelContact
 from physgraph_usd.contact.metric import HeldMetric
 from physgraph_usd.forces.contact import Contact
@@ -80,9 +79,9 @@ def test_cloth_that_crosses_cloth_is_not_worth_a_factor(tangled, monkeypatch):
     monkeypatch.setattr(Metric, "plus", lambda self, stiff: made.append(stiff) or whole(self, stiff))
     pushed = torch.linspace(0.0, 5.0, 12, dtype=torch.float64)
     monkeypatch.setattr(Contact, "diagonal", lambda *_: pushed)
-    cloth, touch = object.__new__(ClothView), object.__new__(Contact)
-    cloth.tangled = tangled
-    metric = LevelContact(None, cloth, rounds=3).metric(plain, [touch], torch.zeros((12, 3), dtype=torch.float64))
+    monkeypatch.setattr(LevelContact, "comes_apart", lambda *_: tangled)
+    x = torch.zeros((12, 3), dtype=torch.float64)
+    metric = LevelContact(None, None).metric(plain, [object.__new__(Contact)], x)
     assert isinstance(metric, HeldMetric)
     metric.smooth(torch.zeros((12, 3), dtype=torch.float64))
     assert len(made) == (not tangled)

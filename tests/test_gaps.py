@@ -1,51 +1,90 @@
-"""On which side the planes between near parts of cloth hold them, and which parts have none."""
+"""Which parts of cloth push one another, on which side, and which do not."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 from energies import evaluate
-from folds import levels_of, named, square, view_of
-from test_untangle import BOTH, pair
+from folds import EDGE, crumpled, curved, flat, folded, levels_of, named, placed, square, strip, view_of
+from test_tangles import pair
 
-from physgraph_usd.contact.cloth_mesh import ClothMesh
+from physgraph_usd.contact.cloth import ClothView
 from physgraph_usd.forces.self_contact import Gaps, SelfContact
+
+QUIET: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "flat": flat,
+    "curved": curved,
+    "half a turn": lambda points: curved(points, np.pi),
+    "rippled": lambda points: points + np.outer(0.004 * np.sin(40 * points[:, 0]), [0.0, 1.0, 0.0]),
+}
+
+
+def creased(points: np.ndarray) -> np.ndarray:
+    """Laid back over itself within less than an edge of the finer level."""
+    return folded(points, gap=0.1 * EDGE)
+
+
+class TestOneSheet:
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    @pytest.mark.parametrize("name", QUIET)
+    def test_what_is_bent_little_pushes_nothing(self, name: str, level: int):
+        garment = named(strip(12, 4))
+        levels = levels_of(garment, level=level)
+        x = placed(levels[-1], QUIET[name])
+        term = view_of(levels, [garment]).term(x)
+        assert term is None or float(evaluate(term, x)[1].abs().max()) == 0.0
+
+    @pytest.mark.parametrize("level", [1, 2])
+    def test_in_a_sharp_fold_parts_one_edge_apart_push(self, level: int):
+        garment = named(strip(8, 4))
+        levels = levels_of(garment, level=level)
+        view, x = view_of(levels, [garment], thickness=0.2 * EDGE), placed(levels[-1], creased)
+        term = view.term(x)
+        assert isinstance(term, SelfContact)
+        beside, nearest = view.mesh.beside.toarray() > 0, []
+        pushes = term.gaps.lacks(x).abs() > 0
+        for corners, weights in zip(term.gaps.corners[pushes].tolist(), term.gaps.weight[pushes].tolist(), strict=True):
+            of = [[c for c, w in zip(corners, weights, strict=True) if side * w > 1e-6] for side in (1.0, -1.0)]
+            nearest.append(min(1 if beside[a, b] else 2 for a in of[0] for b in of[1]))
+        assert {1, 2} <= set(nearest)
+
+    def test_the_papers_spheres_where_no_two_vertices_are_near(self):
+        garment = named(square(4))
+        levels = levels_of(garment)
+        view = view_of(levels, [garment], form="spheres")
+        assert view.term(levels[-1].rest) is None
+        assert view.term(placed(levels[-1], lambda p: crumpled(p, 3, size=0.8))) is not None
 
 
 class TestCrossing:
-    """Two sheets of 4 by 4 cells that cross, as cloth without layers and as layers."""
+    """Two sheets of 4 by 4 cells that cross."""
 
-    def own_gaps(self, *layers: float | None) -> tuple[Gaps, torch.Tensor]:
-        """The planes but for those that draw out what crosses, and which vertices cross."""
-        garments = [named(square(4), name, layer=layer) for name, layer in zip("AB", layers, strict=True)]
-        levels = levels_of(*garments)
-        _, x = pair("cornered")
-        view = view_of(levels, garments, x.float())
-        term = view.term(x.float())
+    def gaps(self, x: torch.Tensor) -> tuple[ClothView, Gaps]:
+        garments = [named(square(4), name) for name in "AB"]
+        view = view_of(levels_of(*garments), garments, thickness=0.4 * EDGE)
+        term = view.term(x)
         assert isinstance(term, SelfContact)
-        out = 2 * view.before.crossings.count
-        assert view.tangled
-        assert 0 < out < len(term.gaps.corners)
-        crossed = ClothMesh(levels[-1], BOTH).crossed(view.before.crossings)
-        kept = len(term.gaps.corners) - out
-        return Gaps(*(getattr(term.gaps, each.name)[:kept] for each in fields(Gaps))), crossed
+        return view, term.gaps
 
     def test_what_crosses_has_no_side_to_keep(self):
-        own, crossed = self.own_gaps(None, None)
-        assert not crossed[own.corners.long()].any()
-
-    def test_layers_keep_theirs_even_so(self):
-        own, crossed = self.own_gaps(0, 1)
-        assert crossed[own.corners.long()].any()
+        """It is drawn out instead, by two planes for each edge and face; what is beside it keeps its side."""
+        x = pair("cornered")[1].float()
+        view, gaps = self.gaps(x)
+        found = view.crossings(x)
+        out = 2 * found.count
+        assert 0 < out < len(gaps.corners)
+        crossed = view.mesh.crossed(found)
+        assert not crossed[gaps.corners[:-out].long()].any()
+        assert crossed[gaps.corners[-out:].long()].all()
 
 
 class TestLayers:
     """Two wavy sheets of 8 by 8 cells, 8 mm apart; their fronts face down, so outside is below."""
 
-    def lacks(self, height: float, turn: float, *, upper_is_outer: bool) -> np.ndarray:
+    def lacks(self, height: float, turn: float, *, upper_is_outer: bool, order: bool = True) -> np.ndarray:
         """How far each pair is under what it keeps [m]; waves are so many fine edges high, and turn so fast an edge."""
         layers = (0, 1) if upper_is_outer else (1, 0)
         garments = [named(square(8), name, layer=layer) for name, layer in zip("AB", layers, strict=True)]
@@ -54,28 +93,36 @@ class TestLayers:
         x[:, 1] = height * edge * torch.sin(turn * x[:, 0] / edge) + 0.2 * edge * torch.sin(1.3 * x[:, 2] / edge)
         upper = torch.arange(len(x)) >= len(x) // 2
         x[upper] += torch.tensor([0.13 * edge, 0.008, 0.0])
-        view = view_of(levels, garments, x)
-        term = view.term(x)
-        assert not view.tangled
+        view = view_of(levels, garments, thickness=0.01)
+        assert view.crossings(x).count == 0
+        tangles = view.tangles(x, order=order)
+        assert (tangles is not None) == (upper_is_outer and order)
+        term = view.term(x, order=order)
         assert isinstance(term, SelfContact)
         assert len(term.gaps.corners) > 1000
-        return term.gaps.lacks(x).numpy()
+        # Towards where it belongs the outer sheet goes down, which raises the inner one against it.
+        first = term.gaps.corners[:, 0].long() >= len(x) // 2
+        up = torch.where(first, term.gaps.normal[:, 1], -term.gaps.normal[:, 1])
+        return torch.sign(up).numpy() * term.gaps.lacks(x).abs().numpy()
 
     @pytest.mark.parametrize(("height", "turn"), [(0.0, 1.0), (1.0, 1.0), (1.0, 1.5), (2.0, 1.0)])
     def test_none_is_sent_back_that_lies_right(self, height: float, turn: float):
         """Beyond the next wave an outer sheet lies behind the inner one's normals, and is outside all the same."""
-        assert self.lacks(height, turn, upper_is_outer=False).max() < 1e-6
+        assert self.lacks(height, turn, upper_is_outer=False).min() > -1e-6
 
     @pytest.mark.parametrize("height", [0.0, 0.5])
     def test_all_are_sent_back_that_lie_wrong(self, height: float):
-        assert (self.lacks(height, 1.0, upper_is_outer=True) > 0.001).mean() > 0.95
+        assert (self.lacks(height, 1.0, upper_is_outer=True) < -0.001).mean() > 0.95
+
+    def test_nor_is_any_where_nobody_asked_for_the_order(self):
+        assert self.lacks(0.0, 1.0, upper_is_outer=True, order=False).min() > -1e-6
 
 
 def test_the_energy_of_each_pair_counts_for_the_garment_of_its_first_corner():
     garments = [named(square(4), name) for name in "AB"]
     levels = levels_of(*garments)
     _, x = pair("dented")
-    term = view_of(levels, garments, x.float()).term(x.float())
+    term = view_of(levels, garments).term(x.float())
     assert isinstance(term, SelfContact)
     whole, _ = evaluate(term, x.float())
     energy, owner = term.split(x.float())

@@ -1,21 +1,13 @@
-"""The last push out of bodies: over corners, with other cloth before it, and never to more crossings than the input."""
+"""The last push out of bodies: over corners, and through no other cloth."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from bodies import box
+from bodies import ball, box
 from brute import Soup, crossings
-from folds import EDGE, contact_of, frame_with, levels_of, named, refiner_with, square
-from test_untangle import BOTH, UPPER
-
-from physgraph_usd.contact.cloth_mesh import ClothMesh
-from physgraph_usd.contact.squeeze import squeezed
-
-GAP = 0.002
+from folds import contact_of, frame_with, levels_of, named, refiner_with, square
 
 
 class TestCorners:
@@ -32,54 +24,37 @@ class TestCorners:
         assert told["after"]["crossings"] == 0
 
 
-class TestSqueezed:
-    def test_cloth_moves_the_cloth_before_it(self):
-        """The lower of two sheets 1 mm apart is pushed up by 15 mm in the middle, through the upper."""
+class TestCloth:
+    """What is pushed out of bodies takes no cloth through other cloth."""
+
+    def test_cloth_on_a_body_stops_at_the_cloth_before_it(self):
+        """The lower of two sheets 1 mm apart is sent up by 15 mm in the middle, through the upper."""
         cloths = square(4), square(4)
-        level = levels_of(named(cloths[0], "A"), named(cloths[1], "B"), dtype=torch.float64)[-1]
-        mesh, start = ClothMesh(level, BOTH), level.rest.clone()
-        upper = level.vertex_garment == 1
+        garments = [named(cloths[0], "A"), named(cloths[1], "B")]
+        levels = levels_of(*garments, dtype=torch.float64)
+        level = levels[-1]
+        upper, start = level.vertex_garment == 1, level.rest.clone()
         start[upper] = 0.97 * start[upper] + torch.tensor([0.0031, 0.001, 0.0017], dtype=start.dtype)
-        x = start.clone()
-        x[~upper, 1] += 0.015 * torch.exp(-(x[~upper][:, [0, 2]].norm(dim=1) / 0.05).square())
-        kept = x.clone()
+        wanted = start.clone()
+        wanted[~upper, 1] += 0.015 * torch.exp(-(wanted[~upper][:, [0, 2]].norm(dim=1) / 0.05).square())
+        assert len(crossings(Soup.of(level, wanted))) > 10
+        x = contact_of(levels, garments, levels[0].rest).at(level).moved(start, wanted)
+        assert len(crossings(Soup.of(level, x))) == 0
+        middle = int(start[~upper][:, [0, 2]].norm(dim=1).argmin())
+        assert float(x[middle, 1] - start[middle, 1]) > 0.0005
+        assert float((x - wanted)[~upper].norm(dim=1).max()) < 0.015
 
-        def push_out(y: torch.Tensor) -> torch.Tensor:
-            """The lower sheet does not give way."""
-            return torch.where(upper.unsqueeze(1), y, kept)
-
-        out = squeezed(mesh, start, x, push_out=push_out, gap=0.001)
-        assert len(crossings(Soup.of(level, x))) > 10
-        assert len(crossings(Soup.of(level, out))) == 0
-        torch.testing.assert_close(out[~upper], x[~upper], atol=0, rtol=0)
-        assert float((out - x).norm(dim=1).max()) < 0.02
-
-    def test_what_touches_nothing_stays(self):
-        level = levels_of(named(square(4)))[-1]
-        start = level.rest.clone()
-        x = start + torch.tensor([0.0, 0.01, 0.0])
-        assert squeezed(ClothMesh(level, np.ones((1, 1), bool)), start, x, push_out=lambda y: y, gap=0.001) is x
-
-
-class TestLastResort:
-    @pytest.mark.parametrize("size", [0.1, 0.5, 2.0])
-    @pytest.mark.parametrize("name", UPPER)
-    def test_no_result_crosses_more_than_the_input(self, name: str, size: float):
-        """Whatever the solve leaves: here noise of up to two edges, over sheets that start crossed."""
-        garments = [named(square(4), each) for each in "AB"]
-        levels, cage = levels_of(*garments, dtype=torch.float64), _cage(name)
-        base = levels[-1].base.apply(cage)
-        contact = contact_of(levels, garments, cage)
-        noise = torch.as_tensor(np.random.default_rng(4).normal(size=(len(base), 3))) * size * EDGE
-        out, _, _ = contact.finish(base + noise)
-        told: Any = contact.measure(out)[0]["cloth"]
-        before = len(crossings(Soup.of(levels[-1], base)))
-        assert told["before"]["crossings"] == before
-        assert told["after"]["crossings"] == len(crossings(Soup.of(levels[-1], out))) <= before
-
-
-def _cage(name: str) -> torch.Tensor:
-    """The cages of a level sheet and of one that passes through it [m]."""
-    points = square(4)[1]
-    upper = UPPER[name](0.9 * points + np.array([0.0037, 0.0, 0.0051]))
-    return torch.as_tensor(np.concatenate([points, upper]))
+    @pytest.mark.parametrize("height", [0.0015, 0.004])
+    def test_two_sheets_sink_onto_a_ball_together(self, height: float):
+        """The cage of the lower one is in the ball, and the last push sends it through the upper."""
+        cloth = square(8)
+        cages = [cloth[1] + [0.0, 0.147 + number * height, 0.0] for number in range(2)]
+        garments = [named(cloth, "A"), named(cloth, "B")]
+        answer = refiner_with(garments, ["mesh"]).solve(frame_with(cages, ball(0.15, level=3)))
+        told = answer.telemetry[0]["contact"]
+        body = next(iter(told["bodies"].values()))
+        assert body["before"]["inside"] > 0
+        assert body["after"]["inside"] == 0
+        assert told["cloth"]["after"]["crossings"] == 0
+        over = np.linalg.norm(answer.points[0][:, [0, 2]], axis=1) < 0.1
+        assert (answer.points[1][over, 1] > answer.points[0][over, 1]).all()

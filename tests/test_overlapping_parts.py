@@ -170,7 +170,7 @@ class TestWrinkles:
         view = contact.at(level).bodies
         assert view is not None
         rough = torch.where(lens.unsqueeze(1), base + noise.to(base), base)
-        out, _, _ = contact.finish(rough)
+        out, _ = contact.finish(rough)
         told: Any = contact.measure(out)[0]["bodies"]
         before, after = told["/Body0"]["before"], told["/Body0"]["after"]
         assert view.crossings(rough) > before["crossings"]

@@ -14,27 +14,30 @@ from cloth import FABRIC, base_of
 from folds import (
     EDGE,
     Cloth,
-    contact_of,
     curved,
     fine,
     frame_with,
     levels_of,
     named,
+    promise_of,
     refiner_with,
     square,
     strip,
     view_of,
 )
 from shots import refine
-from test_cloth_mesh import everything, moved, reach
 
+from physgraph_usd.collide.crossings import crossings
+from physgraph_usd.collide.near import near_pairs
+from physgraph_usd.collide.parts import Parts
+from physgraph_usd.collide.sweep import Reach
 from physgraph_usd.contact.bodies import LevelBodies
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.forces import elastic_terms
 from physgraph_usd.forces.base import ForceModule
 from physgraph_usd.forces.seam import Seam, SewnForces
 from physgraph_usd.level import Level
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.mesh.topology import PolygonMesh, joined_by
 from physgraph_usd.scene import Garment
 
 SOFT = replace(FABRIC, shear=10.0)
@@ -242,60 +245,44 @@ class TestCloth:
         x = level.rest.clone()
         middle = float(np.median(x[:, 0]))
         x[:, 1] = 0.4 * (x[:, 0] - middle).abs()
-        seam = seam_of(level, level.rest)
-        mesh = moved(level, x)
-        loose = mesh.pairs(everything(level), reach(level))
-        mesh.sew(seam.pairs)
-        sewn = mesh.pairs(everything(level), reach(level))
-        beside = mesh.beside + mesh.beside.T
+        one = joined_by(seam_of(level, level.rest).pairs, level.vertex_count)
+        near = Reach(torch.full_like(x[:, 0], 0.02).double(), torch.ones_like(x[:, 0]).double(), 0.0)
 
-        def joined(corners: np.ndarray) -> int:
-            return sum(bool(beside[a, b] or a == b) for four in corners for a in four[:1] for b in four[1:])
+        def joined(label: np.ndarray | None) -> int:
+            pairs = near_pairs(Parts(level, np.ones((1, 1), bool), label), x, near)
+            split = np.where(pairs.face.numpy(), 1, 2)
+            return sum(
+                len({*four[:k]} & {*four[k:]}) > 0 for four, k in zip(one[pairs.corners.numpy()], split, strict=True)
+            )
 
-        assert joined(loose.corners[loose.face].numpy()) > 0
-        assert joined(sewn.corners[sewn.face].numpy()) == 0
+        assert joined(None) > 0
+        assert joined(one) == 0
 
-    def test_rings_grow_across_seams_and_no_longer_when_they_are_gone(self):
-        _, levels, seam, base = self.sewn()
-        mesh = moved(levels[-1], base)
-        one = torch.zeros(len(base), dtype=torch.bool)
-        one[seam.pairs[0, 0]] = True
-        alone = mesh.grown(one, 2)
-        mesh.sew(seam.pairs)
-        assert bool(mesh.grown(one, 1)[seam.pairs[0, 1]])
-        assert int(mesh.grown(one, 2).sum()) > int(alone.sum())
-        assert len(np.unique(mesh.whole)) == 1
-        mesh.sew(np.zeros((0, 2), np.int64))
-        assert torch.equal(mesh.grown(one, 2), alone)
-        assert len(np.unique(mesh.whole)) == 2
-
-    def test_mended_cloth_stays_closed(self):
-        """Noise that crosses the cloth on both sides of its seam is mended; the seam is closed wherever it ends."""
+    @pytest.mark.parametrize("seed", range(4))
+    def test_whatever_is_wanted_seams_stay_closed_and_nothing_crosses(self, seed: int):
+        """Noise that would cross the cloth on both sides of its seam, and open that."""
         garment, levels, seam, base = self.sewn()
-        view = view_of(levels, [garment], seam.closed(base), seam=seam)
-        x = seam.closed(base + 0.3 * EDGE * noise(base))
-        assert view.look(x).crossings.count > 0
-        mended = view.mend(x)
-        assert mended.crossings.count == 0
-        assert torch.equal(seam.closed(mended.x), mended.x)
-        assert bool((mended.x != x).any(dim=1)[seam.pairs.reshape(-1)].any())
+        promise, start = promise_of(levels, [garment], seam=seam), seam.closed(base)
+        wanted = seam.closed(base + 0.3 * EDGE * noise(base, seed))
+        view = promise.view
+        assert view.crossings(wanted).count > 0
+        x = promise.move(start, wanted)
+        assert crossings(view.parts, x).count == 0
+        assert gap_of(x.numpy(), base.numpy()) < 1e-6
+        assert torch.equal(seam.closed(x), x)
+        assert bool((x != start).any(dim=1)[seam.pairs.reshape(-1)].any())
 
-    def test_what_opens_at_a_seam_is_closed_before_it_is_looked_for_crossings(self):
-        """The last frame's detail, carried panel by panel: the end of one hangs through the other."""
+    def test_a_frame_whose_carried_detail_opens_at_a_seam_is_closed(self):
+        """Two frames of a sewn strip that is bent at its seam by ever more."""
         cloth, _ = panels(strip(8, 3))
-        garment = named(cloth)
-        levels = levels_of(garment)
+        solver = refiner_with([named(cloth)], times=(0.0, 1.0, 2.0))
         middle = float(np.median(cloth[1][:, 0]))
-        bent = torch.as_tensor(cloth[1], dtype=torch.float32)
-        bent[:, 1] = 0.4 * (bent[:, 0] - middle).abs()
-        contact = contact_of(levels, [garment], bent, cloth_stiffness=1e5)
-        base = levels[-1].base.apply(bent)
-        x, first = base.clone(), torch.as_tensor(seam_of(levels[-1], base).pairs[:, 0])
-        x[first] += 0.5 * EDGE * torch.tensor([0.3, 0.05, 0.0])
-        view = contact.at(levels[-1]).cloth
-        assert view is not None
-        assert view.look(x).crossings.count > 0
-        assert torch.equal(contact.mixed(x, base), contact.at(levels[-1]).closed(x))
+        for time in range(3):
+            bent = cloth[1].copy()
+            bent[:, 1] = 0.2 * (1 + time) * np.abs(bent[:, 0] - middle)
+            answer = solver.solve(frame_with([bent], time=float(time)))
+            assert gap_of(answer.points[0], base_of(cloth[0], bent, 1)) < 1e-7
+            assert answer.telemetry[0]["contact"]["cloth"]["after"]["crossings"] == 0
 
     def test_what_meets_at_a_corner_does_not_cross(self):
         """Edges that begin at corners of faces they are sewn to: rounding puts them on either side, at any place."""
@@ -304,7 +291,7 @@ class TestCloth:
             turn = torch.linalg.qr(noise(torch.zeros((3, 3)), seed))[0]
             x = seam.closed(base + 0.02 * EDGE * noise(base, seed)) @ turn + noise(torch.zeros(3), seed)
             x = seam.closed(x)
-            assert view_of(levels, [garment], x).before.crossings.count == 0
+            assert view_of(levels, [garment], seam=seam).crossings(x).count == 0
 
 
 @pytest.mark.real_data

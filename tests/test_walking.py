@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from brute import Soup, crossings, on_triangles
-from folds import SHAPES, crumpled, folded, frame_with, levels_of, named, placed, refiner_with, square, strip
+from brute import Soup, between_edges, crossings, on_segments, on_triangles
+from folds import SHAPES, folded, frame_with, levels_of, named, placed, refiner_with, square, strip
 
 from physgraph_usd.collide.near import near_pairs
 from physgraph_usd.collide.parts import Parts
-from physgraph_usd.contact.settings import ContactSettings
+from physgraph_usd.collide.sweep import Reach
+from physgraph_usd.level import Level
 
-WALKING = ContactSettings(promise=True)
+ONE = np.ones((1, 1), bool)
+
+
+def reach_of(level: Level, within: float) -> Reach:
+    """What is near within a distance [m], however near it is at rest."""
+    radius = torch.full((level.vertex_count,), 0.5 * within, dtype=torch.float64)
+    return Reach(radius, torch.full_like(radius, 1e3), 0.0)
 
 
 class TestCagesThatPassThroughOneAnother:
@@ -21,7 +30,7 @@ class TestCagesThatPassThroughOneAnother:
         mesh, flat = square(4)
         turn = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
         sheets = [named((mesh, flat), "A"), named((mesh, flat), "B")]
-        solver, level = refiner_with(sheets, contact=WALKING), levels_of(*sheets)[-1]
+        solver, level = refiner_with(sheets), levels_of(*sheets)[-1]
         inputs, results = [], []
         for number, height in enumerate([0.03, 0.015, 0.0, -0.015, 0.0, 0.03]):
             tilted = (flat + 0.2 * flat[:, :1] * [0.0, 1.0, 0.0]) @ turn.T
@@ -38,7 +47,7 @@ class TestNearPairs:
     def test_every_vertex_and_face_that_is_near_is_found_and_no_other(self, shape: str):
         level = levels_of(named(strip(8, 3)))[-1]
         x, within = placed(level, SHAPES[shape]), 0.025
-        found = near_pairs(Parts(level, np.ones((1, 1), bool)), x, within)
+        found = near_pairs(Parts(level, ONE), x, reach_of(level, within))
         corners = found.corners[found.face].long().numpy()
         listed = {(int(v), *sorted(map(int, t))) for v, *t in corners}
         points, faces = x.double().numpy(), level.triangles.long().numpy()
@@ -52,19 +61,53 @@ class TestNearPairs:
         assert len(expected) > 20
         assert listed == expected
 
+    @pytest.mark.parametrize("shape", ["folded", "rolled", "crumpled"])
+    def test_every_two_edges_that_are_near_are_found_and_no_others(self, shape: str):
+        level = levels_of(named(strip(8, 3)))[-1]
+        x, within = placed(level, SHAPES[shape]), 0.0213
+        found = near_pairs(Parts(level, ONE), x, reach_of(level, within))
+        corners = found.corners[~found.face].long().numpy()
+        listed = {frozenset((tuple(sorted(four[:2])), tuple(sorted(four[2:])))) for four in corners.tolist()}
+        assert len(listed) == len(corners)
+        points, edges, expected = x.double().numpy(), level.edges.long().numpy(), set()
+        for number, (a, b) in enumerate(edges):
+            others = edges[:number][~np.isin(edges[:number], (a, b)).any(axis=1)]
+            near = edge_distance(points[a], points[b], points[others[:, 0]], points[others[:, 1]]) < within
+            expected |= {frozenset((tuple(sorted((a, b))), tuple(sorted(other)))) for other in others[near].tolist()}
+        assert len(expected) > 100
+        assert listed == expected
+
     def test_ways_are_as_long_as_parts_are_apart(self):
         level = levels_of(named(strip(8, 3)))[-1]
         x = placed(level, folded)
-        found = near_pairs(Parts(level, np.ones((1, 1), bool)), x, 0.012)
+        found = near_pairs(Parts(level, ONE), x, reach_of(level, 0.012))
         way = (found.weight.unsqueeze(2) * x[found.corners.long()]).sum(dim=1)
         torch.testing.assert_close(way, found.way)
         assert float(found.way.norm(dim=1).max()) < 0.012
         assert float(found.weight.sum(dim=1).abs().max()) < 1e-6
 
-    def test_exempt_vertices_are_in_none(self):
+    def test_of_one_garment_what_is_near_at_rest_is_nearer_than_half_of_that(self):
+        """As the force asks: a flat sheet has none, a folded one has those of the fold."""
         level = levels_of(named(strip(8, 3)))[-1]
-        x = placed(level, crumpled)
-        exempt = torch.rand(len(x), generator=torch.Generator().manual_seed(0)) < 0.3
-        found = near_pairs(Parts(level, np.ones((1, 1), bool)), x, 0.012, exempt=exempt)
-        assert len(found.face)
-        assert not bool(exempt[found.corners.long()].any())
+        parts, rest = Parts(level, ONE), level.rest.double()
+        near = replace(reach_of(level, 0.03), play=torch.zeros(level.vertex_count, dtype=torch.float64), half=0.5)
+        assert len(near_pairs(parts, level.rest, near).face) == 0
+        x = placed(level, folded)
+        found, every = near_pairs(parts, x, near), near_pairs(parts, x, reach_of(level, 0.03))
+        assert 0 < len(found.face) < len(every.face)
+        at_rest = (found.weight.double().unsqueeze(2) * rest[found.corners.long()]).sum(dim=1).norm(dim=1)
+        # The closest points at rest are others: they are no farther apart than these.
+        assert bool((found.way.norm(dim=1) < 0.5 * at_rest + 1e-6).all())
+
+
+def edge_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Distances between an edge and edges: inside both, or from an end of one."""
+    s, t = between_edges(a, b, c, d)
+    inside = (s > 0) & (s < 1) & (t > 0) & (t < 1)
+    s, t = np.nan_to_num(s)[:, None], np.nan_to_num(t)[:, None]
+    best = np.where(inside, np.linalg.norm(a + s * (b - a) - c - t * (d - c), axis=1), np.inf)
+    for p in (a, b):
+        best = np.minimum(best, np.linalg.norm(c + on_segments(c, d, p)[:, None] * (d - c) - p, axis=1))
+    for p in (c, d):
+        best = np.minimum(best, np.linalg.norm(a + on_segments(a, b, p)[:, None] * (b - a) - p, axis=1))
+    return best

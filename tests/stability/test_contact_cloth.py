@@ -11,7 +11,7 @@ from brute import between
 from cloth import Answer, base_of, refiner_of
 from folds import EDGE, Cloth, frame_with, named, refiner_with, square
 from sheets import garment_of
-from test_untangle import cornered, dented
+from test_tangles import cornered, dented
 
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.level import refine_garments

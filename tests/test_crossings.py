@@ -1,0 +1,306 @@
+"""Edges that pass through faces: every one of them, against numpy and the IPC toolkit, which share no code with it."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from brute import Soup, on_triangles
+from brute import crossings as every
+from cloth import base_of
+from folds import EDGE, SHAPES, Cloth, crumpled, curved, flat, folded, levels_of, named, placed, square, strip
+from meshes import mesh_of
+from scipy.spatial import Delaunay
+from sheets import rotation, triangle_mesh
+
+from physgraph_usd.collide.crossings import Crossings, crossings
+from physgraph_usd.collide.parts import Parts
+from physgraph_usd.contact.cloth_mesh import ClothMesh
+from physgraph_usd.level import Level
+from physgraph_usd.mesh.topology import joined_by
+
+ALL = np.ones((2, 2), bool)
+CROSSED = ("rolled through itself", "crumpled", "crumpled more")
+
+
+def listed(found: Crossings) -> set[tuple[int, int]]:
+    """Pairs of an edge and a face, each found once."""
+    out = set(zip(found.edge.tolist(), found.face.tolist(), strict=True))
+    assert len(out) == found.count
+    return out
+
+
+def found_at(level: Level, x: torch.Tensor, meets: np.ndarray = ALL) -> set[tuple[int, int]]:
+    """What crosses at positions [m]."""
+    return listed(crossings(Parts(level, meets), x))
+
+
+def two_sheets(kind: str = "triangles") -> tuple[Level, torch.Tensor]:
+    """Two garments that pass through one another and through themselves."""
+    cloth = square(3, kind=kind)
+    level = levels_of(named(cloth, "A"), named(cloth, "B"))[-1]
+    half = level.vertex_count // 2
+    points = level.rest.double().numpy()
+    x = np.concatenate([crumpled(points[:half], 1, size=0.5), crumpled(points[half:], 2, size=0.5)])
+    x[half:, 0] += 0.01
+    return level, torch.as_tensor(x, dtype=level.dtype)
+
+
+def fan(corners: int = 90) -> Cloth:
+    """A disc whose triangles all meet in its middle."""
+    angle = 2 * np.pi * np.arange(corners) / corners
+    rim = 0.05 * np.stack([np.cos(angle), 0.0 * angle, -np.sin(angle)], axis=1)
+    ids = np.arange(corners)
+    faces = np.stack([0 * ids, 1 + ids, 1 + (ids + 1) % corners], axis=1)
+    return triangle_mesh(faces, corners + 1), np.concatenate([np.zeros((1, 3)), rim])
+
+
+def two_fans() -> tuple[Level, torch.Tensor]:
+    """Two such discs, one tilted through the other."""
+    level = levels_of(named(fan(), "A"), named(fan(), "B"), level=0)[-1]
+    x = level.rest.double().numpy() + 1e-3 * np.random.default_rng(0).normal(size=level.rest.shape)
+    half = level.vertex_count // 2
+    x[half:] = x[half:] * [0.8, 1.0, 0.9] + [0.0031, 0.0, 0.0017]
+    x[half:, 1] += 0.4 * x[half:, 0] + 0.1 * x[half:, 2] + 0.003
+    return level, torch.as_tensor(x, dtype=level.dtype)
+
+
+def coarse(seed: int) -> tuple[Level, torch.Tensor]:
+    """A coarse irregular mesh, crumpled so that faces fold into those beside them."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.1, 0.1, (40, 2))
+    rest = np.stack([points[:, 0], 0.0 * points[:, 0], points[:, 1]], axis=1)
+    level = levels_of(named((triangle_mesh(Delaunay(points).simplices, len(rest)), rest)), level=0)[-1]
+    x = rest * [0.5, 1.0, 0.5] + 0.03 * rng.normal(size=rest.shape)
+    return level, torch.as_tensor(x, dtype=level.dtype)
+
+
+@cache
+def scene(name: str) -> tuple[Level, torch.Tensor]:
+    """A level and positions."""
+    if name in (more := {"two sheets": two_sheets, "two fans": two_fans}):
+        return more[name]()
+    if name == "two sheets of quads":
+        return two_sheets("quads")
+    cloth = strip(8, 3) if "crumpled" not in name else square(4)
+    level = levels_of(named(cloth))[-1]
+    return level, placed(level, SHAPES[name])
+
+
+SCENES = (*SHAPES, "two sheets", "two sheets of quads", "two fans")
+
+
+class TestAgainstEveryPair:
+    @pytest.mark.parametrize("name", SCENES)
+    def test_of_sheets(self, name: str):
+        level, x = scene(name)
+        expected = every(Soup.of(level, x))
+        assert found_at(level, x) == expected
+        assert (len(expected) > 10) == (name in (*CROSSED, *SCENES[-3:]))
+
+    @pytest.mark.parametrize("kind", ["triangles", "quads", "mixed"])
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    def test_of_random_crumples(self, kind: str, level: int):
+        finest, count = levels_of(named(square(4, kind=kind)), level=level)[-1], 0
+        for seed in range(6):
+            for size in (0.2, 0.5, 0.8):
+                points = crumpled(finest.rest.double().numpy(), seed, size=size) @ rotation(seed)
+                x = torch.as_tensor(points, dtype=finest.dtype)
+                expected = every(Soup.of(finest, x))
+                assert found_at(finest, x) == expected
+                count += len(expected)
+        assert count > 30
+
+    @pytest.mark.parametrize("kinds", [("triangles", "triangles"), ("quads", "triangles"), ("quads", "mixed")])
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    def test_of_two_random_sheets_that_cross(self, kinds: tuple[str, str], level: int):
+        one, other = (square(3, kind=kind) for kind in kinds)
+        finest = levels_of(named(one, "A"), named(other, "B"), level=level)[-1]
+        first = (finest.vertex_garment == 0).numpy()
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            x = finest.rest.double().numpy() + 0.1 * EDGE * rng.normal(size=finest.rest.shape)
+            x[~first] = x[~first] @ rotation(seed) + 0.02 * rng.normal(size=3)
+            at = torch.as_tensor(x, dtype=finest.dtype)
+            expected = every(Soup.of(finest, at))
+            assert found_at(finest, at) == expected
+            assert len(expected) > 2
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_of_faces_that_fold_into_those_beside_them(self, seed: int):
+        """Parts one edge apart: in a coarse irregular mesh they pass through one another."""
+        level, x = coarse(seed)
+        soup = Soup.of(level, x)
+        expected = every(soup)
+        assert found_at(level, x) == expected
+        edge, face = np.array(sorted(expected)).T
+        joined = [
+            np.isin(soup.faces, e).any(axis=1) & np.isin(soup.faces, f).any(axis=1)
+            for e, f in zip(soup.edges[edge], soup.faces[face], strict=True)
+        ]
+        assert sum(each.any() for each in joined) > 10
+
+    @pytest.mark.parametrize("far", [0.0, 1e3])
+    def test_far_from_the_origin(self, far: float):
+        """In double precision what crosses does not depend on where it is."""
+        cloth = square(4)
+        level = levels_of(named(cloth), dtype=torch.float64)[-1]
+        x = placed(level, SHAPES["crumpled more"])
+        assert found_at(level, x + far * EDGE) == found_at(level, x)
+        assert len(found_at(level, x)) > 10
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_of_the_lips_of_a_slit(self, seed: int):
+        """Both lips lie in the plane of the cloth, their normals up, and pass over and through one another."""
+        mesh, rest = slit()
+        level = levels_of(named((mesh, rest)))[-1]
+        x = torch.as_tensor(base_of(mesh, overlapped(rest, seed), 1), dtype=level.dtype)
+        expected = every(Soup.of(level, x))
+        assert found_at(level, x) == expected
+        assert len(expected) > 5
+
+
+def slit() -> Cloth:
+    """A square sheet cut along the middle from its lower rim to its centre: the points there are there twice."""
+    mesh, points = square(6)
+    faces = mesh.indices.reshape(-1, 3).copy()
+    cut = np.flatnonzero((np.abs(points[:, 0]) < 1e-9) & (points[:, 2] > 1e-9))
+    left = points[faces][:, :, 0].mean(axis=1) < 0
+    for number, vertex in enumerate(cut):
+        faces[left[:, None] & (faces == vertex)] = len(points) + number
+    return mesh_of(faces.tolist(), len(points) + len(cut)), np.concatenate([points, points[cut]])
+
+
+def overlapped(rest: np.ndarray, seed: int) -> np.ndarray:
+    """The lips pushed over one another by up to an edge, and waved a little."""
+    points = rest.copy()
+    mirror = len(square(6)[1])
+    left = points[:, 0] < -1e-9
+    left[mirror:] = True
+    past = points[:, 2].clip(0.0)
+    points[:, 0] += np.where(left, 1.0, -1.0) * 0.4 * past * (1 - 2 * np.abs(rest[:, 0])) ** 4
+    rng = np.random.default_rng(seed)
+    return points + 0.05 * EDGE * rng.normal(size=points.shape)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_against_the_ipc_toolkit(name: str):
+    ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
+    level, x = scene(name)
+    soup = Soup.of(level, x)
+    mesh = ipctk.CollisionMesh(soup.x, soup.edges.astype(np.int32), soup.faces.astype(np.int32))
+    found = found_at(level, x)
+    assert ipctk.has_intersections(mesh, soup.x) == bool(found)
+    for e, edge in enumerate(soup.edges):
+        for f in np.flatnonzero(~np.isin(soup.faces, edge).any(axis=1)):
+            hit = ipctk.is_edge_intersecting_triangle(*soup.x[edge], *soup.x[soup.faces[f]])
+            assert hit == ((e, int(f)) in found)
+
+
+class TestWhatCounts:
+    @pytest.mark.parametrize(
+        "meets", [[[True, False], [False, True]], [[False, True], [True, False]], [[False, False], [False, True]]]
+    )
+    def test_only_garments_that_feel_one_another(self, meets: list[list[bool]]):
+        level, x = scene("two sheets")
+        felt = np.array(meets)
+        mesh = ClothMesh(level, felt, np.zeros((0, 2), np.int64))
+        found = crossings(mesh.parts, x)
+        expected = every(Soup.of(level, x), felt)
+        assert 0 < len(expected) < len(every(Soup.of(level, x)))
+        assert listed(found) == expected
+        table = mesh.between(found)
+        assert table.sum() == found.count
+        assert not table[~felt | np.tri(2, k=-1, dtype=bool)].any()
+
+    def test_touching_is_not_passing(self):
+        """A sheet laid exactly on another, and one whose vertices lie in the other's faces."""
+        level = levels_of(named(square(2), "A"), named(square(2), "B"))[-1]
+        half = level.vertex_count // 2
+        for shift in ([0.0, 0.0, 0.0], [0.004, 0.0, 0.003]):
+            x = level.rest.clone()
+            x[half:] += torch.tensor(shift)
+            assert not found_at(level, x)
+
+    def test_a_lining_of_the_same_mesh_passes_through_at_the_sides_of_faces(self):
+        """Every edge that passes through meets an edge below it; it is counted once, as when moved aside by a hair."""
+        level = levels_of(named(square(4), "A"), named(square(4), "B"))[-1]
+        half = level.vertex_count // 2
+        x = level.rest.clone()
+        x[half:, 1] = 0.3 * x[half:, 0] + 0.11 * x[half:, 2] + 0.002
+        found = len(found_at(level, x))
+        x[half:] += 1e-5 * torch.rand_like(x[half:])
+        aside = found_at(level, x)
+        assert aside == every(Soup.of(level, x))
+        assert 0.5 * len(aside) < found < 1.5 * len(aside)
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("shape", [flat, folded, curved])
+    def test_what_does_not_cross_has_none(self, shape: object, dtype: torch.dtype):
+        """However it is turned: in a plane that is no axis' own, rounding says on which side of it an end is."""
+        level = levels_of(named(strip(8, 3)), dtype=dtype)[-1]
+        x = placed(level, shape)  # type: ignore[arg-type]
+        for seed in range(20):
+            assert not found_at(level, x @ torch.as_tensor(rotation(seed), dtype=dtype)), seed
+
+    def test_what_is_sewn_to_a_face_does_not_pass_through_it(self):
+        """Pairs of vertices of two crossing sheets are sewn at random: what shares a label with a face is left out."""
+        level, x = scene("two sheets")
+        soup, half = Soup.of(level, x), level.vertex_count // 2
+        expected = every(soup)
+        rng = np.random.default_rng(3)
+        sewn = np.stack([rng.choice(half, 12, replace=False), half + rng.choice(half, 12, replace=False)], axis=1)
+        label = joined_by(sewn, level.vertex_count)
+        kept = {(e, f) for e, f in expected if not np.isin(label[soup.edges[e]], label[soup.faces[f]]).any()}
+        assert 0 < len(kept) < len(expected)
+        assert listed(crossings(Parts(level, ALL, label), x)) == kept
+
+
+class TestUpsampledOnTriangles:
+    """A level's vertices on the triangles of the level below: what does not cross there does not cross here."""
+
+    @pytest.mark.parametrize("kind", ["quads", "mixed", "triangles"])
+    @pytest.mark.parametrize("seed", range(4))
+    def test_they_lie_on_them(self, kind: str, seed: int):
+        levels = levels_of(named(square(4, kind=kind)), level=2, dtype=torch.float64)
+        x = torch.as_tensor(crumpled(levels[0].rest.numpy(), seed, size=0.7))
+        for below, level in pairwise(levels):
+            assert level.flat_from_below is not None
+            above = level.flat_from_below.apply(x)
+            a, b, c = x.numpy()[below.triangles.long().numpy()].transpose(1, 0, 2)
+            for point in above.numpy():
+                foot = on_triangles(np.broadcast_to(point, a.shape), a, b, c)
+                assert np.linalg.norm(foot - point, axis=1).min() < 1e-7
+            x = above
+
+    @pytest.mark.parametrize("kind", ["quads", "mixed"])
+    def test_quads_are_not_upsampled_by_their_means(self, kind: str):
+        """Bent ones have their middle on a diagonal, and not where the mean of their corners is."""
+        levels = levels_of(named(square(4, kind=kind)), level=1, dtype=torch.float64)
+        x, level = torch.as_tensor(crumpled(levels[0].rest.numpy(), 1, size=0.7)), levels[-1]
+        assert level.flat_from_below is not None
+        assert level.from_below is not None
+        assert float((level.flat_from_below.apply(x) - level.from_below.apply(x)).norm(dim=1).max()) > 0.01 * EDGE
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("kind", ["quads", "mixed", "triangles"])
+    def test_a_cage_that_does_not_cross_crosses_at_no_level(self, kind: str, dtype: torch.dtype):
+        """Crumpled sheets, as far as their cages do not cross; by the means of quads some of them would."""
+        levels = levels_of(named(square(4, kind=kind)), level=2, dtype=dtype)
+        tried = bent = 0
+        for seed in range(60):
+            x = torch.as_tensor(crumpled(levels[0].rest.double().numpy(), seed, size=0.9), dtype=dtype)
+            if found_at(levels[0], x):
+                continue
+            tried, mean = tried + 1, x
+            for level in levels[1:]:
+                assert level.flat_from_below is not None
+                assert level.from_below is not None
+                x, mean = level.flat_from_below.apply(x), level.from_below.apply(mean)
+                assert not found_at(level, x), (seed, level.index)
+            bent += bool(found_at(levels[-1], mean))
+        assert tried > 5
+        assert kind == "triangles" or bent > 0

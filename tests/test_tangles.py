@@ -1,0 +1,259 @@
+"""Tangles: what hangs together of what crosses, the way out of it, and that no move makes more of it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from brute import Soup, contour_length, crossings
+from energies import evaluate
+from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
+
+from physgraph_usd.collide.crossings import Crossings
+from physgraph_usd.collide.crossings import crossings as crossings_of
+from physgraph_usd.contact.cloth_mesh import ClothMesh
+from physgraph_usd.contact.promise import Promise
+from physgraph_usd.contact.tangles import Tangles, gaps_out, ways_out
+from physgraph_usd.forces.self_contact import SelfContact
+from physgraph_usd.level import Level
+
+BOTH = np.ones((2, 2), bool)
+LIFT = 0.3 * EDGE
+
+
+def pair(upper: str) -> tuple[Level, torch.Tensor]:
+    """A level sheet and a smaller one that passes through it, in float64; the second is the one that is bent."""
+    cloths = square(4), square(4)
+    level = levels_of(named(cloths[0], "A"), named(cloths[1], "B"), dtype=torch.float64)[-1]
+    x = level.rest.clone()
+    half = len(x) // 2
+    points = 0.9 * x[half:].numpy() + np.array([0.0037, 0.0, 0.0051])
+    x[half:] = torch.as_tensor(UPPER[upper](points))
+    return level, x
+
+
+def dented(points: np.ndarray) -> np.ndarray:
+    """Above the other but for a dent in the middle."""
+    radius = np.linalg.norm(points[:, [0, 2]], axis=1)
+    return points + np.outer(LIFT - 2.2 * LIFT * np.exp(-((radius / 0.04) ** 2)), [0.0, 1.0, 0.0])
+
+
+def cornered(points: np.ndarray) -> np.ndarray:
+    """Above the other but for a corner."""
+    down = 0.5 * (points[:, 0] + points[:, 2] - 0.08)
+    return points + np.outer(LIFT - down.clip(0.0) * 1.5, [0.0, 1.0, 0.0])
+
+
+def tilted(points: np.ndarray) -> np.ndarray:
+    """Through the other from rim to rim, a little off its middle."""
+    return points + np.outer(0.6 * points[:, 0] + 0.2 * points[:, 2] + 0.2 * LIFT, [0.0, 1.0, 0.0])
+
+
+def shifted(points: np.ndarray) -> np.ndarray:
+    """A flat sheet on its edge, passed through by the rim of the other."""
+    return points[:, [1, 0, 2]] + np.array([0.081, 0.013, 0.02])
+
+
+UPPER = {"dented": dented, "cornered": cornered, "tilted": tilted, "on edge": shifted}
+
+
+def found_in(level: Level, x: torch.Tensor) -> tuple[ClothMesh, Crossings]:
+    mesh = ClothMesh(level, BOTH, np.zeros((0, 2), np.int64))
+    found = crossings_of(mesh.parts, x)
+    assert found.count > 5
+    return mesh, found
+
+
+class TestWaysOut:
+    @pytest.mark.parametrize("name", UPPER)
+    def test_the_place_is_where_edge_and_face_meet(self, name: str):
+        level, x = pair(name)
+        mesh, found = found_in(level, x)
+        _, place = ways_out(mesh, found, x)
+        ends, face = level.edges.long()[found.edge], mesh.triangles[found.face]
+        on_edge = (1 - place[:, :1]) * x[ends[:, 0]] + place[:, :1] * x[ends[:, 1]]
+        on_face = (place[:, 1:].unsqueeze(2) * x[face]).sum(dim=1)
+        torch.testing.assert_close(on_edge, on_face, atol=1e-9, rtol=0)
+
+    @pytest.mark.parametrize("name", ["dented", "cornered", "on edge"])
+    def test_moved_along_it_the_contour_is_shorter(self, name: str):
+        """Edges by the ways and faces against them, weighed as the springs weigh them."""
+        level, x = pair(name)
+        mesh, found = found_in(level, x)
+        lengths = [contour_length(Soup.of(level, x))]
+        for _ in range(5):
+            _, force = evaluate(SelfContact(level, gaps_out(mesh, found, x, step=0.01, stiffness=1.0)), x)
+            x = x + 0.04 * EDGE * force / force.norm(dim=1).max()
+            lengths.append(contour_length(Soup.of(level, x)))
+        assert all(after < before for before, after in pairwise(lengths)), lengths
+        assert lengths[-1] < 0.97 * lengths[0]
+
+    @pytest.mark.parametrize("name", ["dented", "cornered", "on edge"])
+    def test_a_garment_moved_as_a_whole_along_their_sum_comes_out(self, name: str):
+        level, x = pair(name)
+        mesh, found = found_in(level, x)
+        way, _ = ways_out(mesh, found, x)
+        second = level.vertex_garment[level.edges.long()[found.edge, 0]] == 1
+        total = torch.where(second.unsqueeze(1), way, -way).sum(dim=0)
+        before = contour_length(Soup.of(level, x))
+        x[level.vertex_garment == 1] += 0.05 * EDGE * total / total.norm()
+        assert contour_length(Soup.of(level, x)) < before
+
+    def test_its_length_is_the_contours_derivative(self):
+        """A corner through a plane: the contour grows by G . d when all that is above moves by d."""
+        level, x = pair("cornered")
+        mesh, found = found_in(level, x)
+        way, _ = ways_out(mesh, found, x)
+        second = level.vertex_garment[level.edges.long()[found.edge, 0]] == 1
+        clipped = way.norm(dim=1) > 0.999
+        total = torch.where(second.unsqueeze(1), way, -way).sum(dim=0)
+        slope = torch.zeros(3, dtype=x.dtype)
+        for axis in range(3):
+            sides = []
+            for step in (1e-5, -1e-5):
+                moved = x.clone()
+                moved[level.vertex_garment == 1, axis] += step
+                sides.append(contour_length(Soup.of(level, moved)))
+            slope[axis] = (sides[0] - sides[1]) / 2e-5
+        assert float(torch.nn.functional.cosine_similarity(-total, slope, dim=0)) > (0.7 if clipped.any() else 0.99)
+
+    def test_a_straight_contour_from_rim_to_rim_has_no_way_out(self):
+        """Moved across the other sheet it stays as long: at the cage the piece that is cut off goes back."""
+        level, x = pair("tilted")
+        mesh, found = found_in(level, x)
+        way, _ = ways_out(mesh, found, x)
+        ends = level.edges.long()[found.edge]
+        inner = (x[ends].abs() < 0.08).all(dim=2).all(dim=1)
+        assert float(way[inner].norm(dim=1).max()) < 0.35
+
+
+class TestTangles:
+    """Two pairs of sheets, far apart, each pair crossing in one corner."""
+
+    def scene(self, rings: int) -> tuple[Level, torch.Tensor, Tangles, Crossings, ClothMesh]:
+        garments = [named(square(4), name) for name in "ABCD"]
+        level = levels_of(*garments, dtype=torch.float64)[-1]
+        x = pair("cornered")[1]
+        x = torch.cat([x, x + torch.tensor([1.0, 0.0, 0.0], dtype=x.dtype)])
+        mesh = ClothMesh(level, np.ones((4, 4), bool), np.zeros((0, 2), np.int64))
+        found = crossings_of(mesh.parts, x)
+        return level, x, Tangles.find(mesh, mesh.corners_of(found), rings=rings), found, mesh
+
+    @pytest.mark.parametrize("rings", [0, 1, 2])
+    def test_what_hangs_together_or_crosses_is_one(self, rings: int):
+        level, _, tangles, found, mesh = self.scene(rings)
+        assert len(tangles.before) == 2
+        first = level.vertex_garment < 2
+        inside = tangles.label >= 0
+        assert len(tangles.label[inside & first].unique()) == len(tangles.label[inside & ~first].unique()) == 1
+        assert torch.equal(inside, mesh.grown(mesh.crossed(found), rings))
+
+    def test_each_is_counted_alone(self):
+        level, _, tangles, found, mesh = self.scene(1)
+        assert tangles.before.tolist() == [found.count // 2] * 2
+        assert not tangles.worse(found).any()
+        first = (level.vertex_garment[mesh.corners_of(found)[:, 0]] < 2).nonzero().squeeze(1)
+        twice = Crossings(*(torch.cat([each, each[first]]) for each in (found.edge, found.face)))
+        worse = tangles.worse(twice)
+        assert torch.equal(worse, (tangles.label >= 0) & (level.vertex_garment < 2))
+
+
+def crossed_strip(name: str) -> tuple[Level, Promise, torch.Tensor]:
+    """A strip pinned at one end in a shape, and what moves it."""
+    cloth = strip(8, 3)
+    garment = named(cloth, pin=(cloth[1][:, 0] < 0.01) * 1.0)
+    levels = levels_of(garment)
+    shapes = {"flat": lambda p: p, "curved": curved, "folded": folded, **SHAPES}
+    return levels[-1], promise_of(levels, [garment]), placed(levels[-1], shapes[name])
+
+
+class TestMoves:
+    """Whatever is wanted, no more crosses after a move than before, and nothing where nothing did."""
+
+    @pytest.mark.parametrize("seed", range(4))
+    @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
+    @pytest.mark.parametrize("name", ["flat", "folded", "rolled", "crumpled", "rolled through itself"])
+    def test_never_more_crossings_than_before(self, name: str, size: float, seed: int):
+        level, promise, base = crossed_strip(name)
+        noise = torch.randn(base.shape, generator=torch.Generator().manual_seed(seed))
+        x = promise.move(base, base + size * 0.3 * EDGE * noise * level.free)
+        before, after = (len(crossings(Soup.of(level, at))) for at in (base, x))
+        assert promise.view.crossings(x).count == after
+        assert after <= before
+        assert (before > 0) == (name in ("crumpled", "rolled through itself"))
+        assert torch.equal(x[~level.free[:, 0]], base[~level.free[:, 0]])
+
+    @pytest.mark.parametrize("name", UPPER)
+    @pytest.mark.parametrize("size", [0.1, 0.5, 2.0])
+    def test_nor_of_two_sheets(self, name: str, size: float):
+        garments = [named(square(4), each) for each in "AB"]
+        levels, (level, base) = levels_of(*garments, dtype=torch.float64), pair(name)
+        noise = torch.as_tensor(np.random.default_rng(4).normal(size=(len(base), 3)))
+        x = promise_of(levels, garments).move(base, base + size * EDGE * noise)
+        assert 0 <= len(crossings(Soup.of(level, x))) <= len(crossings(Soup.of(level, base)))
+
+    @pytest.mark.parametrize("name", ["flat", "curved", "folded", "rolled"])
+    def test_what_is_safe_is_gone_to_itself(self, name: str):
+        _, promise, base = crossed_strip(name)
+        x = base + 1e-4 * torch.sin(100 * base)
+        assert promise.move(base, x) is x
+
+    def test_only_what_is_near_what_would_cross_is_held_back(self):
+        """A smooth wave that pushes the upper half of a fold through the lower one in one corner."""
+        level, promise, base = crossed_strip("folded")
+        upper = (base[:, 1] > 0.009) & (base[:, 2] > 0.03)
+        wanted = base.clone()
+        wanted[upper, 1] -= 0.014
+        assert len(crossings(Soup.of(level, wanted))) > 0
+        x = promise.move(base, wanted)
+        assert len(crossings(Soup.of(level, x))) == 0
+        moved = (x - wanted).norm(dim=1) > 1e-7
+        assert 0 < int(moved.sum()) < 0.6 * level.vertex_count
+
+    def test_crossings_may_wander(self):
+        """Two sheets that cross along a line, one of which rises a little: what crosses, crosses elsewhere."""
+        garments = [named(square(4), name) for name in "AB"]
+        levels = levels_of(*garments)
+        base = levels[-1].rest.clone()
+        half = len(base) // 2
+        base[half:] += 0.1 * EDGE * torch.rand_like(base[half:])
+        base[half:, 1] += 0.5 * base[half:, 0]
+        x, promise = base.clone(), promise_of(levels, garments)
+        x[half:, 1] += 0.001
+        assert 0 < promise.view.crossings(x).count <= promise.view.crossings(base).count
+        assert promise.move(base, x) is x
+
+    def test_one_tangle_that_would_cross_more_holds_up_no_other(self):
+        """Of two pairs of sheets one is pushed deeper, the other drawn out."""
+        garments = [named(square(4), name) for name in "ABCD"]
+        levels = levels_of(*garments, dtype=torch.float64)
+        base = pair("cornered")[1]
+        base = torch.cat([base, base + torch.tensor([1.0, 0.0, 0.0], dtype=base.dtype)])
+        number, wanted = levels[-1].vertex_garment, base.clone()
+        wanted[number == 1, 1] -= 0.004
+        wanted[number == 3, 1] += 0.012
+        promise = promise_of(levels, garments)
+        x = promise.move(base, wanted)
+        before, asked, after = (promise.view.mesh.between(promise.view.crossings(at)) for at in (base, wanted, x))
+        assert asked[0, 1] > before[0, 1] > 0
+        assert after[0, 1] <= before[0, 1]
+        assert after[2, 3] == asked[2, 3] < before[2, 3]
+        assert torch.equal(x[number >= 2], wanted[number >= 2])
+
+
+class TestRemembered:
+    def test_a_view_looks_again_where_its_tensor_was_written_to(self):
+        garments = [named(square(4))]
+        levels = levels_of(*garments)
+        view = view_of(levels, garments)
+        x = placed(levels[-1], SHAPES["crumpled more"])
+        first = view.crossings(x)
+        assert view.crossings(x) is first
+        x[:] = levels[-1].rest
+        assert first.count > 0
+        assert view.crossings(x).count == 0
+        view.remember(x)
+        x[:] = placed(levels[-1], SHAPES["crumpled more"])
+        assert view.crossings(x).count == first.count
