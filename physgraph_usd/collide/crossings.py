@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..mesh.piercing import volume
 from .parts import Parts, Topology
-from .sweep import IMPACTS, Found, Motion, Pairs, Sweep, Swept, has, is_one, overlap, write
+from .sweep import IMPACTS, ROUNDING, Found, Motion, Pairs, Sweep, Swept, has, is_one, overlap, write
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,9 +52,17 @@ def turns_left(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, p: wp.int32, q: wp.int3
 
 @wp.func
 def is_through(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces."""
-    p, q, r = x[t[0]], x[t[1]], x[t[2]]
-    if volume(p, q, r, x[e[0]]) * volume(p, q, r, x[e[1]]) >= wp.float64(0.0):
+    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces.
+
+    What is in the plane but for the rounding of single precision is in it: parts of one flat face do not cross.
+    """
+    p, q, r, a, b = x[t[0]], x[t[1]], x[t[2]], x[e[0]], x[e[1]]
+    near, far = volume(p, q, r, a), volume(p, q, r, b)
+    if near * far >= wp.float64(0.0):
+        return False
+    size = wp.max(wp.max(wp.abs(p), wp.abs(q)), wp.max(wp.abs(a), wp.abs(b)))
+    rounding = ROUNDING * wp.max(size[0], wp.max(size[1], size[2])) * wp.length(wp.cross(q - p, r - p))
+    if wp.abs(near) <= rounding or wp.abs(far) <= rounding:
         return False
     first = turns_left(x, e, t[0], t[1])
     return turns_left(x, e, t[1], t[2]) == first and turns_left(x, e, t[2], t[0]) == first

@@ -118,6 +118,11 @@ class ClothView:
         """What may touch what, sewn as in this frame."""
         return self.mesh.parts
 
+    @property
+    def gap(self) -> float:
+        """Distance at which cloth is laid over cloth [m]."""
+        return float(self._thickness.mean())
+
     @cached_property
     def near(self) -> Reach:
         """How near parts are that may push one another before they are looked for again."""
@@ -160,13 +165,13 @@ class ClothView:
         Args:
             x: Positions [m].
             listed: Pairs among which those are that are near, or None.
-            order: Whether garments are brought in their order.
+            order: Whether garments are brought in their order, and even what is hopeless is drawn out.
         """
         if self._settings.cloth == "spheres":
             return self._spheres(x)
         found, tangles = self.crossings(x), self.tangles(x)
         gaps = self._gaps(x, found, listed, order=order)
-        found = found if tangles is None else tangles.hopeful(found)
+        found = found if tangles is None or order else tangles.hopeful(found)
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
@@ -190,7 +195,7 @@ class ClothView:
         if found.count:
             tangles = self.tangles(x)
             kept &= ~self.mesh.crossed(found)[corners].any(dim=1)
-            kept &= tangles is None or ~tangles.given_up[corners].all(dim=1)
+            kept &= tangles is None or order or ~tangles.given_up[corners].all(dim=1)
         corners, area = corners[kept], self._level.vertex_area[corners[kept]]
         share = torch.where(near.face[kept], area[:, 0], area.amin(dim=1) / 3.0)
         normal = torch.nn.functional.normalize(way[kept], dim=1, eps=1e-30).contiguous()

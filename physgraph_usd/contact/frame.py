@@ -17,6 +17,7 @@ from ..forces.self_contact import SelfContact, Spheres
 from ..integrate.base import Preconditioner
 from ..integrate.metric import Metric
 from ..level import Level
+from .apart import drawn_apart
 from .bodies import FrameBodies, LevelBodies, moves
 from .cloth import ClothContact, ClothView
 from .metric import HeldMetric
@@ -27,6 +28,8 @@ from .settings import ContactSettings
 
 FLOOR = 0.06
 """Of the thickness: gaps under it shrink by a tenth a move at most."""
+BLENDED = 4
+"""Rings round a tangle that does not come apart in which cloth goes over to where it was."""
 PUSHES = 4
 """How often cloth is pushed out of bodies and moved there in turn."""
 Touch = Contact | SelfContact | Spheres
@@ -78,7 +81,29 @@ class LevelContact:
     def comes_apart(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> bool:
         """Whether what crosses there, or is in no order where that counts, may come apart: not what is hopeless."""
         tangles = None if self.promise is None else self.promise.view.tangles(x, order=order)
-        return tangles is not None and not bool(tangles.hopeless.all())
+        return tangles is not None and (order or not bool(tangles.hopeless.all()))
+
+    def laid_back(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions in which pieces that went through cloth lie on their side again [m], where less crosses then."""
+        if self.promise is None or not self.crosses(x):
+            return x
+        out = drawn_apart(self.promise.view.mesh, x, gap=self.promise.view.gap)[0]
+        return x if out is x else self.closed(out)
+
+    def without_hope(
+        self, x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"]
+    ) -> Float[Tensor, "vertices 3"]:
+        """Positions x [m], back at the start where a tangle did not come apart, and on the way there beside it."""
+        tangles = None if self.promise is None else self.promise.view.tangles(x)
+        if self.promise is None or tangles is None or not bool(tangles.hopeless.any()):
+            return x
+        mesh, back = self.promise.view.mesh, tangles.given_up
+        share = back.to(x)
+        for ring in range(BLENDED):
+            wider = mesh.grown(back, 1)
+            share = torch.where(wider & ~back, 1.0 - (ring + 1.0) / (BLENDED + 1.0), share)
+            back = wider
+        return self.closed(x + share.unsqueeze(1) * (start - x))
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """As `ClothView.remember`, where there is a promise."""

@@ -94,7 +94,8 @@ def _drawn_out(
     budget: Budget,
 ) -> tuple[Tensor, list[LevelReport]]:
     """Rounds of few steps in which contours shorten, at the cage and where the last level or frame left any."""
-    cold = level.index == 0
+    cold, start = level.index == 0, x
+    x = view.laid_back(x) if cold else x
     reports: list[LevelReport] = []
     short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0)
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
@@ -104,7 +105,7 @@ def _drawn_out(
         y, report = solve_level(make_system(terms, x, None), integrator, x, level=level.index, budget=short)
         x = view.drawn(x, y) if cold else view.moved(x, y)
         reports.append(report)
-    return x, reports
+    return view.without_hope(x, start) if cold else x, reports
 
 
 def _budget_of(budget: Budget, system: System, *, first: bool) -> Budget:
