@@ -36,6 +36,8 @@ SPHERE = 0.8
 HALF, MARGIN = 0.5, 0.1
 """The part of their distance at rest that pairs of one garment keep at most, so that a flat sheet pushes nothing; and
 how much farther than the thickness pairs are asked for, in edges."""
+LEAST = 0.25
+"""Part of its thickness that cloth keeps from cloth, however near the input has the two."""
 TANGLED = 2
 """Rings round what crosses to which nothing is promised but that no more crosses."""
 OUT = 0.5
@@ -96,6 +98,7 @@ class ClothView:
         lasting: ClothContact,
         level: Level,
         *,
+        base: Float[Tensor, "vertices 3"],
         thickness: Float[Tensor, " garments"],
         settings: ContactSettings,
         seam: Seam | None = None,
@@ -105,12 +108,14 @@ class ClothView:
         Args:
             lasting: The group's cloth.
             level: The level.
+            base: The upsampled cage [m]: distances that it has are not widened.
             thickness: Of each garment [m].
             settings: How contact is solved, in SI.
             seam: What is sewn together, and stays so; or None without seams.
         """
         self.mesh, self.keeps_sides = lasting.mesh(level, seam), settings.cloth == "pairs"
         self._lasting, self._level, self._settings, self._thickness = lasting, level, settings, thickness
+        self._base = base
         self._looked: _Looked | None = None
 
     @property
@@ -184,7 +189,9 @@ class ClothView:
         garment = self._level.vertex_garment[corners[:, [0, 3]]].long()
         at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
         at_rest = torch.where(garment[:, 0] == garment[:, 1], at_rest, torch.inf)
-        offset = torch.minimum(self._thickness[garment].mean(dim=1), HALF * at_rest)
+        at_input = (near.weight.unsqueeze(2) * self._base[corners]).sum(dim=1).norm(dim=1)
+        thickness = self._thickness[garment].mean(dim=1)
+        offset = torch.minimum(torch.minimum(thickness, HALF * at_rest), torch.maximum(at_input, LEAST * thickness))
         distance, way = near.way.norm(dim=1), near.way
         if order and self._lasting.layers is not None:
             wrong, most = self._lasting.layers.wrong(self._level, near, x), OUT * float(self._level.spacing.mean())

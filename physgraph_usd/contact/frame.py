@@ -222,7 +222,7 @@ class FrameContact:
                 bodies.lose(base)
             cloth = promise = None
             if self._cloth is not None:
-                own = {"thickness": self._thickness, "settings": self._settings, "seam": seam}
+                own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
                 cloth = ClothView(self._cloth, level, **own)
                 promise = Promise(cloth, FLOOR * float(self._thickness.min())) if cloth.keeps_sides else None
             target = self._target if finest else None

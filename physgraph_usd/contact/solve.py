@@ -15,8 +15,10 @@ from ..level import Level
 from .frame import LevelContact, Touch
 from .metric import SMOOTH, HeldMetric
 
-ROUNDS, STEPS = 10, 4
-"""Most rounds of a level, and steps of each."""
+STEPS, LONGEST = 4, 16
+"""Steps of a round where something is near, and where nothing is: then pairs are found anew."""
+MOST, TOUCHING = 40, 3
+"""Steps of a level where something touches: so many times the budget's, but no more than the first, or the budget's."""
 NEAR = 10.0
 """Tolerances of remaining move under which a warm frame makes no more steps than its budget has."""
 UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
@@ -58,20 +60,28 @@ def solve_touching(
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
         x = view.moved(x, leave_saddle(make_system(view.terms(x), x, None), level, x, outward=outward))
-    carry, last, terms, listed = None, None, (), None
-    for number in range(ROUNDS):
+    carry, last, terms, listed, made, touched = None, None, (), None, 0, False
+    while not made or made < _most(budget, reports[-1], touched=touched):
         listed = view.listed(x, listed)
         terms = view.terms(x, listed=listed)
+        touched |= bool(terms)
         system = make_system(terms, x, last)
         resume = carry if last is not None and system.shares_metric(last) else None
-        of_round = _budget_of(budget, system, first=not number)
+        of_round = _budget_of(budget, system, first=not made, steps=STEPS if terms else LONGEST)
         y, report, ended = _descended(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         reports.append(report)
+        made += report.steps
         x, last = view.moved(x, y, listed), system
         carry = ended if x is y else None if ended.setbacks else replace(ended, x=x)
-        if _ends(report, short=x is not y) or (smoothing is None and _serves(report, budget, number + 1)):
+        if _ends(report, short=x is not y) or (smoothing is None and _serves(report, budget, made)):
             break
     return x, reports, terms
+
+
+def _most(budget: Budget, report: LevelReport, *, touched: bool) -> int:
+    """How many steps a level makes, by its last round's report: more where something touches or it is far from rest."""
+    most = budget.steps + budget.extra * budget.is_far(report.remaining_move)
+    return max(most, min(MOST, TOUCHING * budget.steps)) if touched else most
 
 
 def _ends(report: LevelReport, *, short: bool) -> bool:
@@ -79,9 +89,9 @@ def _ends(report: LevelReport, *, short: bool) -> bool:
     return report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not short)
 
 
-def _serves(report: LevelReport, budget: Budget, rounds: int) -> bool:
+def _serves(report: LevelReport, budget: Budget, made: int) -> bool:
     """Whether a warm frame has made its steps and is near enough to rest."""
-    return rounds * STEPS >= budget.steps and report.remaining_move < NEAR * budget.tolerance
+    return made >= budget.steps and report.remaining_move < NEAR * budget.tolerance
 
 
 def _drawn_out(
@@ -108,11 +118,11 @@ def _drawn_out(
     return view.without_hope(x, start) if cold else x, reports
 
 
-def _budget_of(budget: Budget, system: System, *, first: bool) -> Budget:
+def _budget_of(budget: Budget, system: System, *, first: bool, steps: int) -> Budget:
     """The budget of a round: what a held metric calls a small move is that much smaller."""
     shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
     rest = budget.rest if first else 1.0
-    return replace(budget, steps=min(STEPS, budget.steps), extra=0, tolerance=shrunk * budget.tolerance, rest=rest)
+    return replace(budget, steps=min(steps, budget.steps), extra=0, tolerance=shrunk * budget.tolerance, rest=rest)
 
 
 def _descended(
