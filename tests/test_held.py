@@ -46,10 +46,6 @@ class TestSlowing:
         found = [slowing(30, part * STILL)[1] for part in (0.999, 0.5, 0.25)]
         assert found == pytest.approx([1.0, 4.0, 16.0], rel=3e-3)
 
-    def test_a_frame_counts_once(self):
-        assert slowing(3, 0.0, again=True) == (3, SLOWER**3)
-        assert slowing(0, 0.0, again=True) == (0, 1.0)
-
 
 class TestHowFarABodyMoved:
     def test_a_mesh(self):
