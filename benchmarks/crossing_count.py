@@ -6,12 +6,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 ROUNDING = 2.4e-7
-"""Of the largest coordinate: ends nearer to a face's plane lie in it, but for the rounding of single precision."""
+"""Of the largest coordinate: an edge nearer to a face's plane lies in it, but for the rounding of single precision."""
 AT_ONCE = 200_000
 """Edges and faces that are tested at once."""
 
 
-def crossing_count(points: np.ndarray, edges: np.ndarray, triangles: np.ndarray, same: np.ndarray | None = None) -> int:
+def crossing_count(
+    points: np.ndarray, edges: np.ndarray, triangles: np.ndarray, *, same: np.ndarray | None = None
+) -> int:
     """Count the pairs of an edge and a face it passes through, without those that share a vertex.
 
     Args:
@@ -65,7 +67,7 @@ def _through(points: np.ndarray, edge: np.ndarray, face: np.ndarray, label: np.n
 
     first, last = volume(p, q, r, a), volume(p, q, r, b)
     least = ROUNDING * np.abs(points).max(initial=0.0) * np.linalg.norm(np.cross(q - p, r - p), axis=1)
-    split = (first * last < 0) & (np.abs(first) > least) & (np.abs(last) > least)
+    split = (first * last < 0) & ((np.abs(first) > least) | (np.abs(last) > least))
     turns = np.stack([volume(a, b, p, q), volume(a, b, q, r), volume(a, b, r, p)], axis=1)
     inside = (turns > 0).all(axis=1) | (turns < 0).all(axis=1)
     return int((split & inside).sum())

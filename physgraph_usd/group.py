@@ -291,7 +291,9 @@ class Group:
         """Walk the levels; a warm start goes to the finest. Also says why."""
         predicted, last = start.detailed, len(self.levels) - 1
         choice = self._choose(forces[0], coarse, contact, warm=predicted is not None)
-        first = 0 if choice.nested else last
+        # What crosses is drawn apart at the cage.
+        crossed = predicted is None and contact is not None and contact.crossed
+        first = 0 if choice.nested or crossed else last
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         below, smooth = coarse, self.levels[first].smooth_base
         reports: list[LevelReport] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -186,7 +187,8 @@ class TestLeftOut:
         beside = refiner((MESH, REST)).solve(frame(draped(0.0), far))
         np.testing.assert_array_equal(alone.points[0], beside.points[0])
         assert beside.telemetry[0]["near"] == []
-        assert "bodies" not in beside.telemetry[0].get("contact", {})
+        told: Any = beside.telemetry[0].get("contact", {})
+        assert "bodies" not in told
 
     def test_a_body_near_the_bounds_that_nothing_reaches_changes_no_bit(self):
         close = mesh_pose((ball()[0] + np.array([0.0, 0.33, 0.0]), ball()[1]))

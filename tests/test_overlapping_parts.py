@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import torch
 from bodies import ball, box, surfaces, together
-from folds import EDGE, levels_of, named, square
+from folds import levels_of, named, square
 
 from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact.bodies import FrameBodies, LevelBodies, Touching
-from physgraph_usd.contact.cloth import ClothContact
-from physgraph_usd.contact.frame import FrameContact
 from physgraph_usd.contact.measure import depths, pinched
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.level import Level
@@ -153,26 +151,3 @@ class TestLost:
         out = view.push_out(x)
         inner = level.rest[:, [0, 2]].norm(dim=1) < 0.02
         assert float((out[inner] - torch.tensor([0.0, -0.005, 0.0])).norm(dim=1).min()) > 0.0299
-
-
-class TestWrinkles:
-    @pytest.mark.parametrize("size", [0.0, 0.1])
-    def test_between_parts_they_are_laid_smooth_where_more_would_cross_the_body(self, size: float):
-        """Whatever the solve leaves there: here noise, or the cage drawn taut, which comes out at another place."""
-        levels = levels_of(SHEET)
-        cage = torch.as_tensor(SHEET.rest, dtype=torch.float32) + torch.tensor([0.0, 0.012, 0.0])
-        bodies = bodies_of(levels, cage, together(OVER, UNDER))
-        cloth = ClothContact(levels, [SHEET])
-        contact = FrameContact(levels, cage, bodies=bodies, cloth=cloth, thickness=[0.001], settings=SETTINGS)
-        level = levels[-1]
-        base, lens = level.base.apply(contact.aim), lens_of(level)
-        noise = torch.as_tensor(np.random.default_rng(3).normal(size=(len(base), 3))) * size * EDGE
-        view = contact.at(level).bodies
-        assert view is not None
-        rough = torch.where(lens.unsqueeze(1), base + noise.to(base), base)
-        out, _ = contact.finish(rough)
-        told: Any = contact.measure(out)[0]["bodies"]
-        before, after = told["/Body0"]["before"], told["/Body0"]["after"]
-        assert view.crossings(rough) > before["crossings"]
-        assert after["crossings"] <= before["crossings"]
-        assert (after["inside"], after["pinched"] > 0) == (0, True)

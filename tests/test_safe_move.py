@@ -161,7 +161,7 @@ class TestWhatIsFreeToGoGoes:
     def test_what_is_in_one_tangle_goes_through_itself_wherever_it_is_wanted(self):
         scenes = Scenes(2, gap=0.1, far=0.0, dtype=torch.float64)
         wanted = torch.as_tensor(mirrored(scenes.start, np.random.default_rng(1)))
-        whole = torch.as_tensor(scenes.owner.astype(np.int32))
+        whole = torch.as_tensor(np.asarray(scenes.owner, np.int32))
         assert safe_move(scenes.x, wanted, scenes.parts, floor=1e-6, tangle=torch.zeros_like(whole)).x is wanted
 
     def test_but_not_through_another_nor_through_what_is_in_none(self):
@@ -170,10 +170,11 @@ class TestWhatIsFreeToGoGoes:
         for number in range(3):
             own = scenes.owner == number
             wanted[own] = mirrored(wanted[own], rng)
-        tangle = torch.as_tensor(scenes.owner.astype(np.int32))
+        tangle = torch.as_tensor(np.asarray(scenes.owner, np.int32))
         tangle[tangle == 2] = -1
         moved = safe_move(scenes.x, torch.as_tensor(wanted), scenes.parts, floor=1e-6, tangle=tangle)
-        own, none = scenes.owner < 2, scenes.owner == 2
+        owner = np.asarray(scenes.owner)
+        own, none = owner < 2, owner == 2
         np.testing.assert_array_equal(moved.x.numpy()[own], wanted[own])
         assert moved.short.numpy()[none].any()
 

@@ -62,7 +62,7 @@ def is_through(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, t: wp.vec3i):
         return False
     size = wp.max(wp.max(wp.abs(p), wp.abs(q)), wp.max(wp.abs(a), wp.abs(b)))
     rounding = ROUNDING * wp.max(size[0], wp.max(size[1], size[2])) * wp.length(wp.cross(q - p, r - p))
-    if wp.abs(near) <= rounding or wp.abs(far) <= rounding:
+    if wp.abs(near) <= rounding and wp.abs(far) <= rounding:
         return False
     first = turns_left(x, e, t[0], t[1])
     return turns_left(x, e, t[1], t[2]) == first and turns_left(x, e, t[2], t[0]) == first

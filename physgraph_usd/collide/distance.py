@@ -52,21 +52,24 @@ def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     aa, cc, ac = wp.dot(first, first), wp.dot(second, second), wp.dot(first, second)
     wa, wc = wp.dot(way, first), wp.dot(way, second)
     size = aa * cc - ac * ac
+    best = wp.vec4d(one, zero, zero, zero)
+    least = wp.float64(1.0e300)
     if size > FLAT * aa * cc:
         s, t = (ac * wc - wa * cc) / size, (aa * wc - ac * wa) / size
         if s >= zero and s <= one and t >= zero and t <= one:
-            return wp.vec4d(one - s, s, t - one, -t)
-    best = wp.vec4d(one, zero, zero, zero)
-    least = wp.float64(1.0e300)
+            # Of edges that are all but parallel rounding decides where: an end may be nearer.
+            best = wp.vec4d(one - s, s, t - one, -t)
+            gap = way + s * first - t * second
+            least = wp.dot(gap, gap)
     for end in range(4):
         # One edge's end, and the closest point of the other edge.
         from_first = end < 2
         p = wp.where(end == 0, a, wp.where(end == 1, b, wp.where(end == 2, c, d)))
         near, far = wp.where(from_first, c, a), wp.where(from_first, d, b)
         t = along(p, near, far)
-        gap = p - near - t * (far - near)
-        if wp.dot(gap, gap) < least:
-            least = wp.dot(gap, gap)
+        from_end = p - near - t * (far - near)
+        if wp.dot(from_end, from_end) < least:
+            least = wp.dot(from_end, from_end)
             last = wp.float64(end % 2)
             if from_first:
                 best = wp.vec4d(one - last, last, t - one, -t)

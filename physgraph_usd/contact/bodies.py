@@ -153,10 +153,6 @@ class LevelBodies:
             held |= pinned
         return inside, held
 
-    def crossings(self, x: Float[Tensor, "vertices 3"]) -> int:
-        """How many edges of cloth pass through bodies at x [m], and of bodies through cloth."""
-        return sum(len(self._pierced(track, x)) for track in self._tracks)
-
     def lose(self, x: Float[Tensor, "vertices 3"]) -> None:
         """From now on leave cloth that is between overlapping parts of a body at x [m] to itself while inside that.
 

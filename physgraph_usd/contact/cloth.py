@@ -115,13 +115,17 @@ class ClothView:
         """
         self.mesh, self.keeps_sides = lasting.mesh(level, seam), settings.cloth == "pairs"
         self._lasting, self._level, self._settings, self._thickness = lasting, level, settings, thickness
-        self._base = base
+        self._base, self._seam = base, seam
         self._looked: _Looked | None = None
 
     @property
     def parts(self) -> Parts:
         """What may touch what, sewn as in this frame."""
         return self.mesh.parts
+
+    def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions with their seams closed [m]."""
+        return x if self._seam is None else self._seam.closed(x)
 
     @property
     def gap(self) -> float:

@@ -191,12 +191,20 @@ class FrameContact:
 
     @cached_property
     def aim(self) -> Float[Tensor, "coarse 3"]:
-        """The cage that the fine cloth follows [m]: the input, but for what is between overlapping parts of a body."""
-        cage = self._levels[0]
-        if self._cloth is None or self._bodies is None:
-            return self._coarse
-        bodies, seam = self._bodies.at(cage, self._levels[-1]), self._seam_at(cage, self._coarse)
-        out = repaired_cage(cage, self._coarse, bodies=bodies, mesh=self._cloth.mesh(cage, seam))
+        """The cage that the fine cloth follows [m]: the input, but for what is between overlapping parts of a body.
+
+        And but for a cage that crosses and comes clean: the guide would draw cloth through itself.
+        """
+        cage, out = self._levels[0], self._coarse
+        if self._cloth is None:
+            return out
+        seam = self._seam_at(cage, out)
+        mesh = self._cloth.mesh(cage, seam)
+        if self._bodies is not None:
+            out = repaired_cage(cage, out, bodies=self._bodies.at(cage, self._levels[-1]), mesh=mesh)
+        if self._settings.cloth == "pairs":
+            apart, before, after = drawn_apart(mesh, out, gap=float(self._thickness.mean()))
+            out = apart if before and not after else out
         return out if seam is None or out is self._coarse else seam.closed(out)
 
     @property

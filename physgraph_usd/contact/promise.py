@@ -86,5 +86,5 @@ class Promise:
             rest = wanted.double() - x.double()
             against = (rest * moved.clear).sum(dim=1, keepdim=True).clamp_max(0.0)
             along = (x.double() + rest - against * moved.clear).to(wanted)
-            wanted = torch.where(moved.short.unsqueeze(1), along, wanted)
+            wanted = self.view.closed(torch.where(moved.short.unsqueeze(1), along, wanted))
         return x
