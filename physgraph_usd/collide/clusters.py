@@ -19,7 +19,7 @@ class Clusters:
 
     Attributes:
         count: Number of clusters.
-        vertices: Warp arrays: the first vertex of each cluster, the vertices in the clusters' order.
+        vertices: Warp arrays: the first vertex of each cluster, the faces' corners in the clusters' order.
         edges: Warp arrays: the first edge of each cluster, the edges' ends in the clusters' order, their numbers.
         faces: Warp arrays: the same of the faces, which belong where their first corners do.
         garment: Warp array: the garment of each cluster.
@@ -44,7 +44,9 @@ class Clusters:
         self.faces = (self._array(first), self._array(triangles[members], wp.vec3i), self._array(members))
         first, members = _by_owner(owner, self.count)
         self.edges = (self._array(first), self._array(edges[members], wp.vec2i), self._array(members))
-        self.vertices = tuple(self._array(each) for each in _by_owner(cluster, self.count))
+        corners = np.unique(triangles)  # A vertex of no face is no cloth.
+        first, members = _by_owner(cluster[corners], self.count)
+        self.vertices = self._array(first), self._array(corners[members])
         garment = np.zeros(self.count, np.int32)
         garment[cluster] = level.vertex_garment.cpu().numpy()
         self.garment = self._array(garment)
