@@ -291,9 +291,8 @@ class Group:
         """Walk the levels; a warm start goes to the finest. Also says why."""
         predicted, last = start.detailed, len(self.levels) - 1
         choice = self._choose(forces[0], coarse, contact, warm=predicted is not None)
-        # What crosses is drawn apart at the cage.
-        crossed = predicted is None and contact is not None and contact.crossed
-        first = 0 if choice.nested or crossed else last
+        # What crosses in a cold frame is drawn apart at the cage.
+        first = 0 if choice.nested or (predicted is None and contact is not None and contact.crossed) else last
         x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
         below, smooth = coarse, self.levels[first].smooth_base
         reports: list[LevelReport] = []
