@@ -308,7 +308,7 @@ class Group:
             tie = None if warm is None or self._settings.temporal != "tether" else (pull, warm)
             budget = self._settings.budget(last - index, clock, more=choice.steps, warm=warm is not None)
             smoothing = None if warm is not None else lasting.without_facets(x, below, smooth)
-            if view is not None and smoothing is not None and level.flat_from_below is not None and index > first:
+            if view is not None and smoothing is not None and level.flat_from_below is not None and view.crosses(x):
                 flat = level.flat_from_below.apply(below)
                 x, smoothing = flat, x + smoothing - flat
             if view is not None and warm is not None and before is not None:

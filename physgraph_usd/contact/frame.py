@@ -281,5 +281,6 @@ class FrameContact:
             said |= self._bodies.measure(finest, base, x, lost=lost)
         if view.cloth is not None:
             cloth, crossing = view.cloth.measure(view.closed(base), x)
-            said |= {"cloth": cloth}
+            near = any(each["crossings"] for each in cloth.values()) or view.cloth.term(x) is not None
+            said |= {"cloth": cloth} if near else {}
         return said, crossing
