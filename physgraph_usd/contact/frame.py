@@ -281,6 +281,7 @@ class FrameContact:
             said |= self._bodies.measure(finest, base, x, lost=lost)
         if view.cloth is not None:
             cloth, crossing = view.cloth.measure(view.closed(base), x)
-            near = any(each["crossings"] for each in cloth.values()) or view.cloth.term(x) is not None
+            near = view.seam is not None or any(each["crossings"] for each in cloth.values())
+            near = near or view.cloth.term(x) is not None
             said |= {"cloth": cloth} if near else {}
         return said, crossing
