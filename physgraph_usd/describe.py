@@ -58,7 +58,7 @@ def say_what_was(report: RefineReport) -> None:
     """Say who made the steps, and move contact of cloth with cloth to what is left out where no frame needed it."""
     entries = [entry for frame in report.frames for entry in frame.get("garments", ())]
     _say_who_integrated(report, entries)
-    if any("cloth" in entry.get("contact", {}) for entry in entries):
+    if any(entry.get("contact", {}).get("cloth", {}).get("near") for entry in entries):
         return
     if report.modelled.pop("self contact", None):
         report.left_out["self contact"] = "no two parts of the cloth came near one another in any frame"

@@ -281,7 +281,6 @@ class FrameContact:
             said |= self._bodies.measure(finest, base, x, lost=lost)
         if view.cloth is not None:
             cloth, crossing = view.cloth.measure(view.closed(base), x)
-            near = view.seam is not None or any(each["crossings"] for each in cloth.values())
-            near = near or view.cloth.term(x) is not None
-            said |= {"cloth": cloth} if near else {}
+            near = view.cloth.term(x) is not None or any(each["crossings"] for each in cloth.values())
+            said["cloth"] = {"near": near, **cloth}
         return said, crossing
