@@ -95,6 +95,7 @@ class Group:
         at: float | None,
         touching: Sequence[Touching] = (),
         moved: float = np.inf,
+        cage: np.ndarray | None = None,
     ) -> Solved:
         """Solve one frame.
 
@@ -104,6 +105,8 @@ class Group:
             at: The time code, for errors.
             touching: Surfaces that the garments may touch.
             moved: As `start_of` takes it.
+            cage: World positions that the cage walked to from an earlier frame [m], shape (C, 3): where a cold frame
+                starts; or None.
 
         Raises:
             SolveError: A term of the potential is not finite.
@@ -119,14 +122,13 @@ class Group:
             before = None if kept is None else kept.about(origin)
             if contact is not None and before is not None and kept is not None and kept.clean:
                 contact.at(self.levels[-1]).remember(before)
-            x, reports, module, told = self._descend(forces, aim, start, clock, contact=contact, before=before)
+            own = {"before": before, "cage": None if cage is None else self._tensor(cage - origin)}
+            x, reports, module, told = self._descend(forces, aim, start, clock, contact=contact, **own)
         except SolveError as error:
             raise SolveError(blame(self.garments, forces[-1], coarse, error=error, at=at)) from error
         result = self._scaled(aim, x, frames, at=at)
-        finished: dict[str, object] = {}
         clean = contact is not None and not contact.at(self.levels[-1]).crosses(x)
-        if contact is not None:
-            result, finished = contact.finish(result)
+        result, finished = (result, {}) if contact is None else contact.finish(result)
         solved = time.perf_counter()
         carried = self._carried(coarse, x, world, origin=origin, held=start.held, clean=clean)
         strain = edge_strain(self.levels[-1], result)
@@ -287,13 +289,14 @@ class Group:
         *,
         contact: FrameContact | None,
         before: Tensor | None = None,
+        cage: Tensor | None = None,
     ) -> tuple[Tensor, list[LevelReport], ForceModule, dict[str, object]]:
         """Walk the levels; a warm start goes to the finest. Also says why."""
         predicted, last = start.detailed, len(self.levels) - 1
         choice = self._choose(forces[0], coarse, contact, warm=predicted is not None)
         # What crosses in a cold frame is drawn apart at the cage.
         first = 0 if choice.nested or (predicted is None and contact is not None and contact.crossed) else last
-        x = predicted if predicted is not None else self.levels[first].base.apply(coarse)
+        x = self.levels[first].base.apply(coarse if cage is None or first else cage) if predicted is None else predicted
         below, smooth = coarse, self.levels[first].smooth_base
         reports: list[LevelReport] = []
         module = ForceModule(())

@@ -76,6 +76,7 @@ class Refiner:
         self._before: list[Known | None] = [None] * len(scene.garments)
         self._unsolved = set[int]()  # Garments whose last result is no solution.
         self._time: float | None = None
+        self._walked: tuple[list[np.ndarray | None], float] | None = None
 
     @staticmethod
     def subdivide(scene: Scene, levels: Sequence[int]) -> list[tuple[Refinement, ...]]:
@@ -100,7 +101,25 @@ class Refiner:
         self._passed.forget()
         self._bodies.forget()
         self._last, self._before = [None] * len(self._last), [None] * len(self._last)
-        self._time = None
+        self._time = self._walked = None
+
+    def begin_at(self, cages: Refiner, *, since: float) -> None:
+        """Start the first frame, where it is cold, with the cage that another refiner walked to it.
+
+        Args:
+            cages: A refiner of the same scene that does not subdivide, and has solved that frame.
+            since: The time code from which it walked, for the report.
+        """
+        self._walked = [None if each is None else each.points for each in cages._last], since
+
+    def crosses(self, frame: Frame) -> bool:
+        """Whether a cage that is to keep its sides crosses itself, or another one, in a frame."""
+        refuse_far(self._scene, frame)
+        for part in self._parts.of(frame.garments):
+            contact = self.group_of(part).potential([frame.garments[index] for index in part])[1]
+            if contact is not None and contact.crossed:
+                return True
+        return False
 
     def use(self, settings: SolveSettings) -> None:
         """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
@@ -162,7 +181,7 @@ class Refiner:
             for index, each, entry in zip(part, *self._answer(part, frame, same=same, gap=gap), strict=True):
                 if asked[index]:
                     points[index], telemetry[index] = each, entry
-        self._time = frame.time
+        self._time, self._walked = frame.time, None
         for index, passed in enumerate(self._passed.look(frame)):
             telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
         heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
@@ -215,10 +234,13 @@ class Refiner:
         kept = None if gap or len(known) < len(part) else join([each.carried for each in known])
         if kept is not None and any(each.part != part for each in known):
             kept = replace(kept, clean=False)  # What was solved apart may cross.
+        cage = None if kept is not None else self._cage_walked(part)
         while True:
             touching = self._touching(part, frames, near)
             moved = self._moved(part, frame, near, known)
-            solved = group.solve(frames, kept, at=frame.time, touching=touching, moved=moved)
+            solved = group.solve(
+                frames, kept, at=frame.time, touching=touching, moved=moved, cage=None if cage is None else cage[0]
+            )
             more = self._reached(part, frames, solved.points)
             if more <= set(near):
                 break
@@ -228,10 +250,9 @@ class Refiner:
             entry["near"] = [self._scene.colliders[each].path for each in near]
         if len(part) > 1:
             entry["together"] = [self._scene.garments[index].path for index in part]
-        if gap:
-            entry["start"] = "cold: the time between samples is too long"
-        if broken is not None:
-            entry["broken_before"] = broken
+        entry |= {"start": "cold: the time between samples is too long"} if gap else {}
+        entry |= {} if cage is None else {"start": f"cold: the cage walked here from time code {cage[1]:g}"}
+        entry |= {} if broken is None else {"broken_before": broken}
         own = split(solved.carried, group.levels[0].spans, group.levels[-1].spans)
         for place, (index, each) in enumerate(zip(part, frames, strict=True)):
             self._before[index] = last[place]
@@ -239,6 +260,13 @@ class Refiner:
                 frame.time, each, frame.colliders, near, part, solved.points[place], own[place], solved.crossing[place]
             )
         return solved.points, [entry] * len(part)
+
+    def _cage_walked(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
+        """World positions of cages that another refiner walked to this frame [m], and from which time code."""
+        if self._walked is None:
+            return None
+        found = [each for each in (self._walked[0][index] for index in part) if each is not None]
+        return (np.concatenate(found), self._walked[1]) if len(found) == len(part) else None
 
     def _broken(self, part: tuple[int, ...], frame: Frame, near: Sequence[int]) -> float | None:
         """Time code of the last frame, if garments' input left its place in it alone."""

@@ -109,6 +109,11 @@ class Shot:
         """
         return to_metres(self.stage.GetPrimAtPath(self.sources[index].path), self.metres_per_unit, time)
 
+    def times_until(self, last: float) -> list[float]:
+        """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
+        every = merge(time for source in self.sources for time in (*source.times, *source.left_out))
+        return [time for time in every if time < last] + [last]
+
     def frame(self, time: float | None) -> Frame:
         """Read one time code; None reads the default values.
 

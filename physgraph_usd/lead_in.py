@@ -1,0 +1,62 @@
+"""Where a run that begins in the middle of a shot finds its cloth: the cage walks there from an earlier frame.
+
+Cloth that walks from frame to frame crosses nothing new, but a cage that crosses in the middle of a shot cannot always
+be drawn apart by itself. An earlier one often can, and the cage alone walks at a small part of what a frame costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from .errors import SolveError, StageError
+from .pipeline import Refiner
+from .scene import Frame
+
+
+def lead_in(
+    cages: Refiner, frame_at: Callable[[float | None], Frame], times: Sequence[float]
+) -> tuple[Refiner, float] | None:
+    """Walk the cage to a run's first frame from one where it does not cross, or comes clean by itself.
+
+    That frame is looked for 1, 2, 4, 8, ... frames before; where none comes clean, it is the shot's first.
+
+    Args:
+        cages: A refiner of the shot that does not subdivide.
+        frame_at: Reads a time code; one that cannot be read or solved is left out.
+        times: The shot's time codes up to the run's first, in order.
+
+    Returns:
+        The refiner there, and the time code that it walked from; None where the first frame needs nothing of the kind,
+        or nothing comes before it.
+    """
+    last = len(times) - 1
+    try:
+        needed = last > 0 and cages.crosses(frame_at(times[last]))
+    except StageError:  # It is told of where the frame is solved.
+        needed = False
+    if not needed or _is_clean(cages, frame_at, times[last]):
+        return None
+    back = 1
+    while not _is_clean(cages, frame_at, times[max(last - back, 0)]) and back < last:
+        back *= 2
+    begun = max(last - back, 0)
+    for time in times[begun + 1 :]:
+        _solve(cages, frame_at, time)
+    return cages, times[begun]
+
+
+def _is_clean(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> bool:
+    """Whether nothing crosses in the cage that is solved at a time code by itself."""
+    cages.forget()
+    told = _solve(cages, frame_at, time)
+    return bool(told) and all(not entry["contact"]["cloth"]["after"]["crossings"] for entry in told)
+
+
+def _solve(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> list[dict[str, Any]]:
+    """What is told of each garment whose cloth may touch cloth; nothing of a frame that cannot be solved."""
+    try:
+        state: Any = cages.solve(frame_at(time))
+    except (SolveError, StageError):
+        return []
+    return [entry for entry in state.telemetry if "cloth" in entry.get("contact", {})]
