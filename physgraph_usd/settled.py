@@ -1,4 +1,4 @@
-"""Which frames the solver left unsettled or unsolved: what the warning, `--strict` and the report say of them."""
+"""Which frames the solver left unsettled, unsolved, crossed or in bodies: what warnings, `--strict` and reports say."""
 
 from __future__ import annotations
 
@@ -91,6 +91,36 @@ def told_unsettled(found: Sequence[Mapping[str, Any]]) -> list[str]:
         remedy = "cache that frame again, or leave it out with --frames"
         said += _told(path, collapsed, f"{{}}; the frame is upsampled, not solved: {remedy}", others="so it is at")
     return said
+
+
+def told_contact(path: str, entries: Mapping[float | None, Mapping[str, Any]]) -> list[str]:
+    """A warning for each kind of contact that a garment's result does not keep, with its worst frame.
+
+    Args:
+        path: The garment.
+        entries: Its telemetry by time code.
+    """
+    found: dict[str, dict[float | None, int]] = {}
+    for time, entry in entries.items():
+        contact = entry.get("contact", {})
+        found.setdefault("edges pass through cloth", {})[time] = _after(contact.get("cloth", {}), "crossings")
+        for body, told in contact.get("bodies", {}).items():
+            found.setdefault(f"vertices are left inside <{body}>", {})[time] = _after(told, "inside")
+            passing = f"vertices are inside <{body}>, which lies between them and where the cage has them"
+            found.setdefault(passing, {})[time] = _after(told, "passing")
+    said = []
+    for what, counts in found.items():
+        left = {time: count for time, count in counts.items() if count}
+        if left:
+            worst = max(left, key=lambda time: left[time])
+            others = f", and fewer in {len(left) - 1} other frames" if len(left) > 1 else ""
+            code = "default" if worst is None else f"{worst:g}"
+            said.append(f"<{path}> at time code {code}: {left[worst]:,} {what}{others}")
+    return said
+
+
+def _after(told: Mapping[str, Any], name: str) -> int:
+    return int(told.get("after", {}).get(name, 0))
 
 
 def _told(path: str, entries: Sequence[Mapping[str, Any]], said: str, *, others: str) -> list[str]:

@@ -29,7 +29,7 @@ from .pipeline import Refiner
 from .processes import call_each, memory_is_named
 from .report import RefineReport
 from .resolution import too_coarse
-from .settled import told_unsettled, unsettled_frames
+from .settled import told_contact, told_unsettled, unsettled_frames
 from .usd.atomic import check_place
 from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
 from .usd.provenance import FAILED, UNSETTLED, asset_path, file_hashes, is_result_of, write_root
@@ -361,7 +361,13 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
 
 def _of_frames(report: RefineReport) -> list[str]:
     """What frames say that the user should know."""
-    return [*_coarse_garments(report), *_passed(report), *_broken(report), *told_unsettled(report.unsettled)]
+    return [
+        *_coarse_garments(report),
+        *_of_garments(report, told, "passed_through"),
+        *_of_garments(report, told_broken, "broken_before"),
+        *_of_garments(report, told_contact),
+        *told_unsettled(report.unsettled),
+    ]
 
 
 def _coarse_garments(report: RefineReport) -> list[str]:
@@ -374,23 +380,13 @@ def _coarse_garments(report: RefineReport) -> list[str]:
     return [warning for warning in said if warning]
 
 
-def _passed(report: RefineReport) -> list[str]:
-    """A warning for each body that a coarse garment passes right through."""
+def _of_garments(report: RefineReport, tell: Callable[[str, Any], list[str]], name: str | None = None) -> list[str]:
+    """What a function of a garment's path and entries by time code warns of; of the entries with a name, that of it."""
     said = []
     for index, garment in enumerate(report.garments):
         entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
-        said += told(garment["path"], {t: e["passed_through"] for t, e in entries.items() if "passed_through" in e})
-    return said
-
-
-def _broken(report: RefineReport) -> list[str]:
-    """A warning for each frame in which the input left its place for that frame alone."""
-    said = []
-    for index, garment in enumerate(report.garments):
-        entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
-        said += told_broken(
-            garment["path"], {t: e["broken_before"] for t, e in entries.items() if "broken_before" in e}
-        )
+        given = entries if name is None else {time: each[name] for time, each in entries.items() if name in each}
+        said += tell(garment["path"], given)
     return said
 
 

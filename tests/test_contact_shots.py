@@ -20,8 +20,7 @@ SHOTS: dict[str, tuple[list[str], list[str], tuple[float, float]]] = {
     "12_variants/b_winding_flipped_unflagged.usdc": (["/shot/shirt"], ["/shot/body"], (6, 7)),
 }
 CAUGHT = {
-    "01_newton_shirt_dab_cm.usdc": pytest.mark.xfail(reason="cloth is held by cloth: 72 vertices stay inside (was 0)"),
-    "09_cesiumman_kilt/shot.usda": pytest.mark.xfail(reason="a hand sweeps through: 19 stay inside (was 0)"),
+    "09_cesiumman_kilt/shot.usda": pytest.mark.xfail(reason="a hand sweeps through: one vertex stays 0.107 mm inside"),
 }
 """Where cloth may not newly cross, and so cannot leave the body."""
 
@@ -40,7 +39,8 @@ def check(report: Any) -> list[dict[str, Any]]:
     measured = bodies_of(report)
     for body in measured:
         assert body["after"]["inside"] == 0, body
-        assert body["after"]["crossings"] <= body["before"]["crossings"], body
+        through = body["after"]["passing"]  # The body comes through the cloth around what it lets through.
+        assert through or body["after"]["crossings"] <= body["before"]["crossings"], body
     return measured
 
 

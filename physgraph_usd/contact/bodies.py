@@ -175,6 +175,11 @@ class LevelBodies:
         """The vertices that each body lost; None where there are none."""
         return tuple(track.lost for track in self._tracks)
 
+    @property
+    def passing(self) -> tuple[Bool[Tensor, " vertices"] | None, ...]:
+        """The vertices that each body lets through; None where it lets none."""
+        return tuple(track.passing for track in self._tracks)
+
     def _out(self, x: Tensor) -> tuple[Tensor, int]:
         """Push out to the least clearance, body by body; the positions and the passes made.
 
@@ -329,6 +334,7 @@ class FrameBodies:
         x: Float[Tensor, "vertices 3"],
         *,
         lost: Sequence[Bool[Tensor, " vertices"] | None] = (),
+        passing: Sequence[Bool[Tensor, " vertices"] | None] = (),
     ) -> dict[str, object]:
         """What is in each body and what crosses it, before and after, as plain values.
 
@@ -337,20 +343,22 @@ class FrameBodies:
             base: The upsampled cage [m].
             x: The result [m].
             lost: `LevelBodies.lost`.
+            passing: `LevelBodies.passing`.
         """
         bodies: dict[str, object] = {}
-        lost = lost or [None] * len(self._tracks)
-        known = zip(self.touching, self._tracks, self.distances, self._inside, lost, strict=True)
-        for index, (each, track, before, inside, own) in enumerate(known):
+        lost, passing = (given or [None] * len(self._tracks) for given in (lost, passing))
+        known = zip(self.touching, self._tracks, self.distances, self._inside, lost, passing, strict=True)
+        for index, (each, track, before, inside, own, through) in enumerate(known):
             surface, shift = each.surface, track.shift
             # What was farther outside a closed surface than it moved since still is; of an open one it may be behind.
             least = self._known_last(index, finest).least(x) if surface.closed else None
             reach = float(finest.spacing.max())
             after = signed_distances(surface, x + shift, finest.edges, reach=reach, least=least)
             after = torch.where(track.offset.isfinite(), after, torch.full_like(after, float("inf")))
-            through, longest = len(track.pierced(finest, x, after.abs())), track.longest
+            crossings, longest = len(track.pierced(finest, x, after.abs())), track.longest
             first = penetration(surface, finest, base + shift, before, longest=longest, inside=inside)
-            last = penetration(surface, finest, x + shift, after, longest=longest, lost=own, crossings=through)
+            left = {"lost": own, "passing": through, "crossings": crossings}
+            last = penetration(surface, finest, x + shift, after, longest=longest, **left)
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {"before": asdict(first), "after": asdict(last)}
         return {"bodies": bodies}

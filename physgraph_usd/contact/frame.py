@@ -277,8 +277,8 @@ class FrameContact:
         base = finest.base.apply(self._coarse)
         said: dict[str, object] = {}
         if self._bodies is not None:
-            lost = () if view.bodies is None else view.bodies.lost
-            said |= self._bodies.measure(finest, base, x, lost=lost)
+            own = {} if view.bodies is None else {"lost": view.bodies.lost, "passing": view.bodies.passing}
+            said |= self._bodies.measure(finest, base, x, **own)
         if view.cloth is not None:
             cloth, crossing = view.cloth.measure(view.closed(base), x)
             near = view.cloth.term(x) is not None or any(each["crossings"] for each in cloth.values())
