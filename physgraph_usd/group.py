@@ -163,7 +163,7 @@ class Group:
         """Energy of each term [J] at the garments' world positions [m], what touches there found anew."""
         module, contact, origin = self.potential(frames, touching)
         x = self._tensor(np.concatenate(points) - origin)
-        touched = () if contact is None else contact.at(self.levels[-1]).terms(x)
+        touched = () if contact is None else contact.at(self.levels[-1]).terms(x)[1]
         return ForceModule((*module.forces, *touched)).energies(x)
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:

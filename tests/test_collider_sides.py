@@ -275,7 +275,7 @@ def test_sides_are_right_again_after_creeping_through_a_surface(seed: int):
     for step in range(40):
         height = 3e-9 * 1.3**step * (-1.0) ** step
         x = here + torch.tensor([0.0, height, 0.0])
-        which, normal, found = track.refresh(x, offset)
+        track, which, normal, found = track.refresh(x, offset)
         if abs(height) > 1e-7:
             assert len(which) == 200
             assert bool(((found > 0) == (height > 0)).all()), height

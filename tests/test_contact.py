@@ -16,6 +16,7 @@ from touching import frame, measured, mesh_pose, refiner
 import physgraph_usd.contact.bodies
 from physgraph_usd.colliders.mesh import MeshBody
 from physgraph_usd.colliders.pose import ShapePose
+from physgraph_usd.contact.push_out import no_farther
 from physgraph_usd.forces.contact import Contact, Planes
 
 MESH, REST = sheet(12, 12, 0.05)
@@ -173,11 +174,11 @@ def test_cloth_is_lifted_so_far_and_no_farther():
     way = torch.nn.functional.normalize(torch.randn((50, 3), generator=torch.Generator().manual_seed(6)), dim=1)
     length = torch.linspace(0.0, 3.0, 50)
     x, most = start + length.unsqueeze(1) * way, torch.full((50,), 1.2)
-    found = physgraph_usd.contact.bodies.no_farther(x, start, most)
+    found = no_farther(x, start, most)
     near = length <= 1.2
     assert torch.equal(found[near], x[near])
     assert torch.allclose(found[~near], (start + 1.2 * way)[~near], atol=1e-6)
-    assert physgraph_usd.contact.bodies.no_farther(x, start, 10.0 * most) is x
+    assert no_farther(x, start, 10.0 * most) is x
 
 
 class TestLeftOut:

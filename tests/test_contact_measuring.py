@@ -16,6 +16,7 @@ from touching import frame, measured, mesh_pose, refiner
 from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact.bodies import FrameBodies, Touching
+from physgraph_usd.contact.push_out import projected
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.level import Level
 from physgraph_usd.options import RefineOptions
@@ -86,16 +87,16 @@ class TestBodies:
         """What it found outside is not asked for again, where it has not moved into a body since; all else is."""
         bodies, level, base = self.begun()
         view, normal = bodies.at(level, level), torch.as_tensor(NORMAL, dtype=base.dtype)
-        view.term(base - 0.04 * normal)
-        out = view.project(base - 0.04 * normal)[0]
+        view, _ = view.seen(base - 0.04 * normal)
+        view, out, _ = projected(view, base - 0.04 * normal)
         x = out - depth * normal * (torch.arange(len(out)) % 3 == 0).unsqueeze(1)
         fresh = self.begun()[0].measure(level, base, x)
         asked, closest = list[int](), MeshSurface.closest
         monkeypatch.setattr(
             MeshSurface, "closest", lambda self, x, reach: asked.append(len(x)) or closest(self, x, reach)
         )
-        assert bodies.measure(level, base, x) == fresh
-        unknown = int((view._tracks[0].least(x) <= 0).sum())
+        assert bodies.measure(level, base, x, view=view) == fresh
+        unknown = int((view.tracks[0].least(x) <= 0).sum())
         assert unknown > 20 if depth else unknown == 0
         assert max(asked, default=0) <= unknown < 0.5 * len(x)
 

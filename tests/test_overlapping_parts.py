@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.contact.bodies import FrameBodies, LevelBodies, Touching
 from physgraph_usd.contact.measure import depths, pinched
+from physgraph_usd.contact.push_out import pushed_out
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.level import Level
 from physgraph_usd.mesh.topology import patches_with
@@ -94,17 +96,16 @@ class TestLost:
         levels = levels_of(SHEET)
         cage = torch.as_tensor(SHEET.rest, dtype=torch.float32) + torch.tensor([0.0, height, 0.0])
         view, x = bodies_of(levels, cage, *soups).at(levels[-1], levels[-1]), levels[-1].base.apply(cage)
-        view.lose(x)
-        return levels[-1], view, x
+        return levels[-1], view.losing(x), x
 
     def test_cloth_right_through_an_overlap_is_lost_there(self):
         level, view, x = self.view(together(OVER, UNDER))
-        lost = view.lost[0]
+        lost = view.tracks[0].lost
         assert lost is not None
         assert int(lens_of(level).sum()) > 9
         assert bool(lost[lens_of(level, wider=-0.01)].all())
         assert not bool(lost[~lens_of(level, wider=0.01)].any())
-        out = view.push_out(x)
+        out = pushed_out(view, x)[1]
         assert torch.equal(out[lost], x[lost])
 
     def test_closest_points_of_the_upsampled_cage_are_not_asked_for_twice(self, monkeypatch: pytest.MonkeyPatch):
@@ -113,20 +114,19 @@ class TestLost:
         level, view, x = self.view(together(OVER, UNDER))
         closest = MeshSurface.closest
         monkeypatch.setattr(MeshSurface, "closest", lambda *args: asked.append(len(args[1])) or closest(*args))
-        known = view.lost[0]
-        view.lose(x)
+        known = view.tracks[0].lost
+        view = view.losing(x)
         assert not asked
-        view._tracks[0].inside = None
-        view.lose(x)
+        again = replace(view, tracks=(replace(view.tracks[0], inside=None),)).losing(x).tracks[0].lost
         assert asked
         assert known is not None
-        assert view.lost[0] is not None
-        assert torch.equal(view.lost[0], known)
+        assert again is not None
+        assert torch.equal(again, known)
         level, view, x = self.view(together(OVER, UNDER))
         asked.clear()
-        view.lose(x + torch.tensor([0.02, 0.0, 0.0]))
+        view = view.losing(x + torch.tensor([0.02, 0.0, 0.0]))
         assert asked
-        lost, away = view.lost[0], (level.rest[:, [0, 2]] + torch.tensor([0.02, 0.0])).norm(dim=1)
+        lost, away = view.tracks[0].lost, (level.rest[:, [0, 2]] + torch.tensor([0.02, 0.0])).norm(dim=1)
         lens = np.sqrt(0.15**2 - 0.13**2)
         assert lost is not None
         assert bool(lost[away < lens - 0.01].all())
@@ -134,20 +134,20 @@ class TestLost:
 
     def test_two_bodies_that_overlap_lose_none(self):
         """Each has bare faces all over: cloth between them is pushed to the middle."""
-        assert self.view(OVER, UNDER)[1].lost == (None, None)
+        assert [track.lost for track in self.view(OVER, UNDER)[1].tracks] == [None, None]
 
     def test_nor_does_a_body_whose_parts_only_graze_it(self):
         """In one part, whose face over it the other buries, but nowhere in both: it is pushed out."""
         _, view, x = self.view(together(OVER, UNDER), height=0.03)
-        assert view.lost == (None,)
-        out = view.push_out(x)
+        assert [track.lost for track in view.tracks] == [None]
+        out = pushed_out(view, x)[1]
         assert not torch.equal(out, x)
 
     def test_one_body_does_not_keep_what_another_pushes(self):
         """A third one, a small ball in the lens: what the first lost lies outside that."""
         level, view, x = self.view(together(OVER, UNDER), ball(0.03, at=(0.0, -0.005, 0.0), level=4))
-        assert view.lost[0] is not None
-        assert view.lost[1] is None
-        out = view.push_out(x)
+        assert view.tracks[0].lost is not None
+        assert view.tracks[1].lost is None
+        out = pushed_out(view, x)[1]
         inner = level.rest[:, [0, 2]].norm(dim=1) < 0.02
         assert float((out[inner] - torch.tensor([0.0, -0.005, 0.0])).norm(dim=1).min()) > 0.0299

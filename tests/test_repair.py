@@ -35,7 +35,7 @@ class TestRepairedCage:
             body, settings = Touching("/Ball", surface, (0.002,)), ContactSettings(stiffness=1.0)
             bodies = FrameBodies.begin(levels, [body], cage, origin=np.zeros(3), settings=settings)
             view = bodies.at(levels[0], levels[-1])
-            view.lose(cage)
+            view = view.losing(cage)
             mesh = ClothMesh(levels[0], np.ones((1, 1), bool), np.zeros((0, 2), np.int64))
             assert bool(view.within(cage)[0].any())
             assert repaired_cage(levels[0], cage, bodies=view, mesh=mesh) is cage

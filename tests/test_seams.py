@@ -32,6 +32,7 @@ from physgraph_usd.collide.near import near_pairs
 from physgraph_usd.collide.parts import Parts
 from physgraph_usd.collide.sweep import Reach
 from physgraph_usd.contact.bodies import LevelBodies
+from physgraph_usd.contact.push_out import projected, pushed_out
 from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.forces import elastic_terms
 from physgraph_usd.forces.base import ForceModule
@@ -209,9 +210,9 @@ def test_what_bodies_push_out_is_closed():
     bodies = LevelBodies(level, (), ContactSettings())
     opened = base + 1e-3 * noise(base)
     assert not torch.equal(seam.closed(opened), opened)
-    assert bodies.project(opened)[0] is opened
-    bodies.seam = seam
-    for out in (bodies.project(opened)[0], bodies.push_out(opened)):
+    assert projected(bodies, opened)[1] is opened
+    bodies = replace(bodies, seam=seam)
+    for out in (projected(bodies, opened)[1], pushed_out(bodies, opened)[1]):
         assert torch.equal(out, seam.closed(opened))
 
 

@@ -116,10 +116,10 @@ def test_in_a_trough_cloth_feels_both_walls():
     """Vertices near one wall move to where the other is nearer: both push, where one alone would be left through."""
     level, view = view_of(trough())
     x = torch.tensor([0.0015, 0.012, 0.0]).repeat(level.vertex_count, 1)
-    first = view.term(x)
+    view, first = view.seen(x)
     assert first is not None
     assert [each.normal.round().tolist()[0] for each in first.planes] == [[1.0, 0.0, 0.0]]
-    second = view.term(x + torch.tensor([0.0, -0.0115, 0.0]))
+    _, second = view.seen(x + torch.tensor([0.0, -0.0115, 0.0]))
     assert second is not None
     assert [each.normal.round().tolist()[0] for each in second.planes] == [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     assert [len(each.vertex) for each in second.planes] == [level.vertex_count] * 2

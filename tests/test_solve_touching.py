@@ -134,14 +134,14 @@ class TestPlanes:
         closest = MeshSurface.closest
         monkeypatch.setattr(MeshSurface, "closest", lambda self, x, reach: asked.append(x) or closest(self, x, reach))
         x = level.rest.clone()
-        first = view.term(x)
+        view, first = view.seen(x)
         assert first is not None
         seen = first.planes[0].vertex.long()
         assert len(asked.pop()) >= len(seen) > 20
         moved = x + 0.5 * STALE * level.spacing.unsqueeze(1) * torch.tensor([0.0, 1.0, 0.0])
         one = int(seen[len(seen) // 2])
         moved[one, 0] += 3.0 * STALE * float(level.spacing[one])
-        second = view.term(moved)
+        _, second = view.seen(moved)
         assert second is not None
         again = (asked[0].unsqueeze(1) == (moved[seen] - torch.as_tensor(surface.origin)).to(x)).all(dim=2).any(dim=0)
         assert seen[again].tolist() == [one]

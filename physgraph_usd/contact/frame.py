@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -18,10 +18,11 @@ from ..integrate.base import Preconditioner
 from ..integrate.metric import Metric
 from ..level import Level
 from .apart import drawn_apart
-from .bodies import FrameBodies, LevelBodies, moves
+from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
 from .metric import HeldMetric
 from .promise import Promise
+from .push_out import moves, projected
 from .repair import repaired_cage
 from .seams import Seams
 from .settings import ContactSettings
@@ -112,12 +113,14 @@ class LevelContact:
 
     def terms(
         self, x: Float[Tensor, "vertices 3"], *, listed: Listed | None = None, order: bool = False
-    ) -> tuple[Touch, ...]:
-        """The forces of what is near positions x [m]; empty where nothing is. The rest is as for `ClothView.term`."""
-        self._let_through(x)
-        bodies = None if self.bodies is None else self.bodies.term(x)
+    ) -> tuple[LevelContact, tuple[Touch, ...]]:
+        """The view from positions x [m], and the forces of what is near them; none where nothing is.
+
+        The rest is as for `ClothView.term`.
+        """
+        seen, body = (None, None) if self.bodies is None else self._letting_through(self.bodies, x).seen(x)
         cloth = None if self.cloth is None else self.cloth.term(x, listed, order=order)
-        return tuple(term for term in (bodies, cloth) if term is not None)
+        return replace(self, bodies=seen), tuple(term for term in (body, cloth) if term is not None)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with their seams closed [m]."""
@@ -141,20 +144,22 @@ class LevelContact:
 
     def out_of_bodies(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], int]:
         """Positions moved safely out of bodies [m], x itself where none had to be, and the passes made."""
-        passes = 0
-        for _ in range(PUSHES if self.bodies is not None else 0):
-            assert self.bodies is not None
-            self._let_through(x)
-            out, more = self.bodies.project(x)
+        passes, bodies = 0, self.bodies
+        for _ in range(PUSHES if bodies is not None else 0):
+            assert bodies is not None
+            bodies, out, more = projected(self._letting_through(bodies, x), x)
             start, x, passes = x, self.moved(x, out), passes + more
             if out is start or x is out:
                 break
         return x, passes
 
-    def _let_through(self, x: Tensor) -> None:
-        """Let cloth at x [m] through bodies that are between it and its target."""
-        if self.bodies is not None and self.target is not None:
-            self.bodies.let_through(x, self.target)
+    def _letting_through(self, bodies: LevelBodies, x: Tensor) -> LevelBodies:
+        """Bodies that let cloth at x [m] through where they are between it and its target."""
+        return bodies if self.target is None else bodies.letting_through(x, self.target)
+
+    def bodies_around(self, x: Float[Tensor, "vertices 3"]) -> LevelBodies | None:
+        """The view of the bodies at x [m], which lets through what they let through there."""
+        return None if self.bodies is None else self._letting_through(self.bodies, x)
 
 
 class FrameContact:
@@ -225,9 +230,7 @@ class FrameContact:
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
             seam = self._seam_at(level, base)
-            if bodies is not None:
-                bodies.seam = seam
-                bodies.lose(base)
+            bodies = None if bodies is None else replace(bodies.losing(base), seam=seam)
             cloth = promise = None
             if self._cloth is not None:
                 own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
@@ -277,8 +280,7 @@ class FrameContact:
         base = finest.base.apply(self._coarse)
         said: dict[str, object] = {}
         if self._bodies is not None:
-            own = {} if view.bodies is None else {"lost": view.bodies.lost, "passing": view.bodies.passing}
-            said |= self._bodies.measure(finest, base, x, **own)
+            said |= self._bodies.measure(finest, base, x, view=view.bodies_around(x))
         if view.cloth is not None:
             cloth, crossing = view.cloth.measure(view.closed(base), x)
             near = view.cloth.term(x) is not None or any(each["crossings"] for each in cloth.values())

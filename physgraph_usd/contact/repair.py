@@ -19,6 +19,7 @@ from ..level import Level
 from ..mesh.topology import patches_with
 from .bodies import LevelBodies
 from .cloth_mesh import ClothMesh
+from .push_out import pushed_out
 
 FAIRINGS, PASSES = 3, 2
 """How often drawn cloth is smoothed and pushed out in turn, and passes of the smoothing."""
@@ -44,7 +45,7 @@ def repaired_cage(
     around = mesh.grown(hidden, 1) & cage.free[:, 0]
     out = _membrane(x, hidden, mesh.beside)
     for _ in range(FAIRINGS):
-        out = bodies.push_out(_smoothed(out, around, mesh.beside))
+        out = pushed_out(bodies, _smoothed(out, around, mesh.beside))[1]
     return out
 
 

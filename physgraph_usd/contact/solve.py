@@ -59,11 +59,12 @@ def solve_touching(
     x, reports = _drawn_out(make_system, integrator, view.closed(x), view=view, level=level, budget=budget)
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
-        x = view.moved(x, leave_saddle(make_system(view.terms(x), x, None), level, x, outward=outward))
+        view, terms = view.terms(x)
+        x = view.moved(x, leave_saddle(make_system(terms, x, None), level, x, outward=outward))
     carry, last, terms, listed, made, touched = None, None, (), None, 0, False
     while not made or made < _most(budget, reports[-1], touched=touched):
         listed = view.listed(x, listed)
-        terms = view.terms(x, listed=listed)
+        view, terms = view.terms(x, listed=listed)
         touched |= bool(terms)
         system = make_system(terms, x, last)
         resume = carry if last is not None and system.shares_metric(last) else None
@@ -111,7 +112,7 @@ def _drawn_out(
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
         if not view.comes_apart(x, order=cold):
             break
-        terms = view.terms(x, order=cold)
+        view, terms = view.terms(x, order=cold)
         y, report = solve_level(make_system(terms, x, None), integrator, x, level=level.index, budget=short)
         x = view.drawn(x, y) if cold else view.moved(x, y)
         reports.append(report)

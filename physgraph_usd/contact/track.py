@@ -1,8 +1,11 @@
-"""What is known of the distances between one level's cloth and one body, asked anew only where it may have changed."""
+"""What is known of the distances between one level's cloth and one body, asked anew only where it may have changed.
+
+A value: what asks for more returns a new one, and asking the old one again gives the same answer.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,7 +21,7 @@ ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Track:
     """What is known of the distances between one level and one surface.
 
@@ -33,7 +36,6 @@ class Track:
         lost: Vertices that lay between overlapping parts in the input, and stay while inside, shape (V,), or None.
         passing: Vertices whose way to where they belong leads through the body, which lets them, shape (V,), or None.
         inside: Closest points of the vertices with negative distances, as they were found first; or None.
-        looked: The positions at which it was looked for crossings last, and what was found; shared by all levels.
     """
 
     surface: Surface
@@ -46,34 +48,33 @@ class Track:
     lost: Tensor | None = None
     passing: Tensor | None = None
     inside: Nearest | None = None
-    looked: list[tuple[Tensor, Pierced]] = field(default_factory=list)
 
-    def pierced(self, level: Level, x: Tensor, distance: Tensor) -> Pierced:
-        """What crosses at x [m], distances or bounds given; the answer is kept for the same tensor."""
-        if not self.looked or self.looked[0][0] is not x:
-            self.looked[:] = [(x, pierced(self.surface, level, x + self.shift, distance))]
-        return self.looked[0][1]
+    def pierced(self, level: Level, x: Tensor) -> Pierced:
+        """What goes through the body at x [m], and what it goes through."""
+        bound = (self.known.abs() - (x - self.at).norm(dim=1)).clamp_min(0.0)
+        return pierced(self.surface, level, x + self.shift, bound)
 
     def least(self, x: Tensor) -> Tensor:
         """Lower bounds of the signed distances at x [m]."""
         return self.known - MARGIN * (x - self.at).norm(dim=1) - ROUNDING
 
-    def refresh(self, x: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def refresh(self, x: Tensor, within: Tensor) -> tuple[Track, Tensor, Tensor, Tensor]:
         """Find anew what may be nearer than a distance that each vertex has [m].
 
         Returns:
-            Numbers of those vertices, their unit normals away from the surface, and the signed distances; without
-            those that are pinched.
+            What is known then, numbers of those vertices, their unit normals away from the surface, and the signed
+            distances; without those that are pinched.
         """
         moved = (x - self.at).norm(dim=1)
         which = torch.nonzero(self.known - moved < within).squeeze(1)
         if not len(which):
-            return which, x[which], moved[which]
+            return self, which, x[which], moved[which]
         asked = x[which] + self.shift
         limit = self._limit(which, within[which], moved[which])
         found = self.surface.closest(asked, limit)
         sign = self._signs(which, found, asked, moved[which])
-        self.at[which], self.known[which] = x[which], torch.minimum(found.distance, limit) * sign
+        at, known = self.at.clone(), self.known.clone()
+        at[which], known[which] = x[which], torch.minimum(found.distance, limit) * sign
         distance, point, outward = found.distance.clone(), found.point.clone(), found.normal.clone()
         within = torch.nonzero(sign < 0).squeeze(1)
         kept = distance.isfinite()
@@ -89,7 +90,7 @@ class Track:
         normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
         if self.passing is not None:
             kept &= ~self.passing[which]
-        return which[kept], normal[kept], (distance * sign)[kept]
+        return replace(self, at=at, known=known), which[kept], normal[kept], (distance * sign)[kept]
 
     def between(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Numbers of the vertices that are between overlapping parts of a closed surface at x [m]; which are in two."""
@@ -107,22 +108,22 @@ class Track:
         between = torch.nonzero(is_between(found, self.surface.exit(asked, found))).squeeze(1)
         return which[between], self.surface.inside(asked[between], parts=2)
 
-    def let_through(self, x: Tensor, target: Tensor, least: Tensor) -> None:
-        """From now on let vertices at x [m] pass whose way to a target, farther than the least, is through the body."""
-        self.passing = None
+    def letting_through(self, x: Tensor, target: Tensor, least: Tensor) -> Track:
+        """The same, which lets vertices at x [m] pass whose way to a target, farther than the least, is through it."""
         if not self.surface.closed:
-            return
+            return self
         way = target - x
         length = way.norm(dim=1)
         near = (self.known - MARGIN * (x - self.at).norm(dim=1) < length) & (length > least) & self.offset.isfinite()
         which = torch.nonzero(near).squeeze(1)
         if not len(which):
-            return
+            return replace(self, passing=None)
         through = torch.zeros_like(which, dtype=torch.bool)
         for part in THROUGH:
             through |= self.surface.inside(x[which] + part * way[which] + self.shift)
-        self.passing = torch.zeros_like(near)
-        self.passing[which[through]] = True
+        passing = torch.zeros_like(near)
+        passing[which[through]] = True
+        return replace(self, passing=passing)
 
     def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
         """How far to look for the surface: what is farther away outside is known well enough by that bound."""
