@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .colliders.pose import Pose
-from .detail import Carried
+from .frame.detail import Carried
 from .scene import GarmentFrame
 
 BACK = 0.25

@@ -14,9 +14,9 @@ from .contact.bodies import Touching
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
-from .detail import join, split
 from .errors import GarmentError
-from .group import Group
+from .frame.detail import join, split
+from .frame.group import Group
 from .history import Known, bodies_moved, came_back
 from .level import refine_garments
 from .mesh.subdivide import Refinement

@@ -18,7 +18,7 @@ from sheets import garment_of
 from physgraph_usd.cli import main
 from physgraph_usd.colliders.mesh import MeshBody
 from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate.fused import fused_physgraph
 from physgraph_usd.integrate.learned import LearnedMetric, LearnedPaper
 from physgraph_usd.integrate.metric import Metric

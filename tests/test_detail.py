@@ -9,7 +9,7 @@ from cloth import group_of, sheet, wave
 from meshes import mesh_of
 from sheets import rotation
 
-from physgraph_usd.detail import Carried, MovingFrames
+from physgraph_usd.frame.detail import Carried, MovingFrames
 
 MESH, REST = sheet(6, 4)
 GROUP = group_of(MESH, REST, level=2)

@@ -11,11 +11,11 @@ from bodies import ball
 from cloth import sheet
 from touching import frame, mesh_pose, refiner
 
-from physgraph_usd import start
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.detail import Carried, join, split
+from physgraph_usd.frame import start
+from physgraph_usd.frame.detail import Carried, join, split
+from physgraph_usd.frame.start import SLOWER, SLOWEST, STILL, slowing
 from physgraph_usd.scene import Frame
-from physgraph_usd.start import SLOWER, SLOWEST, STILL, slowing
 
 MESH, REST = sheet(8, 8, 0.05)
 HANGING = REST - REST.mean(axis=0)

@@ -16,7 +16,7 @@ from test_forces import crumple
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.forces.membrane import Membrane, in_plane_terms
 from physgraph_usd.forces.stretch import Stretch
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
 from physgraph_usd.mesh.diagonals import quad_edges

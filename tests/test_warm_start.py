@@ -14,12 +14,12 @@ from folds import frame_with, named, refiner_with, square
 
 from benchmarks.contact_shots import run
 from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
+from physgraph_usd.frame.start import STILL
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.resolution import edge_strain
 from physgraph_usd.samples import write_sample
-from physgraph_usd.start import STILL
 from physgraph_usd.usd.reader import open_shot
 
 MESH, REST = sheet(8, 6)

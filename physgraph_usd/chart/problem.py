@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..contact.settings import ContactSettings
-from ..detail import Carried
+from ..frame.detail import Carried
 from ..level import Level
 from ..options import RefineOptions
 from ..pipeline import Refiner

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..detail import Carried
+from ..frame.detail import Carried
 from ..integrate import METHODS
 from ..scene import Frame
 from ..solve_settings import SolveSettings

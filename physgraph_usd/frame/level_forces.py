@@ -11,17 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .forces import body_terms, elastic_terms
-from .forces.base import Force, ForceModule
-from .forces.guide import Guide, GuideMap
-from .forces.stretch import PAPER_SPRING, garment_area
-from .forces.tether import Tether
-from .integrate.base import System
-from .integrate.metric import Metric, kept_to_edges
-from .integrate.saddle import facets
-from .level import Level
-from .mesh.stencil import Stencil
-from .scene import Garment, GarmentFrame
+from ..forces import body_terms, elastic_terms
+from ..forces.base import Force, ForceModule
+from ..forces.guide import Guide, GuideMap
+from ..forces.stretch import PAPER_SPRING, garment_area
+from ..forces.tether import Tether
+from ..integrate.base import System
+from ..integrate.metric import Metric, kept_to_edges
+from ..integrate.saddle import facets
+from ..level import Level
+from ..mesh.stencil import Stencil
+from ..scene import Garment, GarmentFrame
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ another, and have no mean.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,27 +19,12 @@ from jaxtyping import Float
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from .level import PIN_MARGIN, Level
-from .mesh.stencil import Stencil, add_at
-from .mesh.topology import PolygonMesh
+from ..level import PIN_MARGIN, Level
+from ..mesh.stencil import Stencil, add_at
+from ..mesh.topology import PolygonMesh
 
 NEAREST = 1e-6
 """Distance under which points count as at one place, in edge lengths."""
-
-
-@dataclass(frozen=True)
-class Reset:
-    """When a frame starts cold.
-
-    Attributes:
-        move: RMS motion of the cage between samples, in mean cage edges, above which detail is dropped.
-        turn: RMS rotation of the frames [rad] above which detail is dropped.
-        gap: Time between samples, in usual spacings, above which detail is dropped.
-    """
-
-    move: float = 25.0
-    turn: float = math.pi / 3.0
-    gap: float = 4.0
 
 
 @dataclass(frozen=True, eq=False)

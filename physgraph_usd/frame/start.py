@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .detail import Carried, MovingFrames, Reset
-from .level import Level
-from .resolution import edge_strain
+from ..level import Level
+from ..resolution import edge_strain
+from ..solve_settings import Reset
+from .detail import Carried, MovingFrames
 
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the

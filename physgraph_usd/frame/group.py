@@ -12,28 +12,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .contact.bodies import FrameBodies, Touching
-from .contact.cloth import ClothContact
-from .contact.frame import FrameContact, LevelContact, Touch
-from .contact.seams import Seams
-from .contact.settings import ContactSettings
-from .contact.solve import solve_touching
+from ..contact.bodies import FrameBodies, Touching
+from ..contact.cloth import ClothContact
+from ..contact.frame import FrameContact, LevelContact, Touch
+from ..contact.seams import Seams
+from ..contact.settings import ContactSettings
+from ..contact.solve import solve_touching
+from ..errors import SolveError
+from ..forces.base import ForceModule
+from ..forces.guide import GuideMap
+from ..forces.seam import SewnForces
+from ..integrate.base import Integrator, System
+from ..integrate.choice import Choice, choose
+from ..integrate.metric import Metric
+from ..integrate.saddle import leave_saddle
+from ..integrate.solve import Budget, LevelReport, solve_level
+from ..level import Level, build_levels
+from ..mesh.subdivide import Refinement
+from ..resolution import edge_strain, sharp_folds
+from ..scene import FARTHEST, Garment, GarmentFrame, recentred
+from ..solve_settings import SolveSettings
 from .detail import Carried, Followers, MovingFrames, Solved
-from .errors import SolveError
-from .forces.base import ForceModule
-from .forces.guide import GuideMap
-from .forces.seam import SewnForces
-from .integrate.base import Integrator, System
-from .integrate.choice import Choice, choose
-from .integrate.metric import Metric
-from .integrate.saddle import leave_saddle
-from .integrate.solve import Budget, LevelReport, solve_level
-from .level import Level, build_levels
 from .level_forces import LevelForces, blame, build_forces, named
-from .mesh.subdivide import Refinement
-from .resolution import edge_strain, sharp_folds
-from .scene import FARTHEST, Garment, GarmentFrame, recentred
-from .solve_settings import SolveSettings
 from .start import Start, start_of
 
 
