@@ -15,8 +15,8 @@ from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
 from .errors import GarmentError
-from .frame.detail import join, split
 from .frame.group import Group
+from .frame.values import FrameInput, join, split
 from .history import Known, bodies_moved, came_back
 from .level import refine_garments
 from .mesh.subdivide import Refinement
@@ -106,8 +106,7 @@ class Refiner:
         """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
         self._settings = settings
         self._parts = Parts(self._scene.garments, together=settings.contact.cloth != "off")
-        for group in self._groups.values():
-            group.use(settings)
+        self._groups = {part: group.with_settings(settings) for part, group in self._groups.items()}
         self.forget()
 
     def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
@@ -212,13 +211,12 @@ class Refiner:
         if broken is not None:
             last = [self._before[index] for index in part]
         known = [each for each in last if each is not None]
-        kept = None if gap or len(known) < len(part) else join([each.carried for each in known])
-        if kept is not None and any(each.part != part for each in known):
-            kept = replace(kept, clean=False)  # What was solved apart may cross.
+        state = None if gap or len(known) < len(part) else join([each.state for each in known])
+        if state is not None and any(each.part != part for each in known):
+            state = replace(state, clean=False)  # What was solved apart may cross.
         while True:
-            touching = self._touching(part, frames, near)
-            moved = self._moved(part, frame, near, known)
-            solved = group.solve(frames, kept, at=frame.time, touching=touching, moved=moved)
+            touching, moved = self._touching(part, frames, near), self._moved(part, frame, near, known)
+            solved = group.solve(FrameInput(frames, frame.time, touching, moved), state)
             more = self._reached(part, frames, solved.points)
             if more <= set(near):
                 break
@@ -232,7 +230,7 @@ class Refiner:
             entry["start"] = "cold: the time between samples is too long"
         if broken is not None:
             entry["broken_before"] = broken
-        own = split(solved.carried, group.levels[0].spans, group.levels[-1].spans)
+        own = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         for place, (index, each) in enumerate(zip(part, frames, strict=True)):
             self._before[index] = last[place]
             self._last[index] = Known(

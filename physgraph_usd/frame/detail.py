@@ -8,145 +8,44 @@ another, and have no mean.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Float
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..level import PIN_MARGIN, Level
+from ..level import Level
 from ..mesh.stencil import Stencil, add_at
-from ..mesh.topology import PolygonMesh
-
-NEAREST = 1e-6
-"""Distance under which points count as at one place, in edge lengths."""
-
-
-@dataclass(frozen=True, eq=False)
-class Carried:
-    """One frame's result, kept for the next.
-
-    Attributes:
-        coarse: Cage positions [m], world space.
-        detail: Fine positions minus the smooth base [m], shape (V, 3).
-        frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
-        held: For how many frames the pose had been held.
-        fine: Fine positions [m], world space, float64, from which cloth walks on; None before it was solved.
-        clean: Whether nothing of what was solved together crosses there.
-    """
-
-    coarse: Float[Tensor, "coarse 3"]
-    detail: Float[Tensor, "vertices 3"]
-    frames: Float[Tensor, "coarse 3 3"]
-    held: int = 0
-    fine: Float[Tensor, "vertices 3"] | None = None
-    clean: bool = False
-
-    def about(self, origin: np.ndarray) -> Float[Tensor, "vertices 3"] | None:
-        """Fine positions about an origin [m], float64, where cloth walks; else None."""
-        return None if self.fine is None else self.fine - torch.as_tensor(origin).to(self.fine)
-
-
-def join(parts: Sequence[Carried]) -> Carried:
-    """What several garments carry, as one."""
-    whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
-    fine = [part.fine for part in parts if part.fine is not None]
-    walked = torch.cat(fine) if len(fine) == len(parts) else None
-    clean = all(part.clean for part in parts)
-    return Carried(*whole, held=min(part.held for part in parts), fine=walked, clean=clean)
-
-
-def split(carried: Carried, coarse: Sequence[slice], fine: Sequence[slice]) -> list[Carried]:
-    """What each garment of a group carries.
-
-    Args:
-        carried: What the group carries.
-        coarse: Cage vertices of each garment.
-        fine: Fine vertices of each garment.
-    """
-    pairs = zip(coarse, fine, strict=True)
-    return [
-        Carried(
-            carried.coarse[c],
-            carried.detail[f],
-            carried.frames[c],
-            held=carried.held,
-            fine=None if carried.fine is None else carried.fine[f],
-            clean=carried.clean,
-        )
-        for c, f in pairs
-    ]
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """One frame of a group.
-
-    Attributes:
-        points: World positions of each garment [m].
-        carried: What the next frame needs.
-        telemetry: Plain values.
-        crossing: For each garment, which vertices belong to cloth that crosses cloth, shape (V,), bool.
-    """
-
-    points: list[np.ndarray]
-    carried: Carried
-    telemetry: dict[str, Any]
-    crossing: list[np.ndarray]
-
-    @property
-    def crossings(self) -> tuple[int, int]:
-        """How many edges pass through cloth, in the upsampled input and in the result."""
-        return self._told("before", "crossings"), self._told("after", "crossings")
-
-    @property
-    def between_garments(self) -> int:
-        """How many of the result's edges pass through another garment's cloth."""
-        return self._told("after", "between_garments")
-
-    def _told(self, which: str, name: str) -> int:
-        return self.telemetry.get("contact", {}).get("cloth", {}).get(which, {}).get(name, 0)
+from ..mesh.tangents import mean_edge, orthonormal, tangent_operator
+from .values import State
 
 
 class MovingFrames:
-    """The frames of one level's cage and the way from them to the fine vertices.
+    """The frames of a cage and the way from them to the fine vertices.
 
     Attributes:
         edge: Mean edge of the cage [m].
     """
 
-    def __init__(self, level: Level, cage_triangles: np.ndarray, cage_rest: np.ndarray) -> None:
-        """Fix each cage vertex's tangent in the rest shape.
-
-        Args:
-            level: The finest level.
-            cage_triangles: Triangles of the cage, shape (T, 3).
-            cage_rest: Rest positions of the cage [m], shape (C, 3).
-        """
-        self._level = level
-        self._triangles = torch.as_tensor(cage_triangles.astype(np.int64), device=level.device)
-        tangent = _tangent_operator(cage_triangles, np.asarray(cage_rest, dtype=np.float64))
-        self._tangent = Stencil(tangent, dtype=level.dtype, device=level.device)
-        self.edge = _mean_edge(cage_triangles, cage_rest)
+    def __init__(self, cage: Level, finest: Level) -> None:
+        """Fix each cage vertex's tangent in the rest shape."""
+        self._level, self._triangles = finest, cage.triangles.long()
+        triangles, rest = cage.triangles.cpu().numpy(), cage.rest.double().cpu().numpy()
+        self._tangent = Stencil(tangent_operator(triangles, rest), dtype=finest.dtype, device=finest.device)
+        self.edge = mean_edge(triangles, rest)
 
     def frames(self, coarse: Float[Tensor, "coarse 3"]) -> Float[Tensor, "coarse 3 3"]:
         """Orthonormal frames at the cage vertices; columns are tangent, bitangent, normal."""
         corner = coarse[self._triangles]
         area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         normal = add_at(torch.zeros_like(coarse), self._triangles.T.reshape(-1), area.repeat(3, 1))
-        return _orthonormal(normal, self._tangent.apply(coarse))
+        return orthonormal(normal, self._tangent.apply(coarse))
 
-    def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> Carried:
+    def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> State:
         """Keep a solved frame's detail."""
-        return Carried(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
+        return State(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
 
     def predict(
-        self, kept: Carried, coarse: Float[Tensor, "coarse 3"]
+        self, kept: State, coarse: Float[Tensor, "coarse 3"]
     ) -> tuple[Float[Tensor, "vertices 3"], float, float]:
         """Carry detail to new cage positions.
 
@@ -178,88 +77,4 @@ class MovingFrames:
         whole = (torch.linalg.det(turned) > 0.5).unsqueeze(1).unsqueeze(2)
         turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
         first, last = (self._level.base.apply(turned[:, :, column].contiguous()) for column in (0, 2))
-        return _orthonormal(last, first)
-
-
-class Followers:
-    """Corners of faces without area: no cloth carries them, so they move with what lies beside them, by nearness."""
-
-    def __init__(self, level: Level, meshes: Sequence[PolygonMesh]) -> None:
-        """Find them at a level; ``meshes`` are its garments' polygons."""
-        parts = zip(meshes, level.spans, strict=True)
-        edges = np.concatenate([mesh.half_edges.edges.astype(np.int64) + span.start for mesh, span in parts])
-        ends = np.concatenate([edges, edges[:, ::-1]])
-        idle = ((level.vertex_area == 0) & (level.pin < 1.0 - PIN_MARGIN)).cpu().numpy()
-        ends = ends[idle[ends[:, 0]] & (ends[:, 0] != ends[:, 1])]
-        self._which, row = np.unique(ends[:, 0], return_inverse=True)
-        rest = level.rest.double().cpu().numpy()
-        length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
-        near = 1.0 / np.maximum(length, NEAREST * float(level.spacing.mean()))
-        beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._which), level.vertex_count))
-        # What hangs together with no cloth at all stays: the margin makes its matrix one that can be inverted.
-        degree = sp.diags(np.bincount(row, near, len(self._which)) * (1.0 + 1e-9))
-        self._inverse = splu(sp.csc_matrix(degree - beside[:, self._which])) if len(row) else None
-        self._beside, self._from_coarse = sp.csr_matrix(beside @ sp.diags(1.0 - idle)), level.from_coarse
-
-    def placed(self, points: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-        """Positions [m], shape (V, 3), each follower moved off the upsampled cage as its neighbours are on the mean."""
-        if self._inverse is None:
-            return points
-        base, out = self._from_coarse @ coarse, points.copy()
-        out[self._which] = base[self._which] + self._inverse.solve(self._beside @ (points - base))
-        return out
-
-
-def _orthonormal(normal: Tensor, tangent: Tensor) -> Tensor:
-    """Frames from normals and rough tangents; any frame where both vanish."""
-    normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
-    tangent = tangent - (tangent * normal).sum(dim=1, keepdim=True) * normal
-    tangent = torch.nn.functional.normalize(tangent, dim=1, eps=1e-30)
-    return torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=2)
-
-
-def _tangent_operator(triangles: np.ndarray, rest: np.ndarray) -> sp.csr_matrix:
-    """Sparse map from cage positions to one tangent a vertex.
-
-    A vertex's reference direction at rest is projected into each incident triangle and written as a combination of that
-    triangle's two edges; the same combination of the deformed edges is that triangle's vote.
-    """
-    count = len(rest)
-    reference = _reference_directions(triangles, rest)
-    rows, columns, values = [], [], []
-    first, second = rest[triangles[:, 1]] - rest[triangles[:, 0]], rest[triangles[:, 2]] - rest[triangles[:, 0]]
-    a, b, c = (np.einsum("tc,tc->t", u, v) for u, v in ((first, first), (first, second), (second, second)))
-    determinant = a * c - b * b
-    sound = determinant > 1e-12 * a * c
-    inverse = np.where(sound, 1.0 / np.where(sound, determinant, 1.0), 0.0)
-    area = np.sqrt(np.maximum(determinant, 0.0))
-    for corner in range(3):
-        vertex = triangles[:, corner]
-        p = np.einsum("tc,tc->t", first, reference[vertex])
-        q = np.einsum("tc,tc->t", second, reference[vertex])
-        along_first, along_second = area * inverse * (c * p - b * q), area * inverse * (a * q - b * p)
-        rows += [vertex] * 3
-        columns += [triangles[:, 0], triangles[:, 1], triangles[:, 2]]
-        values += [-along_first - along_second, along_first, along_second]
-    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sp.csr_matrix(triplets, shape=(count, count))
-
-
-def _reference_directions(triangles: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """One tangent direction per cage vertex in the rest shape: its first edge, projected."""
-    normal = np.zeros_like(rest)
-    area = np.cross(rest[triangles[:, 1]] - rest[triangles[:, 0]], rest[triangles[:, 2]] - rest[triangles[:, 0]])
-    for corner in range(3):
-        np.add.at(normal, triangles[:, corner], area)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    direction = np.zeros_like(rest)
-    for corner in (2, 1, 0):
-        direction[triangles[:, corner]] = rest[triangles[:, (corner + 1) % 3]] - rest[triangles[:, corner]]
-    return direction - np.einsum("vc,vc->v", direction, normal)[:, None] * normal
-
-
-def _mean_edge(triangles: np.ndarray, rest: np.ndarray) -> float:
-    if not len(triangles):
-        return 1.0
-    sides = rest[triangles] - rest[np.roll(triangles, 1, axis=1)]
-    return max(float(np.linalg.norm(sides, axis=2).mean()), 1e-12)
+        return orthonormal(last, first)
