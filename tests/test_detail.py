@@ -122,7 +122,7 @@ def test_stretching_does_not_stretch_detail():
 
 @pytest.mark.parametrize("rest", [np.zeros((3, 3)), np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]])])
 def test_a_cage_without_area_gives_finite_frames(rest: np.ndarray):
-    frames = group_of(mesh_of(np.array([[0, 1, 2]])), rest)._frames.frames(tensor(rest))
+    frames = group_of(mesh_of([[0, 1, 2]]), rest)._frames.frames(tensor(rest))
     assert bool(frames.isfinite().all())
 
 

@@ -243,9 +243,8 @@ class Group:
     def _descend(self, problem: Problem) -> tuple[Tensor, list[LevelReport], ForceModule, str]:
         """Solve level by level from the cage, or at the finest level alone, as warm frames are; also says why."""
         last = len(self.levels) - 1
-        view = problem.view(self.levels[last])
-        if view is not None and problem.before is not None and problem.clean:
-            view.remember(problem.before)
+        if problem.contact is not None and problem.before is not None and problem.clean:
+            problem.contact.at(self.levels[last]).remember(problem.before)
         choice = self._choose(problem)
         integrator = self._integrator(choice)
         # What crosses in a cold frame is drawn apart at the cage.
