@@ -25,8 +25,8 @@ import click
 import numpy as np
 import torch
 
-from physgraph_usd import level_forces
-from physgraph_usd.group import Group
+from physgraph_usd.frame import level_forces
+from physgraph_usd.frame.group import Group
 from physgraph_usd.level import hinge_geometry
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner

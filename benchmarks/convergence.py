@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 
 from physgraph_usd.chart.reference import Reference
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Integrator, System
 from physgraph_usd.integrate.first_order import Adam, GradientDescent

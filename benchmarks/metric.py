@@ -18,7 +18,7 @@ from unittest import mock
 
 import torch
 
-from physgraph_usd import level_forces
+from physgraph_usd.frame import level_forces
 from physgraph_usd.integrate.metric import Metric, kept_to_edges
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.shot import prepare_device

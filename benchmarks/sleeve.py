@@ -22,7 +22,7 @@ import torch
 from benchmarks.unseen import reference_of
 from physgraph_usd.chart.reference import Reference
 from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.integrate.solve import Budget, solve_level

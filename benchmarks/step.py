@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from physgraph_usd.fabric import PRESETS
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate import METHODS
 from physgraph_usd.integrate.base import Integrator, System
 from physgraph_usd.integrate.learned import integrator_of

@@ -18,7 +18,7 @@ import torch
 from physgraph_usd.chart.problem import ALONE, Problem
 from physgraph_usd.chart.reference import Reference, find_reference
 from physgraph_usd.fabric import PRESETS
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.integrate.base import Carry, Integrator, System
 from physgraph_usd.integrate.saddle import leave_saddle

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .colliders.pose import Pose
-from .detail import Carried
+from .frame.values import State
 from .scene import GarmentFrame
 
 BACK = 0.25
@@ -31,7 +31,7 @@ class Known:
         near: Numbers of those that it could touch.
         part: Numbers of the garments that it was solved with.
         points: Fine positions [m].
-        carried: What the next frame needs of it.
+        state: What it leaves to the next.
         crossing: Which fine vertices belong to cloth that crosses cloth.
     """
 
@@ -41,7 +41,7 @@ class Known:
     near: tuple[int, ...]
     part: tuple[int, ...]
     points: np.ndarray
-    carried: Carried
+    state: State
     crossing: np.ndarray
 
 

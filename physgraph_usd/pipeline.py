@@ -14,9 +14,9 @@ from .contact.bodies import Touching
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
-from .detail import join, split
 from .errors import GarmentError
-from .group import Group
+from .frame.group import Group
+from .frame.values import FrameInput, join, split
 from .history import Known, bodies_moved, came_back
 from .level import refine_garments
 from .mesh.subdivide import Refinement
@@ -125,8 +125,7 @@ class Refiner:
         """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
         self._settings = settings
         self._parts = Parts(self._scene.garments, together=settings.contact.cloth != "off")
-        for group in self._groups.values():
-            group.use(settings)
+        self._groups = {part: group.with_settings(settings) for part, group in self._groups.items()}
         self.forget()
 
     def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
@@ -231,16 +230,14 @@ class Refiner:
         if broken is not None:
             last = [self._before[index] for index in part]
         known = [each for each in last if each is not None]
-        kept = None if gap or len(known) < len(part) else join([each.carried for each in known])
-        if kept is not None and any(each.part != part for each in known):
-            kept = replace(kept, clean=False)  # What was solved apart may cross.
-        cage = None if kept is not None else self._cage_walked(part)
+        state = None if gap or len(known) < len(part) else join([each.state for each in known])
+        if state is not None and any(each.part != part for each in known):
+            state = replace(state, clean=False)  # What was solved apart may cross.
+        cage = None if state is not None else self._cage_walked(part)
         while True:
-            touching = self._touching(part, frames, near)
-            moved = self._moved(part, frame, near, known)
-            solved = group.solve(
-                frames, kept, at=frame.time, touching=touching, moved=moved, cage=None if cage is None else cage[0]
-            )
+            touching, moved = self._touching(part, frames, near), self._moved(part, frame, near, known)
+            given = FrameInput(frames, frame.time, touching, moved, walked=None if cage is None else cage[0])
+            solved = group.solve(given, state)
             more = self._reached(part, frames, solved.points)
             if more <= set(near):
                 break
@@ -253,7 +250,7 @@ class Refiner:
         entry |= {"start": "cold: the time between samples is too long"} if gap else {}
         entry |= {} if cage is None else {"start": f"cold: the cage walked here from time code {cage[1]:g}"}
         entry |= {} if broken is None else {"broken_before": broken}
-        own = split(solved.carried, group.levels[0].spans, group.levels[-1].spans)
+        own = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         for place, (index, each) in enumerate(zip(part, frames, strict=True)):
             self._before[index] = last[place]
             self._last[index] = Known(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from .contact.settings import ContactSettings
-from .detail import Reset
 from .integrate import Method
 from .integrate.solve import Budget
 
@@ -15,6 +15,21 @@ EXTRA = 3
 """Steps of the finest level of a cold frame beyond its own, over those, while it is far from rest."""
 REST = 2.0
 """Tolerances by which cloth at rest may stray before a frame that starts from it moves it."""
+
+
+@dataclass(frozen=True)
+class Reset:
+    """When a frame starts cold.
+
+    Attributes:
+        move: RMS motion of the cage between samples, in mean cage edges, above which detail is dropped.
+        turn: RMS rotation of the frames [rad] above which detail is dropped.
+        gap: Time between samples, in usual spacings, above which detail is dropped.
+    """
+
+    move: float = 25.0
+    turn: float = math.pi / 3.0
+    gap: float = 4.0
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from meshes import grid
 from sheets import garment_of
 
 from physgraph_usd.fabric import Fabric
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate import method_named
 from physgraph_usd.integrate.base import System
 from physgraph_usd.level import refine_garments

@@ -19,6 +19,7 @@ from physgraph_usd.colliders.pose import Collider
 from physgraph_usd.contact.bodies import Touching
 from physgraph_usd.contact.frame import FrameContact, LevelContact
 from physgraph_usd.forces.base import ForceModule
+from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.integrate.base import System
 from physgraph_usd.integrate.metric import Metric
 from physgraph_usd.pipeline import Refiner
@@ -156,7 +157,7 @@ QUESTIONS: dict[str, Callable[[Asked], Any]] = {
     "Group.potential": potential,
     "Group.modules": forces,
     "Group.systems": lambda a: descents(a.group.systems(a.frames)[0], a),
-    "Group.solve": lambda a: a.group.solve(a.frames, None, at=None, touching=a.touching),
+    "Group.solve": lambda a: a.group.solve(FrameInput(a.frames, touching=a.touching), None),
     "System": lambda a: descents(a.systems, a),
     "FrameContact.aim": lambda a: a.contact.aim,
     "FrameContact.crossed": lambda a: a.contact.crossed,

@@ -18,7 +18,8 @@ from sheets import garment_of
 from physgraph_usd.cli import main
 from physgraph_usd.colliders.mesh import MeshBody
 from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
+from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.integrate.fused import fused_physgraph
 from physgraph_usd.integrate.learned import LearnedMetric, LearnedPaper
 from physgraph_usd.integrate.metric import Metric
@@ -73,7 +74,7 @@ def test_s33_a_solved_frame_agrees_and_repeats() -> None:
     answers = []
     for device in ("cpu", "cuda", "cuda"):
         one, frames = cloth(device, torch.float64, steps=60, tolerance=1e-7)
-        answers.append(one.solve(frames, None, at=None).points[0])
+        answers.append(one.solve(FrameInput(frames), None).points[0])
     here, there, again = answers
     assert there.tobytes() == again.tobytes()
     assert np.abs(here - there).max() < 1e-3 * EDGE / 4
@@ -126,7 +127,7 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     chains, down, answers = refine_garments(garments, [4]), np.array([0.0, -9.81, 0.0]), []
     for device in ("cpu", "cuda", "cuda"):
         one = Group(garments, chains, down, settings_of(steps=60), dtype=torch.float32, device=device)
-        answers.append(one.solve(frames, None, at=None))
+        answers.append(one.solve(FrameInput(frames), None))
     assert answers[0].crossings == answers[1].crossings == (0, 0)
     assert np.abs(answers[1].points[0] - answers[0].points[0]).max() < 1e-3 * 0.05
     assert np.array_equal(answers[1].points[0], answers[2].points[0])
@@ -185,12 +186,12 @@ def test_samples_are_refined_alike(tmp_path: Path, sample: str, integrator: str)
 def test_a_recording_keeps_what_it_writes_to() -> None:
     """Others may use up the cache of networks that are laid out, and the memory of those that it drops."""
     one, frames = cloth("cuda", torch.float32, integrator="physgraph", steps=8)
-    first = one.solve(frames, None, at=None).points[0]
+    first = one.solve(FrameInput(frames), None).points[0]
     fused_physgraph.cache_clear()
     gc.collect()
     torch.cuda.empty_cache()
     waste = [torch.full((1 << k,), 7.0, device="cuda") for k in range(8, 24) for _ in range(4)]
-    again = one.solve(frames, None, at=None).points[0]
+    again = one.solve(FrameInput(frames), None).points[0]
     assert np.array_equal(first, again)
     assert all(bool((each == 7.0).all()) for each in waste)
 

@@ -9,7 +9,8 @@ from cloth import group_of, sheet, wave
 from meshes import mesh_of
 from sheets import rotation
 
-from physgraph_usd.detail import Carried, MovingFrames
+from physgraph_usd.frame.detail import MovingFrames
+from physgraph_usd.frame.values import State
 
 MESH, REST = sheet(6, 4)
 GROUP = group_of(MESH, REST, level=2)
@@ -27,7 +28,7 @@ def fine(coarse: torch.Tensor, *, seed: int = 0) -> torch.Tensor:
     return FINEST.smooth_base.apply(coarse) + 0.01 * noise
 
 
-def stored(coarse: torch.Tensor) -> tuple[torch.Tensor, Carried]:
+def stored(coarse: torch.Tensor) -> tuple[torch.Tensor, State]:
     x = fine(coarse)
     return x, FRAMES.store(coarse, x)
 
@@ -121,7 +122,7 @@ def test_stretching_does_not_stretch_detail():
 
 @pytest.mark.parametrize("rest", [np.zeros((3, 3)), np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]])])
 def test_a_cage_without_area_gives_finite_frames(rest: np.ndarray):
-    frames = MovingFrames(FINEST, np.array([[0, 1, 2]]), rest).frames(tensor(rest))
+    frames = group_of(mesh_of([[0, 1, 2]]), rest)._frames.frames(tensor(rest))
     assert bool(frames.isfinite().all())
 
 

@@ -11,11 +11,11 @@ from bodies import ball
 from cloth import sheet
 from touching import frame, mesh_pose, refiner
 
-from physgraph_usd import start
 from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.detail import Carried, join, split
+from physgraph_usd.frame import start
+from physgraph_usd.frame.start import SLOWER, SLOWEST, STILL, slowing
+from physgraph_usd.frame.values import State, join, split
 from physgraph_usd.scene import Frame
-from physgraph_usd.start import SLOWER, SLOWEST, STILL, slowing
 
 MESH, REST = sheet(8, 8, 0.05)
 HANGING = REST - REST.mean(axis=0)
@@ -71,9 +71,9 @@ class TestHowFarABodyMoved:
         assert at.moved(MeshPose(*BALL)) == np.inf
 
 
-class TestCarried:
+class TestState:
     def test_garments_that_join_count_from_the_last_to_move(self):
-        one, other = (Carried(torch.zeros(2, 3), torch.zeros(4, 3), torch.zeros(2, 3, 3), held) for held in (7, 2))
+        one, other = (State(torch.zeros(2, 3), torch.zeros(4, 3), torch.zeros(2, 3, 3), held) for held in (7, 2))
         both = join([one, other])
         assert both.held == 2
         assert [each.held for each in split(both, [slice(0, 2), slice(2, 4)], [slice(0, 4), slice(4, 8)])] == [2, 2]

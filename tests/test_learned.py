@@ -20,7 +20,7 @@ from sheets import rotation
 from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
 from physgraph_usd.fabric import Fabric
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
 from physgraph_usd.integrate import METHODS, paper_network
 from physgraph_usd.integrate.base import Carry, Integrator, System
 from physgraph_usd.integrate.features import NORMAL, seeing

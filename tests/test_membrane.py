@@ -16,7 +16,8 @@ from test_forces import crumple
 from physgraph_usd.fabric import Fabric
 from physgraph_usd.forces.membrane import Membrane, in_plane_terms
 from physgraph_usd.forces.stretch import Stretch
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
+from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.integrate import method_named
 from physgraph_usd.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
 from physgraph_usd.mesh.diagonals import quad_edges
@@ -143,7 +144,7 @@ def test_a_mixed_group_is_what_its_garments_are_alone(dtype: torch.dtype):
         garments = [garment_of(mesh, points) for _ in chosen]
         refinements = refine_garments(garments, [1] * len(garments))
         group = Group(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=dtype, device="cpu")
-        solved = group.solve(chosen, None, at=None)
+        solved = group.solve(FrameInput(chosen), None)
         shapes, energies = solved.points, solved.telemetry["energy_joules"]
         assert isinstance(energies, dict)
         return shapes, energies["output"]

@@ -10,6 +10,7 @@ import torch
 from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
 from physgraph_usd.fabric import Fabric
+from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.integrate.base import System
 from physgraph_usd.integrate.fused import fused_physgraph
 from physgraph_usd.integrate.learned import LearnedMetric, graph_of
@@ -149,10 +150,10 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
     for lasting in (False, True):
         group = group_of(mesh, rest, level=2, dtype=torch.float32, integrator=integrator)
         monkeypatch.setattr(group, "_systems_last", lasting)
-        kept, points = None, []
+        state, points = None, []
         for frame in frames:
-            solved = group.solve(frame, kept, at=None)
-            kept = solved.carried
+            solved = group.solve(FrameInput(frame), state)
+            state = solved.state
             points.append(solved.points[0])
         results.append(points)
     assert [a.tobytes() for a in results[0]] == [b.tobytes() for b in results[1]]

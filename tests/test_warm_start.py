@@ -13,12 +13,13 @@ from cloth import frame_of, group_of, sheet, wave
 from folds import frame_with, named, refiner_with, square
 
 from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.group import Group
+from physgraph_usd.frame.group import Group
+from physgraph_usd.frame.start import STILL
+from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.resolution import edge_strain
 from physgraph_usd.samples import write_sample
-from physgraph_usd.start import STILL
 from physgraph_usd.usd.reader import open_shot
 
 MESH, REST = sheet(8, 6)
@@ -30,16 +31,15 @@ def said(group: Group, *, strain: float, squeeze: float = 0.0) -> tuple[str, flo
     The detail of a solved frame is enlarged until the 99th percentile of the edges' strain is what is asked for.
     """
     frames = list(frame_of(wave(REST)).garments)
-    kept = group.solve(frames, None, at=None).carried
-    cage = REST * np.array([1.0 - squeeze, 1.0, 1.0])
-    world = torch.as_tensor(cage)
-    coarse = group._tensor(cage - cage.mean(axis=0))
+    state = group.solve(FrameInput(frames), None).state
+    cage = group._cage(frame_of(REST * np.array([1.0 - squeeze, 1.0, 1.0])).garments)
+    world = torch.as_tensor(cage.world)
     low, high, found, here = 0.0, 1e4, "", 0.0
     for _ in range(60):
         middle = 0.5 * (low + high)
-        detailed = replace(kept, coarse=world, detail=middle * kept.detail)
-        start = group._start(detailed, coarse, cage)
-        moved = group._frames.predict(replace(detailed, coarse=coarse), coarse)[0]
+        detailed = replace(state, coarse=world, detail=middle * state.detail)
+        start = group._start(detailed, cage)
+        moved = group._frames.predict(replace(detailed, coarse=cage.points), cage.points)[0]
         found, detail = start.why, moved if start.detailed is None else start.detailed
         here = edge_strain(group.levels[-1], detail)["p99"]
         low, high = (middle, high) if here < strain else (low, middle)
@@ -61,11 +61,11 @@ def test_detail_that_tears_the_cloth_is_not_carried(strain: float, squeeze: floa
 @pytest.mark.parametrize(("moved", "still"), [(0.5, True), (0.9, True), (1.1, False), (40.0, False)])
 def test_a_pose_is_held_while_its_cage_hardly_moves(moved: float, still: bool):
     group, points = group_of(MESH, REST, level=1), wave(REST)
-    kept = group.solve(list(frame_of(points).garments), None, at=None).carried
+    state = group.solve(FrameInput(frame_of(points).garments), None).state
     edge = float(group.levels[0].spacing.mean())
-    cage = points + np.array([0.0, moved * STILL * edge, 0.0])
-    start = group._start(kept, group._tensor(cage - cage.mean(axis=0)), cage)
-    assert (start.why, start.still) == ("warm", still)
+    cage = group._cage(frame_of(points + np.array([0.0, moved * STILL * edge, 0.0])).garments)
+    start = group._start(state, cage, moved=0.0)
+    assert (start.why, start.held) == ("warm", int(still))
 
 
 @pytest.mark.parametrize("contact", [ContactSettings(), ContactSettings("off", cloth="off")])
@@ -74,9 +74,9 @@ def test_what_rests_stays_until_it_is_moved_by_more_than_it_rested_with(contact:
     made = []
     for bend in np.linspace(0.0, 0.004, 30):
         group, points = group_of(MESH, REST, steps=400, tolerance=1e-3, contact=contact, temporal="warm"), wave(REST)
-        kept = group.solve(list(frame_of(points).garments), None, at=None).carried
+        state = group.solve(FrameInput(frame_of(points).garments), None).state
         points = points + bend * np.sin(20.0 * REST[:, [0]]) * np.array([0.0, 1.0, 0.0])
-        levels = group.solve(list(frame_of(points).garments), kept, at=None).telemetry["levels"]
+        levels = group.solve(FrameInput(frame_of(points).garments), state).telemetry["levels"]
         made.append((sum(level["steps"] for level in levels), levels[-1]["remaining_move"]))
     stayed = [left for steps, left in made if not steps]
     assert max(stayed) > 1.5e-3, made

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..forces.base import ForceModule
-from ..group import Group
+from ..frame.group import Group
 from ..pipeline import Refiner
 from ..resolution import edge_strain
 from ..scene import Frame

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..contact.settings import ContactSettings
-from ..detail import Carried
+from ..frame.values import FrameInput, State
 from ..level import Level
 from ..options import RefineOptions
 from ..pipeline import Refiner
@@ -111,8 +111,8 @@ class Problem:
         return Solved(points, share * sum(spent), 1e3 * elapsed, steps, waited)
 
     def go_on(
-        self, frame: Frame, settings: SolveSettings, kept: Sequence[Carried | None]
-    ) -> tuple[tuple[np.ndarray, ...], list[Carried]]:
+        self, frame: Frame, settings: SolveSettings, kept: Sequence[State | None]
+    ) -> tuple[tuple[np.ndarray, ...], list[State]]:
         """Solve a frame from a kept result of its own; cold where that is None.
 
         Returns:
@@ -120,13 +120,13 @@ class Problem:
         """
         self.refiner.use(replace(settings, temporal="warm"))
         points: dict[int, np.ndarray] = {}
-        carried = []
+        states = []
         for part, own in zip(self.refiner.parts_of(frame), kept, strict=True):
             frames, touching = [frame.garments[index] for index in part], self.refiner.touching(part, frame)
-            solved = self.refiner.group_of(part).solve(frames, own, at=frame.time, touching=touching)
+            solved = self.refiner.group_of(part).solve(FrameInput(frames, frame.time, touching), own)
             points.update(zip(part, solved.points, strict=True))
-            carried.append(solved.carried)
-        return tuple(points[index] for index in sorted(points)), carried
+            states.append(solved.state)
+        return tuple(points[index] for index in sorted(points)), states
 
     def judge(self, frame: Frame, points: Sequence[np.ndarray], settings: SolveSettings = COLD) -> Judgement:
         """Energy, strain and contact of fine world positions [m], one array a garment, in a potential and a contact."""

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..detail import Carried
+from ..frame.values import State
 from ..integrate import METHODS
 from ..scene import Frame
 from ..solve_settings import SolveSettings
@@ -140,7 +140,7 @@ class _Descent:
 
     def __init__(self, problem: Problem, frame: Frame, settings: SolveSettings, *, start: float) -> None:
         self._problem, self._frame, self._settings, self._start = problem, frame, settings, start
-        self._kept: Sequence[Carried | None] = [None] * len(problem.refiner.parts_of(frame))
+        self._kept: Sequence[State | None] = [None] * len(problem.refiner.parts_of(frame))
         self.by, self.energy = "", math.inf
         self.energies: dict[str, float] = {}
         self.points: tuple[np.ndarray, ...] = ()

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..group import Group
+from ..frame.group import Group
 from ..integrate import METHODS
 from ..level import refine_garments
 from ..solve_settings import SolveSettings

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..fabric import Fabric
-from ..group import Group
+from ..frame.group import Group
 from ..integrate import METHODS
 from ..integrate.base import System
 from ..integrate.quasi_newton import QuasiNewton

@@ -10,6 +10,7 @@ import torch
 from cloth import FABRIC, GUIDE, frame_of, group_of, refiner_of, rms, sheet, solved, total, wave
 from sheets import garment_of
 
+from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.scene import Frame, GarmentFrame
 
 MESH, REST = sheet(8, 6)
@@ -78,10 +79,10 @@ def test_s35_a_hundred_equal_frames_are_one(temporal: str):
 def test_s36_ten_passes_over_its_own_output_do_not_drift(temporal: str, steps: int):
     group = group_of(MESH, REST, level=2, temporal=temporal, steps=steps, tolerance=0.0)
     frame = GarmentFrame(wave(REST), FABRIC, GUIDE)
-    kept, outputs, energies, inputs = None, [], [], []
+    state, outputs, energies, inputs = None, [], [], []
     for _ in range(11):
-        solved = group.solve([frame], kept, at=None)
-        points, kept, telemetry = solved.points, solved.carried, solved.telemetry
+        solved = group.solve(FrameInput([frame]), state)
+        points, state, telemetry = solved.points, solved.state, solved.telemetry
         outputs.append(points[0])
         energies.append(total(telemetry, "output"))
         inputs.append(total(telemetry, "input"))

@@ -18,7 +18,7 @@ from ...forces.base import ForceModule
 from ...forces.bending import Bending
 from ...forces.guide import Guide
 from ...forces.stretch import Stretch
-from ...group import Group
+from ...frame.group import Group
 from ...level import Level
 from ...scene import Frame
 from ..journal import Journal

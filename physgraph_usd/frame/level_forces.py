@@ -11,17 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .forces import body_terms, elastic_terms
-from .forces.base import Force, ForceModule
-from .forces.guide import Guide, GuideMap
-from .forces.stretch import PAPER_SPRING, garment_area
-from .forces.tether import Tether
-from .integrate.base import System
-from .integrate.metric import Metric, kept_to_edges
-from .integrate.saddle import facets
-from .level import Level
-from .mesh.stencil import Stencil
-from .scene import Garment, GarmentFrame
+from ..forces import body_terms, elastic_terms
+from ..forces.base import Force, ForceModule
+from ..forces.guide import Guide, GuideMap
+from ..forces.stretch import PAPER_SPRING, garment_area
+from ..forces.tether import Tether
+from ..integrate.base import ForceField, Preconditioner, System
+from ..integrate.metric import Metric, kept_to_edges
+from ..integrate.saddle import facets
+from ..level import Level
+from ..mesh.stencil import Stencil
+from ..scene import Garment, GarmentFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,7 @@ class LevelForces:
 
     Attributes:
         level: The level.
-        elastic: Stretch, membrane and bending.
-        body: Gravity.
+        terms: Stretch, membrane, bending and gravity.
         guide: The guide, without a target.
         metric: The factorised rest Hessian of all of them.
         density: Areal density of each garment [kg/m^2].
@@ -39,8 +38,7 @@ class LevelForces:
     """
 
     level: Level
-    elastic: tuple[Force, ...]
-    body: tuple[Force, ...]
+    terms: tuple[Force, ...]
     guide: Guide
     metric: Metric
     density: Float[Tensor, " garments"]
@@ -54,13 +52,23 @@ class LevelForces:
 
     def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
         """All terms of one frame, given its recentred coarse positions [m]."""
-        return ForceModule((*self.elastic, *self.body, self.guide.retarget(coarse)))
+        return ForceModule((*self.terms, self.guide.retarget(coarse)))
 
     def system(self, module: ForceModule, tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None) -> System:
         """The system of a frame in which nothing touches, given its terms; the tie as for `lasting_system`."""
         forces = module.forces if tie is None else (*module.forces, self.tether(*tie))
-        field = ForceModule(forces, remembers=True)
-        return System(field, self.metric, free=self.level.free, spacing=self.level.spacing, level=self.level)
+        return self.system_in(ForceModule(forces, remembers=True))
+
+    def system_in(self, field: ForceField, metric: Preconditioner | None = None, *, lasting: bool = False) -> System:
+        """The system of the level in any field, by its own metric or another one."""
+        level, metric = self.level, self.metric if metric is None else metric
+        return System(field, metric, free=level.free, spacing=level.spacing, level=level, lasting=lasting)
+
+    def remaining(self, coarse: Float[Tensor, "coarse 3"]) -> float:
+        """The remaining move of the upsampled cage, given by recentred positions [m], in edge lengths."""
+        system = self.system_in(self.module(coarse))
+        force = system.energy_and_force(self.level.base.apply(coarse))[1]
+        return system.remaining_move(system.apply_metric_inverse(force))
 
     def lasting_system(
         self, coarse: Float[Tensor, "coarse 3"], tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None
@@ -75,21 +83,16 @@ class LevelForces:
         """
         tied = tie is not None
         if tied not in self._lasting:
-            self._lasting[tied] = self._made(coarse, tie)
+            guide = self.guide.retarget(coarse)
+            tether = None if tie is None else self.tether(tie[0], tie[1].clone())
+            field = ForceModule((*self.terms, guide, *([] if tether is None else [tether])))
+            self._lasting[tied] = self.system_in(field, lasting=True), guide, tether
         system, guide, tether = self._lasting[tied]
         guide.aim(coarse)
         if tie is not None and tether is not None:
             stiffness, predicted = tie
             tether.aim(predicted, stiffness)
         return system
-
-    def _made(self, coarse: Tensor, tie: tuple[float, Tensor] | None) -> tuple[System, Guide, Tether | None]:
-        """A system that lasts, and what is aimed in it."""
-        level, guide = self.level, self.guide.retarget(coarse)
-        tether = None if tie is None else self.tether(tie[0], tie[1].clone())
-        field = ForceModule((*self.elastic, *self.body, guide, *([] if tether is None else [tether])))
-        system = System(field, self.metric, free=level.free, spacing=level.spacing, level=level, lasting=True)
-        return system, guide, tether
 
     @cached_property
     def _lasting(self) -> dict[bool, tuple[System, Guide, Tether | None]]:
@@ -125,13 +128,15 @@ def build_forces(
     relative = 1.0
     if potential == "paper":
         relative = PAPER_SPRING / 3.0 * float(level.rest_length.square().mean() / garment_area(level).mean())
-    elastic = elastic_terms(level, fabrics, potential=potential)
-    body = body_terms(level, fabrics, gravity=gravity, potential=potential)
+    terms = (
+        *elastic_terms(level, fabrics, potential=potential),
+        *body_terms(level, fabrics, gravity=gravity, potential=potential),
+    )
     guide = Guide(level, guide_map, torch.as_tensor(stiffness), relative_weight=relative)
-    matrix = kept_to_edges(ForceModule((*elastic, *body, guide)).rest_matrix(), level.edges.cpu().numpy())
+    matrix = kept_to_edges(ForceModule((*terms, guide)).rest_matrix(), level.edges.cpu().numpy())
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
-    return LevelForces(level, elastic, body, guide, metric, density, any(fabric.bend > 0 for fabric in fabrics))
+    return LevelForces(level, terms, guide, metric, density, any(fabric.bend > 0 for fabric in fabrics))
 
 
 def blame(

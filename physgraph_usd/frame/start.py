@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .detail import Carried, MovingFrames, Reset
-from .level import Level
-from .resolution import edge_strain
+from ..level import Level
+from ..resolution import edge_strain
+from ..solve_settings import Reset
+from .detail import MovingFrames
+from .values import Cage, State
 
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
 """A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
 upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
 STILL = 0.02
-"""RMS motion of the cage between samples, in mean cage edges, below which a pose is held: there slow settling shows.
-Below so much motion of the farthest point of cage and bodies, cloth slows down."""
+"""Motion of the farthest point of cage and bodies between samples, in mean cage edges, below which a pose is held:
+there slow settling shows, so cloth slows down."""
 SLOWER, SLOWEST = 2.0, 2.0**8
 """In a held pose the tether holds cloth so many times as stiffly as in the frame before; where that is so many times as
 stiffly as ever, cloth stays where it is: it has a third of a second to settle, and one sees what moves after that."""
@@ -31,14 +33,12 @@ class Start:
     Attributes:
         why: "warm", or "at rest" or "cold" with the reason.
         detailed: The finest vertices with the last frame's detail [m], shape (V, 3); None in a cold start.
-        still: Whether the cage's pose is held.
-        held: For how many frames that of all that the cloth feels has been.
+        held: For how many frames the pose of all that the cloth feels has been held.
         slowed: How many times as stiffly as ever the tether holds it therefore; from `SLOWEST` on it rests.
     """
 
     why: str
     detailed: Float[Tensor, "vertices 3"] | None = None
-    still: bool = False
     held: int = 0
     slowed: float = 1.0
 
@@ -49,42 +49,34 @@ class Start:
 
 
 def start_of(
-    kept: Carried | None,
-    coarse: Float[Tensor, "coarse 3"],
-    world: Float[Tensor, "coarse 3"],
-    *,
-    frames: MovingFrames,
-    finest: Level,
-    reset: Reset,
-    moved: float = np.inf,
+    state: State | None, cage: Cage, *, frames: MovingFrames, finest: Level, reset: Reset, moved: float = np.inf
 ) -> Start:
     """Carry the last frame's detail along, unless the cage jumped or it would tear the cloth.
 
     Args:
-        kept: The last frame's result, or None for a cold start.
-        coarse: Cage positions [m], recentred.
-        world: The same in world space.
+        state: What the last frame left, or None for a cold start.
+        cage: Where the cages are.
         frames: Of the cage.
         finest: The finest level.
         reset: When a frame starts cold.
         moved: How far what the cloth may touch has moved since [m]; infinite where more than poses has changed.
     """
-    if kept is None:
+    if state is None:
         return Start("cold")
-    shifted = Carried((kept.coarse - world.mean(dim=0)).to(coarse), kept.detail, kept.frames)
-    detailed, motion, turn = frames.predict(shifted, coarse)
+    shifted = replace(state, coarse=(state.coarse - torch.as_tensor(cage.world).mean(dim=0)).to(cage.points))
+    detailed, motion, turn = frames.predict(shifted, cage.points)
     if motion > reset.move or turn > reset.turn:
         return Start(f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees")
-    base = finest.base.apply(coarse)
+    base = finest.base.apply(cage.points)
     detailed = torch.where(finest.free, detailed, base)
     carried, plain = (edge_strain(finest, x)["p99"] for x in (detailed, base))
     if carried > min(max(WORTH * plain, LEAST_STRAIN), MOST_STRAIN):
         return Start(f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}")
-    moves = (coarse - shifted.coarse).norm(dim=1)
+    moves = (cage.points - shifted.coarse).norm(dim=1)
     farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
-    held, slowed = slowing(kept.held, farthest)
+    held, slowed = slowing(state.held, farthest)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
-    return Start(why, detailed, motion < STILL, held, slowed)
+    return Start(why, detailed, held, slowed)
 
 
 def slowing(held: int, motion: float) -> tuple[int, float]:

@@ -1,0 +1,121 @@
+"""What a frame's solve is given, what it leaves to the next, and what it gives: values that nothing writes to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..contact.bodies import Touching
+from ..scene import GarmentFrame
+
+
+@dataclass(frozen=True, eq=False)
+class FrameInput:
+    """What a group is given for one frame.
+
+    Attributes:
+        garments: Its garments at this time code.
+        at: The time code, for errors.
+        touching: Surfaces that the garments may touch.
+        moved: How far these have moved since the last frame [m]; infinite where more than poses has changed.
+        walked: World positions that the cages walked to from an earlier frame [m], shape (C, 3), where a cold frame
+            starts; or None.
+    """
+
+    garments: Sequence[GarmentFrame]
+    at: float | None = None
+    touching: Sequence[Touching] = ()
+    moved: float = np.inf
+    walked: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Cage:
+    """Where the cages of a group are.
+
+    Attributes:
+        world: World positions [m], shape (C, 3), float64.
+        origin: Their mean [m], shape (3,).
+        points: Positions about it [m], in the scalar type of the solve.
+    """
+
+    world: np.ndarray
+    origin: np.ndarray
+    points: Float[Tensor, "coarse 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What one frame leaves to the next.
+
+    Attributes:
+        coarse: Cage positions [m], world space.
+        detail: Fine positions minus the smooth base [m], shape (V, 3).
+        frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
+        held: For how many frames the pose had been held.
+        fine: Fine positions [m], world space, float64, from which cloth walks on; None before it was solved.
+        clean: Whether nothing of what was solved together crosses there.
+    """
+
+    coarse: Float[Tensor, "coarse 3"]
+    detail: Float[Tensor, "vertices 3"]
+    frames: Float[Tensor, "coarse 3 3"]
+    held: int = 0
+    fine: Float[Tensor, "vertices 3"] | None = None
+    clean: bool = False
+
+    def about(self, origin: np.ndarray) -> Float[Tensor, "vertices 3"] | None:
+        """Fine positions about an origin [m], float64, where cloth walks; else None."""
+        return None if self.fine is None else self.fine - torch.as_tensor(origin).to(self.fine)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """One frame of a group.
+
+    Attributes:
+        points: World positions of each garment [m].
+        state: What the next frame starts from.
+        telemetry: Plain values.
+        crossing: For each garment, which vertices belong to cloth that crosses cloth, shape (V,), bool.
+    """
+
+    points: list[np.ndarray]
+    state: State
+    telemetry: dict[str, Any]
+    crossing: list[np.ndarray]
+
+
+def join(parts: Sequence[State]) -> State:
+    """The states of several garments as one."""
+    whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
+    fine = [part.fine for part in parts if part.fine is not None]
+    walked = torch.cat(fine) if len(fine) == len(parts) else None
+    clean = all(part.clean for part in parts)
+    return State(*whole, held=min(part.held for part in parts), fine=walked, clean=clean)
+
+
+def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
+    """The state of each garment of a group.
+
+    Args:
+        state: The group's.
+        coarse: Cage vertices of each garment.
+        fine: Fine vertices of each garment.
+    """
+    return [
+        replace(
+            state,
+            coarse=state.coarse[c],
+            detail=state.detail[f],
+            frames=state.frames[c],
+            fine=None if state.fine is None else state.fine[f],
+        )
+        for c, f in zip(coarse, fine, strict=True)
+    ]
