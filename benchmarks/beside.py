@@ -53,7 +53,7 @@ def main(
             if name in REAL and folder is not None:
                 garments, colliders, _ = REAL[name]
                 given |= {"shot": str(folder.resolve() / name), "garments": garments, "colliders": colliders}
-            paths = {"PYTHONPATH": str(version.resolve())}
+            paths = {"PYTHONPATH": os.pathsep.join([str(version.resolve()), os.environ.get("PYTHONPATH", "")])}
             command = [sys.executable, str(HERE), json.dumps(given)]
             try:
                 subprocess.run(command, env={**os.environ, **paths}, cwd=place, timeout=limit, check=True, stdout=2)
