@@ -45,6 +45,7 @@ class Parts:
         topology: What kernels read.
         links: Vertices that hang together: the edges, and what is sewn, shape (N, 2), int64.
         lengths: Of these at rest, 0 where sewn [m], shape (N,), float64.
+        spacing: Mean length of the edges at rest [m].
         shortest: The shortest edge at each vertex at rest [m], shape (V,), float64.
     """
 
@@ -73,6 +74,7 @@ class Parts:
         length = level.rest_length.double().repeat_interleave(2)
         self.shortest = shortest.scatter_reduce(0, level.edges.long().reshape(-1), length, "amin")
         self.lengths = torch.cat([level.rest_length.double(), level.rest.new_zeros(len(sewn)).double()])
+        self.spacing = float(level.rest_length.double().mean()) if len(level.rest_length) else 0.0
         table.owner = self._array(level.vertex_garment.cpu().numpy())
         self._rest = level.rest.double().contiguous()
         table.rest = wp.from_torch(self._rest, dtype=wp.vec3d)

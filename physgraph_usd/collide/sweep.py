@@ -595,6 +595,11 @@ def joined(first: Pairs, second: Pairs) -> Pairs:
     return Pairs(*(torch.cat(each) for each in parts))
 
 
+def none_of(like: Float[Tensor, "vertices 3"]) -> Pairs:
+    """No pairs, on the device of positions [m]."""
+    return _room(torch.empty(0, dtype=torch.int32, device=like.device), 0)
+
+
 def _motion(
     start: Tensor,
     way: Tensor,

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..collide.sweep import Listed
+from ..collide.sweep import Listed, joined, none_of
+from .along import along
+from .carry import carried
 from .cloth import ClothView
-from .safe_move import safe_move
+from .safe_move import in_the_way, safe_move
 
 REACH = 0.15
 """Part of its shortest edge that each vertex may go before near pairs are listed anew."""
+WIDTHS = (16.0, 8.0, 4.0, 2.0)
+"""Cells in which cloth is carried together where something is in the way of its own ways, in edge lengths."""
 GOES = 3
-"""How often a move is taken up again where something was in the way: what was in the way may have gone."""
+"""How often what is then left of each way is gone: what was in the way may have gone too."""
 TRIES = 4
 """How often tangles in which more crosses are held to the promise, before all are."""
 
@@ -73,18 +76,26 @@ class Promise:
         return self._go(start, wanted, None if tangles is None else tangles.label, None)
 
     def _go(
-        self, start: Tensor, wanted: Tensor, tangle: Int[Tensor, " vertices"] | None, listed: Listed | None
+        self, start: Tensor, aim: Tensor, tangle: Int[Tensor, " vertices"] | None, listed: Listed | None
     ) -> Float[Tensor, "vertices 3"]:
-        """The same, with nothing promised to what is in a tangle against what is in the same."""
-        x = start
-        for _ in range(GOES):
-            moved = safe_move(x, wanted, self.view.parts, floor=self.floor, tangle=tangle, listed=listed)
-            x = moved.x
-            if not bool(moved.short.any()):
+        """The same, with nothing promised to what is in a tangle against what is in the same.
+
+        First goes what cloth in a place has in common of its ways, in ever smaller places: layers that move together
+        hold nothing up. Then each vertex goes what is left of its own way, along what was in it.
+        """
+        given = {"floor": self.floor, "tangle": tangle, "listed": listed}
+        parts, moves = self.view.parts, (aim != start).any(dim=1, keepdim=True)
+        if not len(in_the_way(start, aim, parts, **given).value):
+            return aim
+        x, met = start, none_of(start)
+        for width in (*WIDTHS, *(0.0,) * GOES):
+            at, rest = x.double(), aim.double() - x.double()
+            if width:
+                way = moves * carried(at, rest, width=width * parts.spacing)
+            else:
+                way = along(at, rest, met, free=moves & parts.level.free)
+            moved = safe_move(x, self.view.closed((at + way).to(aim)), parts, **given)
+            x, met = moved.x, joined(met, moved.met)
+            if not width and not bool(moved.short.any()):
                 break
-            # What is left of a way goes on along what was in it.
-            rest = wanted.double() - x.double()
-            against = (rest * moved.clear).sum(dim=1, keepdim=True).clamp_max(0.0)
-            along = (x.double() + rest - against * moved.clear).to(wanted)
-            wanted = self.view.closed(torch.where(moved.short.unsqueeze(1), along, wanted))
         return x

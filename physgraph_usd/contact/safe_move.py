@@ -18,15 +18,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.near import weights
 from ..collide.parts import Parts
-from ..collide.sweep import Listed, ListedAndSwept, Pairs
+from ..collide.sweep import Listed, ListedAndSwept, Pairs, joined, none_of
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
 BACK = 0.9
 """Part of the way to an impact that its vertices go: others, cut in turn, may come nearer than they were to."""
-STRAINS, LEAST = 0.1, 0.01
+STRAINS, LEAST = 0.5, 0.01
 """Part of its length that an edge changes by at most where vertices beside one another are cut, and a change of that
 which counts for nothing."""
 SHORTENINGS = 16
@@ -40,12 +39,12 @@ class Moved:
     Attributes:
         x: Positions [m], shape (V, 3).
         share: How much of its way each vertex has gone, in [0, 1], shape (V,), float64.
-        clear: Unit way of each vertex that is short from what was in its way, 0 elsewhere, shape (V, 3), float64.
+        met: Pairs that were in the way.
     """
 
     x: Float[Tensor, "vertices 3"]
     share: Float[Tensor, " vertices"]
-    clear: Float[Tensor, "vertices 3"]
+    met: Pairs
 
     @property
     def short(self) -> Bool[Tensor, " vertices"]:
@@ -85,20 +84,35 @@ def safe_move(
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
     x, asked = wanted, (way != 0).any(dim=1)
     swept = ListedAndSwept(parts, at, way, listed)
-    clear = torch.zeros_like(way)
+    met = none_of(way)
     for attempt in range(len(way) + SHORTENINGS):
-        met = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, tangle=tangle)
-        if not len(met.value):
+        more = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, tangle=tangle)
+        if not len(more.value):
             break
-        least = torch.ones_like(share)
-        corner = met.corners.long().reshape(-1)
-        least.scatter_reduce_(0, corner, BACK * met.value.repeat_interleave(4), "amin")
+        met, least = joined(met, more), torch.ones_like(share)
+        corner = more.corners.long().reshape(-1)
+        least.scatter_reduce_(0, corner, BACK * more.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < SHORTENINGS else torch.where(least < 1.0, 0.0, share)
-        known, clear = share, _away(met, at + share.unsqueeze(1) * way, at, clear)
-        share = _spread(shorter, way, parts)
+        known, share = share, _spread(shorter, way, parts)
         asked = share < known
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
-    return Moved(x, share, clear)
+    return Moved(x, share, met)
+
+
+def in_the_way(
+    start: Float[Tensor, "vertices 3"],
+    wanted: Float[Tensor, "vertices 3"],
+    parts: Parts,
+    *,
+    floor: float,
+    tangle: Int[Tensor, " vertices"] | None = None,
+    listed: Listed | None = None,
+) -> Pairs:
+    """The pairs that would come too near on the straight way to what is wanted, all as for `safe_move`."""
+    at = start.double()
+    way = wanted.double() - at
+    swept = ListedAndSwept(parts, at, way, listed)
+    return swept.impacts(way, share=KEPT, floor=floor, asked=(way != 0).any(dim=1), tangle=tangle)
 
 
 def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
@@ -114,25 +128,3 @@ def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertice
             break
         late = new
     return torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))
-
-
-def _away(met: Pairs, end: Tensor, start: Tensor, known: Tensor) -> Float[Tensor, "vertices 3"]:
-    """Unit way of each vertex from the part that it meets first [1], known ones where it meets none."""
-    corners = met.corners.long()
-    there = start[corners] + met.value.reshape(-1, 1, 1) * (end - start)[corners]
-    own = torch.arange(4 * len(corners), dtype=torch.int32, device=end.device).reshape(-1, 4)
-    weight = weights(there.reshape(-1, 3), own, met.face)
-    way = torch.nn.functional.normalize((weight.unsqueeze(2) * there).sum(dim=1), dim=1, eps=1e-300)
-    side = torch.ones_like(weight)
-    side[:, 2:] = -1.0
-    side[met.face, 1] = -1.0
-    order = torch.argsort(met.value, descending=True, stable=True).repeat_interleave(4)
-    # The first that a vertex meets is written last; the rank of each pair makes that so on any device.
-    place = torch.arange(4, device=end.device).repeat(len(corners))
-    vertex, rank = corners[order, place], torch.arange(4 * len(corners), device=end.device)
-    last = torch.full_like(known[:, 0], -1, dtype=torch.int64).scatter_reduce_(0, vertex, rank, "amax")
-    hit = torch.nonzero(last >= 0).squeeze(1)
-    pair, corner = order[last[hit]], place[last[hit]]
-    out = known.clone()
-    out[hit] = side[pair, corner].unsqueeze(1) * way[pair]
-    return out
