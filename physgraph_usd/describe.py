@@ -21,6 +21,7 @@ from .strain import strained_parts, stretched
 from .usd.reader import Shot
 from .usd.stage import GarmentSource
 from .usd.survey import survey
+from .usd.times import within
 
 
 def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
@@ -88,7 +89,8 @@ def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> Gar
 def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
     """What decides the size of a run beside its garments."""
     levels = [garment["level"] for garment in report.garments]
-    return {"levels": levels, "frames": max(len(opened.scene.times), 1), "workers": options.workers}
+    times = opened.scene.times if options.run_up is None else within(opened.scene.times, options.frames)
+    return {"levels": levels, "frames": max(len(times), 1), "workers": options.workers}
 
 
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:

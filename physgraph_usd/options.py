@@ -26,7 +26,7 @@ SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
 _NOT_OF_THE_RESULT = {
     "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "asset_paths", "resume",
-    "keep_frames", "strict",
+    "keep_frames", "strict", "scheduler",
 }  # fmt: skip
 
 
@@ -51,7 +51,10 @@ class RefineOptions:
         potential: "continuum" or "paper".
         contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
         self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
-        workers: Processes that share the frames.
+        workers: Processes that share the frames; with a scheduler, tasks.
+        run_up: Frames solved before ``frames`` and not written: the layer is a chunk, which `stitch` joins to others.
+            None for a layer by itself.
+        scheduler: Address of a Dask scheduler whose workers solve the frames, or None.
         report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
@@ -85,6 +88,8 @@ class RefineOptions:
     contact: str = "quadratic"
     self_contact: str = "auto"
     workers: int = 1
+    run_up: int | None = None
+    scheduler: str | None = None
     report: Path | None = None
     overwrite: bool = False
     dry_run: bool = False
@@ -103,7 +108,7 @@ class RefineOptions:
         """The options that decide the result, ready for JSON."""
         names = {f.name for f in dataclasses.fields(self)} - _NOT_OF_THE_RESULT
         # A layer without these is as it was before there were any.
-        names -= {name for name in ("heat_map", "weights") if not getattr(self, name)}
+        names -= {name for name in ("heat_map", "weights", "run_up") if getattr(self, name) is None or getattr(self, name) is False}
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         if self.weights:
             values["weights"] = {"file": str(self.weights), "sha256": weights_hash(self.weights)}
@@ -146,6 +151,8 @@ class RefineOptions:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")
         if self.workers < 1 or self.steps < 0 or not self.tolerance >= 0:
             raise UsageError("workers must be at least 1, steps and tolerance at least 0")
+        if self.run_up is not None and self.run_up < 0:
+            raise UsageError(f"run-up of {self.run_up} frames: give 0 or more")
         if self.budget_ms is not None and not self.budget_ms > 0:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):

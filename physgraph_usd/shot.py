@@ -31,6 +31,7 @@ from .report import RefineReport
 from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
 from .usd.atomic import check_place
+from .usd.chunk import Chunk, chunk_of
 from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
 from .usd.provenance import FAILED, UNSETTLED, asset_path, file_hashes, is_result_of, write_root
 from .usd.reader import Shot, open_shot
@@ -197,7 +198,7 @@ def _open(shot: str | Path, options: RefineOptions) -> Shot:
         str(shot),
         garments=options.garments,
         colliders=options.colliders,
-        frames=options.frames,
+        frames=options.frames if options.run_up is None else None,
         level=options.level,
         overrides=options.overrides,
         rest_frame=options.rest_frame,
@@ -279,7 +280,8 @@ def prepare_device(device: str) -> None:
 
 
 def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOptions, report: RefineReport) -> None:
-    times: list[float | None] = list(opened.scene.times) or [None]
+    chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
+    times, skip = _to_solve(opened, chunk, options)
     refinements = Refiner.subdivide(opened.scene, solver.levels)
     began, written, provenance = clock.perf_counter(), 0.0, _provenance(opened, out, options)
     run = provenance | {"levels": solver.levels, "times": times, "report": options.report is not None}
@@ -296,17 +298,20 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
             velocities=options.velocities,
             provenance=provenance,
             overwrite=options.overwrite,
+            chunk=chunk,
         ) as writer,
     ):
-        run_up = 0 if options.temporal == "off" else RUN_UP
-        solved = solve_in_chunks(solver, times, frames, workers=options.workers, run_up=run_up)
-        report.warnings += _tell(_resumed(frames, len(times), run_up), options)
+        run_up = _run_up(options)
+        solved = solve_in_chunks(solver, times, frames, workers=options.workers, run_up=run_up, skip=skip)
+        report.warnings += _tell(_resumed(frames, len(times) - skip, run_up), options)
         with closing(solved):
+            if chunk is not None and chunk.times and times[skip] != chunk.times[0]:
+                _begin_after(next(solved), writer)
             for done, outcome in enumerate(solved, start=1):
                 written += _take(outcome, writer, report)
                 if options.progress:
-                    options.progress(done, len(times))
-        if len(report.failed) == len(times):
+                    options.progress(done, len(chunk.times) if chunk is not None else len(times))
+        if len(report.failed) == len(report.frames):
             raise SolveError(next(iter(report.failed.values())))
         report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
         start = clock.perf_counter()
@@ -318,6 +323,28 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
     report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
+
+
+def _run_up(options: RefineOptions) -> int:
+    """Frames solved before a chunk, where frames depend on one another."""
+    asked = RUN_UP if options.run_up is None else options.run_up
+    return 0 if options.temporal == "off" else asked
+
+
+def _to_solve(opened: Shot, chunk: Chunk | None, options: RefineOptions) -> tuple[list[float | None], int]:
+    """Time codes to solve, in order, and how many of the first are neither written nor compared with a chunk before."""
+    every: list[float | None] = list(opened.scene.times) or [None]
+    if chunk is None or not chunk.times:
+        return every, 0
+    first = every.index(chunk.times[0])
+    lead = min(first, _run_up(options))
+    return every[first - lead : first + len(chunk.times)], max(lead - 1, 0)
+
+
+def _begin_after(outcome: Outcome, writer: LayerWriter) -> None:
+    """Keep where the run-up of a chunk ended, unless that frame failed."""
+    if outcome.points and outcome.time is not None:
+        writer.begin_after(outcome.time, outcome.points)
 
 
 def _tell(warnings: list[str], options: RefineOptions) -> list[str]:

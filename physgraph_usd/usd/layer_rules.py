@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
+from .chunk import read_chunk
 from .provenance import read_record
 from .rules import Problem, code_of
 
@@ -37,6 +38,10 @@ def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
     """All samples of the shot were refined: outside those that were, the cloth stands still."""
     for path, said in (read_record(layer) or {}).get("left_out", {}).items():
         yield Problem("warning", path, None, f"was refined without {said}, where it stands still (--frames)", "")
+    chunk = read_chunk(layer)
+    if chunk is not None and chunk.times != chunk.every:
+        said = f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch joins it to the others"
+        yield Problem("warning", "/", None, said, "")
 
 
 def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError
@@ -151,9 +152,11 @@ def asset_path(path: str | Path, folder: Path, *, absolute: bool = False) -> str
 
 
 def _plain(value: Any) -> Any:
-    """Bring a record to types that layer metadata holds."""
+    """Bring a record to types that layer metadata holds; an array is one of points, shape (V, 3), float32."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in sorted(value.items(), key=str) if item is not None}
+    if isinstance(value, np.ndarray):
+        return Vt.Vec3fArray.FromNumpy(value)
     if isinstance(value, list | tuple | set | frozenset):
         return _plain_list(sorted(value) if isinstance(value, set | frozenset) else list(value))
     if isinstance(value, bool | int | float | str):

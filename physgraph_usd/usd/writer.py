@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,6 +21,7 @@ from ..mesh.subdivide import Refinement
 from . import overs, provenance
 from .atomic import termination_raises
 from .carry import FineMap
+from .chunk import CHUNK, Chunk
 from .files import check_targets, files_of
 from .heat import HeatTrack
 from .hints import ModelHints
@@ -29,7 +31,7 @@ from .primvars import carry_primvars, carry_subsets
 from .reader import Shot
 from .stage import Notice, pxr_errors
 from .stream import LayerStream
-from .track import PointTrack
+from .track import PointTrack, to_local
 from .validate import check_layer
 
 MODES = ("over", "sibling")
@@ -53,6 +55,7 @@ class LayerWriter:
         velocities: bool = False,
         provenance: Mapping[str, Any] | None = None,
         overwrite: bool = False,
+        chunk: Chunk | None = None,
     ) -> None:
         """Start the layer and author everything that does not move.
 
@@ -64,6 +67,8 @@ class LayerWriter:
             velocities: Whether to author velocities, by finite differences, where the shot has none too.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
+            chunk: Which frames of the shot the layer is for; garments without a sample there are not in it. None for
+                all.
 
         Raises:
             UsageError: The mode is unknown, the file exists or is one that the shot is made of, or a garment is refined
@@ -79,6 +84,8 @@ class LayerWriter:
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._rate, self._velocities, self._open = _rate(shot.stage), velocities, True
         self._record = {"mode": mode} | dict(provenance or {})
+        self._chunk = chunk
+        self._held = _garments_in(shot, chunk)
         self.notices: list[Notice] = []
         self.targets: list[Sdf.Path] = []
         self._tracks: list[PointTrack] = []
@@ -96,8 +103,8 @@ class LayerWriter:
         span = (times[0], times[-1]) if times else None
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
         with pxr_errors(f"cannot read {self._shot.path}"):
-            for index, steps in enumerate(refinements):
-                self._author_garment(index, steps, span)
+            for index in self._held:
+                self._author_garment(index, refinements[index], span)
 
     def _author_garment(self, index: int, steps: Sequence[Refinement], span: tuple[float, float] | None) -> None:
         """Author one garment's defaults and start its track."""
@@ -149,22 +156,41 @@ class LayerWriter:
         self._check_call(time, points, heat)
         if self._time == -np.inf:
             self._author_values(time)
-        for index, track in enumerate(self._tracks):
-            array = points[index]
+        for place, index in enumerate(self._held):
+            array, track = points[index], self._tracks[place]
             if array is None:
                 continue
             different = True if changed is None else bool(changed[index])
             track.write(time, array, self._shot.to_metres(index, time), changed=different)
-            self._hints[index].write(time, track.box)
+            self._hints[place].write(time, track.box)
             if heat:
-                self._heat[index].write(time, heat[index] or {})
+                self._heat[place].write(time, heat[index] or {})
         self._time = np.inf if time is None else time
+
+    def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
+        """Take the last frame of a chunk's run-up into the chunk's record.
+
+        Args:
+            time: Its time code.
+            points: As `write` takes them.
+
+        Raises:
+            LayerError: A point is not finite.
+        """
+        assert self._chunk is not None, "only a chunk has a run-up"
+        found = {
+            str(target): to_local(array, self._shot.to_metres(index, time), str(target), time)
+            for target, index in zip(self.targets, self._held, strict=True)
+            if (array := points[index]) is not None
+        }
+        self._chunk = replace(self._chunk, before=time, points=found)
 
     def _author_values(self, time: float | None) -> None:
         """Leave the values used on the coarse prims."""
         frame = self._shot.frame(time)
-        for source, garment, values in zip(self._shot.sources, self._shot.scene.garments, frame.garments, strict=True):
-            author_used_values(self._stream, source, garment, values)
+        for index in self._held:
+            source, garment = self._shot.sources[index], self._shot.scene.garments[index]
+            author_used_values(self._stream, source, garment, frame.garments[index])
 
     def _check_call(
         self,
@@ -177,15 +203,15 @@ class LayerWriter:
             raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
         if self._time == np.inf or (time is not None and time <= self._time):
             raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
-        if len(points) != len(self._tracks):
-            raise LayerError(f"{len(points)} arrays of points for {len(self._tracks)} garments")
-        for track, array in zip(self._tracks, points, strict=True):
-            if array is not None:
-                track.check(array, time)
-        if heat and len(heat) != len(self._heat):
-            raise LayerError(f"heat maps of {len(heat)} garments for {len(self._heat)} garments")
-        for track, maps in zip(self._heat, heat, strict=False):
-            track.check(maps or {}, time)
+        count = len(self._shot.sources)
+        if len(points) != count:
+            raise LayerError(f"{len(points)} arrays of points for {count} garments")
+        if heat and len(heat) != count:
+            raise LayerError(f"heat maps of {len(heat)} garments for {count} garments")
+        for place, index in enumerate(self._held):
+            if (array := points[index]) is not None:
+                self._tracks[place].check(array, time)
+            self._heat[place].check((heat[index] if heat else None) or {}, time)
 
     def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path:
         """Finish, validate and move the layer to its final name.
@@ -201,9 +227,10 @@ class LayerWriter:
         """
         if self._time == -np.inf:
             raise LayerError(f"no time code was written to {self._stream.target}")
-        for track in self._tracks:
-            track.finish()
+        for track in (*self._tracks, *self._heat):
+            track.finish(hold=self._chunk is not None)
         facts = _facts(self._shot, self.targets, self._stream.target)
+        facts |= {CHUNK: self._chunk.record()} if self._chunk is not None else {}
         provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
         self._stream.flush()
         self._check_written()
@@ -238,13 +265,22 @@ class LayerWriter:
 
 def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path) -> dict[str, Any]:
     """What the record says of the garments, and of what they were read from."""
-    held = zip(targets, shot.sources, strict=True)
+    held = zip(targets, shot.sources, strict=False)
     return {
         "shot": provenance.asset_path(shot.path, out.parent),
         "garments": [str(path) for path in targets],
         "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
         "variants": shot.selections or None,
     }
+
+
+def _garments_in(shot: Shot, chunk: Chunk | None) -> list[int]:
+    """Numbers of the garments that have a sample in a chunk; one without samples is in that of the first frame."""
+    every = range(len(shot.sources))
+    if chunk is None or not chunk.times:
+        return [*every]
+    first = shot.scene.times[0]
+    return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(chunk.times)]
 
 
 def _rate(stage: Usd.Stage) -> float:
