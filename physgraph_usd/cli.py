@@ -101,6 +101,13 @@ solve_options = _together(
     click.option("--self-contact", type=click.Choice(["auto", "paper", "off"]), help="How cloth pushes cloth."),
     click.option("--temporal", type=click.Choice(["tether", "warm", "off"]), help="How a frame uses the last one."),
     click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes; each begins 6 frames early."),
+    click.option(
+        "--run-up",
+        type=click.IntRange(min=0),
+        metavar="N",
+        help="Write --frames as a chunk for stitch; N frames before it are solved and not written.",
+    ),
+    click.option("--scheduler", metavar="ADDRESS", help="Solve on the workers of this Dask scheduler (extra farm)."),
 )
 asset_paths_option = click.option(
     "--asset-paths", type=click.Choice(["relative", "absolute"]), help="How files written name other files."
@@ -173,6 +180,31 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
             only, layer, settings = jobs[0]
             code = _say(_refine_shown(only, layer, replace(settings, workers=workers), in_lines=in_lines))
     sys.exit(code)
+
+
+@main.command()
+@click.argument("chunks", nargs=-1, required=True, metavar="CHUNK...", type=click.Path(dir_okay=False, path_type=Path))
+@out_option("LAYER", "Layer to write.")
+@click.option("--frames", type=FrameRange(), help="Time codes that must be there.  [default: all of the shot]")
+@click.option(
+    "--seam-bound",
+    type=click.FloatRange(min=0),
+    metavar="EDGES",
+    help="Most that a seam may move, RMS, in fine edge lengths.  [default: 0.05]",
+)
+@click.option("--clips", is_flag=True, help="Play the chunks as value clips instead of copying them into one file.")
+@overwrite_option
+def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
+    """Join each CHUNK of a shot, as refine --run-up writes them, into one layer and print its path.
+
+    How far each seam moves goes to stderr.
+    """
+    from .usd.stitch import stitch as join
+
+    given = {name: value for name, value in options.items() if value is not None}
+    for seam in join(chunks, out, **given):
+        click.echo(seam, err=True)
+    click.echo(out)
 
 
 @main.command()

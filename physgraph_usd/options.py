@@ -108,7 +108,11 @@ class RefineOptions:
         """The options that decide the result, ready for JSON."""
         names = {f.name for f in dataclasses.fields(self)} - _NOT_OF_THE_RESULT
         # A layer without these is as it was before there were any.
-        names -= {name for name in ("heat_map", "weights", "run_up") if getattr(self, name) is None or getattr(self, name) is False}
+        names -= {
+            name
+            for name in ("heat_map", "weights", "run_up")
+            if getattr(self, name) is None or getattr(self, name) is False
+        }
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         if self.weights:
             values["weights"] = {"file": str(self.weights), "sha256": weights_hash(self.weights)}

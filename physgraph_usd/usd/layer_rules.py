@@ -40,7 +40,7 @@ def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
         yield Problem("warning", path, None, f"was refined without {said}, where it stands still (--frames)", "")
     chunk = read_chunk(layer)
     if chunk is not None and chunk.times != chunk.every:
-        said = f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch joins it to the others"
+        said = f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch it to the others"
         yield Problem("warning", "/", None, said, "")
 
 

@@ -1,15 +1,15 @@
 """Joins chunks, which `refine --run-up` writes, into one layer, or into value clips where one file would be too large.
 
-Each chunk begins a few frames early, and its record says where the cloth was in the last frame of that run-up. The chunk
-before holds the same frame: the distance between the two is what the seam moves.
+Each chunk begins a few frames early, and its record says where the cloth was in the last frame of that run-up. The
+chunk before holds the same frame: the distance between the two is what the seam moves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -257,13 +257,11 @@ def _check_seams(parts: Sequence[_Part], seams: Sequence[Seam], bound: float) ->
             raise LayerError(f"{said}: {part.file} has no run-up that ended in the frame before it; {remedy}")
 
 
-def _record(
-    parts: Sequence[_Part], shot: Path, out: Path, *, frames: tuple[float, float] | None
-) -> dict[str, Any]:
+def _record(parts: Sequence[_Part], shot: Path, out: Path, *, frames: tuple[float, float] | None) -> dict[str, Any]:
     """The record of the joined layer: that of a run of all frames, and the chunks that it was joined from."""
     first = parts[0]
     record = {name: value for name, value in first.record.items() if name not in (CHUNK, FAILED, UNSETTLED)}
-    absolute = record["options"].get("asset_paths") == "absolute" or Path(str(record["shot"])).is_absolute()
+    absolute = Path(str(record["shot"])).is_absolute()
     folder = out.resolve().parent
     options = {name: _comparable(value) for name, value in dict(record["options"]).items() if name != "frames"}
     named = {first.layer.ComputeAbsolutePath(str(name)): value for name, value in dict(record["inputs"]).items()}
@@ -283,9 +281,7 @@ def _record(
     }
 
 
-def _write_layer(
-    parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[str, Any], *, overwrite: bool
-) -> None:
+def _write_layer(parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[str, Any], *, overwrite: bool) -> None:
     """Join chunks into one file; each leaves memory when it is in."""
     with LayerStream(out, overwrite=overwrite) as stream:
         stream.layer.TransferContent(parts[0].layer)
@@ -294,8 +290,8 @@ def _write_layer(
             _union_hints(stream.layer, part.layer)
             author_record(stream.layer, record)
             stream.flush()
-        for before, after in pairwise(parts):
-            _author_velocities(stream, before.chunk.times[-1], after.chunk.times[0])
+        for path in record["garments"]:
+            _author_velocities(stream, path, {t for part in parts for t in _ends(part.layer, f"{path}.velocities")})
         stream.flush()
         root = Sdf.Layer.FindOrOpen(str(shot)) if is_there(shot) else None
         errors = [each for each in check_layer(stream.layer, root, samples=3) if each.severity == "error"]
@@ -305,12 +301,14 @@ def _write_layer(
 
 
 def _union_hints(layer: Sdf.Layer, other: Sdf.Layer) -> None:
-    """Let the boxes that a layer holds as defaults hold those of another one too: each grew them by its own frames."""
+    """Let the boxes of models in a layer hold those of another one too: each chunk grew them by its own frames."""
     paths: list[Sdf.Path] = []
     other.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(Sdf.Path(path)))
     for path in paths:
         if not path.IsPropertyPath() or path.name != HINT:
             continue
+        for time in other.ListTimeSamplesForPath(path):
+            layer.SetTimeSample(path, time, other.QueryTimeSample(path, time))
         ours, theirs = (np.asarray(each.GetAttributeAtPath(path).default) for each in (layer, other))
         if ours.shape == theirs.shape and ours.ndim == 2:
             grown = ours.copy()
@@ -319,42 +317,36 @@ def _union_hints(layer: Sdf.Layer, other: Sdf.Layer) -> None:
             layer.GetAttributeAtPath(path).default = Vt.Vec3fArray.FromNumpy(grown)
 
 
-def _author_velocities(stream: LayerStream, *seam: float) -> None:
-    """Author the velocities next to a seam anew: a chunk knows nothing of the frames outside it.
+def _author_velocities(stream: LayerStream, garment: str, times: Collection[float]) -> None:
+    """Author velocities at the ends of chunks anew: a chunk knows nothing of the samples outside it.
 
     As in `track`, v(t_k) = (p(t_k+1) - p(t_k-1)) / (t_k+1 - t_k-1).
     """
-    rate = stream.layer.timeCodesPerSecond
-    for path in (read_record(stream.layer) or {})["garments"]:
-        points, velocities = Sdf.Path(f"{path}.points"), Sdf.Path(f"{path}.velocities")
-        written = stream.layer.ListTimeSamplesForPath(velocities)
-        for time in set(seam).intersection(written):
-            k = written.index(time)
-            a, b = written[max(k - 1, 0)], written[min(k + 1, len(written) - 1)]
-            low, high = (np.asarray(stream.layer.QueryTimeSample(points, at), np.float64) for at in (a, b))
-            moved = (high - low) * (rate / (b - a))
-            stream.set(velocities, Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)), time=time)
+    layer, points, velocities = stream.layer, Sdf.Path(f"{garment}.points"), Sdf.Path(f"{garment}.velocities")
+    written = layer.ListTimeSamplesForPath(velocities)
+    for time in sorted(times) if len(written) > 1 else ():
+        k = written.index(time)
+        a, b = written[max(k - 1, 0)], written[min(k + 1, len(written) - 1)]
+        low, high = (np.asarray(layer.QueryTimeSample(points, at), np.float64) for at in (a, b))
+        moved = (high - low) / ((b - a) / layer.timeCodesPerSecond)
+        stream.set(velocities, Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)), time=time)
 
 
-def _write_clips(
-    parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[str, Any], *, overwrite: bool
-) -> None:
+def _write_clips(parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[str, Any], *, overwrite: bool) -> None:
     """Write what does not move, the manifest, and a layer that plays the chunks over both."""
     targets = _targets(out, clips=True)
     for path in targets.values():
         check_suffix("the layer", path, LAYER_SUFFIXES)
         prepare_target(path, overwrite=overwrite)
-    anchor = _anchor(record["garments"])
-    files = [part.layer.identifier for part in parts]
     with _on_disk(targets["topology"]) as topology:
-        UsdUtils.StitchClipsTopology(topology, files)
+        UsdUtils.StitchClipsTopology(topology, [part.layer.identifier for part in parts])
         for part in parts:
             _union_hints(topology, part.layer)
         topology.customLayerData = {}
-        with _on_disk(targets["manifest"]) as manifest:
-            UsdUtils.StitchClipsManifest(manifest, topology, files, str(anchor))
-    root = _clip_root(parts, out, anchor, targets)
+    root, manifest = _clip_root(parts, out, record["garments"], manifest=targets["manifest"].name)
+    root.subLayerPaths.append(f"./{targets['topology'].name}")
     author_record(root, record)
+    export_layer(manifest, targets["manifest"])
     export_layer(root, out)
     _check_clips(parts, shot, out)
 
@@ -373,33 +365,33 @@ def _on_disk(target: Path) -> Iterator[Sdf.Layer]:
         temporary.unlink(missing_ok=True)
 
 
-def _anchor(paths: Sequence[str]) -> Sdf.Path:
-    """The nearest prim that all garments lie under, or the only one itself."""
-    common = Sdf.Path(paths[0])
-    for path in paths[1:]:
-        common = common.GetCommonPrefix(Sdf.Path(path))
-    if common.IsAbsoluteRootPath():
-        raise UsageError(f"value clips need a prim above all garments; {', '.join(paths)} have none in common")
-    return common
+def _clip_root(
+    parts: Sequence[_Part], out: Path, garments: Sequence[str], *, manifest: str
+) -> tuple[Sdf.Layer, Sdf.Layer]:
+    """The layer in memory that plays chunks as value clips, without sublayers yet, and its manifest.
 
-
-def _clip_root(parts: Sequence[_Part], out: Path, anchor: Sdf.Path, targets: Mapping[str, Path]) -> Sdf.Layer:
-    """The layer in memory that plays chunks as value clips, each from its first frame on."""
-    root, first = Sdf.Layer.CreateAnonymous(".usda"), parts[0].layer
-    for key in first.pseudoRoot.ListInfoKeys():
+    Each garment has its own clips, those of the chunks in which it has samples: where a clip holds nothing of an
+    attribute, USD takes a default in place of the samples around it.
+    """
+    root, declared = Sdf.Layer.CreateAnonymous(".usda"), Sdf.Layer.CreateAnonymous(".usda")
+    first = parts[0].layer.pseudoRoot
+    for key in first.ListInfoKeys():
         if key not in ("customLayerData", "subLayers", "subLayerOffsets"):
-            root.pseudoRoot.SetInfo(key, first.pseudoRoot.GetInfo(key))
-    root.subLayerPaths.append(f"./{targets['topology'].name}")
-    folder = out.resolve().parent
-    clips = Usd.ClipsAPI(Usd.Stage.Open(root).OverridePrim(anchor))
-    clips.SetClipAssetPaths(Sdf.AssetPathArray([Sdf.AssetPath(asset_path(part.file, folder)) for part in parts]))
-    clips.SetClipManifestAssetPath(Sdf.AssetPath(f"./{targets['manifest'].name}"))
-    clips.SetClipPrimPath(str(anchor))
-    clips.SetClipActive(Vt.Vec2dArray([(part.chunk.times[0], index) for index, part in enumerate(parts)]))
-    ends = parts[0].chunk.times[0], parts[-1].chunk.times[-1]
-    clips.SetClipTimes(Vt.Vec2dArray([(time, time) for time in ends]))
-    clips.SetInterpolateMissingClipValues(True)
-    return root
+            root.pseudoRoot.SetInfo(key, first.GetInfo(key))
+    stage, folder = Usd.Stage.Open(root), out.resolve().parent
+    for path in garments:
+        held = [(part, ends) for part in parts if (ends := _ends(part.layer, f"{path}.points"))]
+        if not held:
+            continue
+        layers = [part.layer for part, _ in held]
+        UsdUtils.StitchLayers(declared, Usd.ClipsAPI.GenerateClipManifestFromLayers(layers, path))
+        clips = Usd.ClipsAPI(stage.OverridePrim(path))
+        clips.SetClipPrimPath(path)
+        clips.SetClipAssetPaths(Sdf.AssetPathArray([Sdf.AssetPath(asset_path(p.file, folder)) for p, _ in held]))
+        clips.SetClipManifestAssetPath(Sdf.AssetPath(f"./{manifest}"))
+        clips.SetClipActive(Vt.Vec2dArray([(ends[0], index) for index, (_, ends) in enumerate(held)]))
+        clips.SetClipTimes(Vt.Vec2dArray([(time, time) for time in (held[0][1][0], held[-1][1][1])]))
+    return root, declared
 
 
 def _check_clips(parts: Sequence[_Part], shot: Path, out: Path) -> None:
@@ -411,7 +403,15 @@ def _check_clips(parts: Sequence[_Part], shot: Path, out: Path) -> None:
         root.subLayerPaths.append(identifier)
     stage = Usd.Stage.Open(root)
     for part in parts:
-        for path, time in product(part.garments(), {part.chunk.times[0], part.chunk.times[-1]}):
-            shown, held = stage.GetAttributeAtPath(f"{path}.points").Get(time), _points_at(part.layer, path, time)
-            if held is not None and (shown is None or not np.array_equal(np.asarray(shown), held)):
-                raise LayerError(f"{out}: the clips do not show <{path}> as {part.file} holds it at time code {time:g}")
+        for path in part.garments():
+            for time in _ends(part.layer, f"{path}.points"):
+                shown = stage.GetAttributeAtPath(f"{path}.points").Get(time)
+                held = part.layer.QueryTimeSample(f"{path}.points", time)
+                if shown is None or not np.array_equal(np.asarray(shown), np.asarray(held)):
+                    raise LayerError(f"{out} does not show <{path}> at time code {time:g} as {part.file} holds it")
+
+
+def _ends(layer: Sdf.Layer, name: str) -> list[float]:
+    """Times of an attribute's first and last sample in a layer."""
+    times = layer.ListTimeSamplesForPath(name)
+    return [times[0], times[-1]] if times else []
