@@ -28,6 +28,8 @@ Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 class Work(Protocol):
     """A function at work in another process, as `Call` is."""
 
+    lag: float
+
     @property
     def ready(self) -> bool:
         """Whether it has returned, failed or died."""
@@ -126,6 +128,7 @@ def _work(
 
 def _collect(frames: FrameFolder, index: int, time: float | None, *, owner: Work | None) -> Outcome:
     """Wait for one frame's file and read it."""
+    ended: float | None = None
     while True:
         over = owner is None or owner.ready
         outcome = frames.read(index, time)
@@ -134,7 +137,9 @@ def _collect(frames: FrameFolder, index: int, time: float | None, *, owner: Work
         if over:
             if owner is not None:
                 owner.result()
-            _lost(time)
+            ended = ended or clock.monotonic()
+            if owner is None or clock.monotonic() - ended >= owner.lag:
+                _lost(time)
         clock.sleep(POLL_SECONDS)
 
 

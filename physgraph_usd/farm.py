@@ -1,21 +1,19 @@
 """Calls on the workers of a Dask scheduler, as `processes` makes them on this machine.
 
-A task solves a chunk and files its frames in the folder beside the layer, which every worker sees under the same path. A
-worker that dies, dies alone: the scheduler gives its task to another one, which writes the same files again.
+A task solves a chunk and files its frames in the folder beside the layer, which every worker sees under the same path.
+A worker that dies, dies alone: the scheduler gives its task to another one, which writes the same files again.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from typing import Any
 
-from . import __version__
 from .errors import PhysGraphError, SolveError, UsageError
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
 
 RETRIES = 2
 """How often a task is begun again after an error that nobody foresaw, such as a disk that was not there."""
@@ -27,9 +25,16 @@ Start = Callable[..., "FarmCall"]
 
 
 class FarmCall:
-    """A function at work on a worker of a Dask scheduler."""
+    """A function at work on a worker of a Dask scheduler.
 
-    def __init__(self, future: Future) -> None:
+    Attributes:
+        lag: How long after its end the files that it wrote may be hidden from this machine [s]: a network's file system
+            remembers what was not there.
+    """
+
+    lag = 60.0
+
+    def __init__(self, future: Any) -> None:
         """Follow a task that was submitted."""
         self._future = future
 
@@ -45,14 +50,16 @@ class FarmCall:
             PhysGraphError: What it raised.
             SolveError: Its workers died, the scheduler is gone, or something failed that nobody foresaw.
         """
-        import distributed
-
+        dask = _distributed()
         try:
-            value, error = self._future.result()
-        except distributed.KilledWorker as died:
-            raise SolveError(f"{died}; perhaps for lack of memory: use more chunks or a lower --level") from died
-        except (distributed.client.FutureCancelledError, distributed.comm.CommClosedError, OSError) as lost:
+            unforeseen = self._future.exception()
+            value, error = self._future.result() if unforeseen is None else (None, None)
+        except (dask.client.FutureCancelledError, OSError) as lost:
             raise SolveError(f"the farm gave no result: {lost}") from lost
+        if isinstance(unforeseen, dask.KilledWorker):
+            raise SolveError(f"{unforeseen}; perhaps for lack of memory: use more chunks or a lower --level")
+        if unforeseen is not None:
+            raise PhysGraphError(f"unexpected {type(unforeseen).__name__} on a worker: {unforeseen}") from unforeseen
         if error is not None:
             raise error
         return value
@@ -72,51 +79,61 @@ def connected(address: str) -> Iterator[Start]:
     Raises:
         UsageError: Dask is not installed, or nothing answers there.
     """
-    try:
-        from distributed import Client
-    except ModuleNotFoundError as error:
-        raise UsageError("--scheduler needs Dask: pip install 'physgraph-usd[farm]'") from error
-    try:
-        client = Client(address, timeout=CONNECT_SECONDS)
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
-    with client:
-        _wait_for_workers(client, address)
+    with _client(address) as client:
 
         def start(function: Callable[..., Any], *args: Any) -> FarmCall:
-            return FarmCall(client.submit(_call, __version__, function, args, pure=False, retries=RETRIES))
+            return FarmCall(client.submit(_call, _version(), function, args, pure=False, retries=RETRIES))
 
         yield start
 
 
-def worker_count(address: str) -> int:
-    """How many workers a scheduler has.
+def shots_at_once(address: str, chunks: int) -> int:
+    """How many shots of so many chunks keep all workers of a scheduler busy.
 
     Raises:
         UsageError: As `connected` does.
     """
-    with connected(address) as start:
-        return int(start.__closure__ is not None)
+    with _client(address) as client:
+        return math.ceil(len(client.nthreads()) / chunks)
 
 
-def _wait_for_workers(client: Client, address: str) -> None:
-    limit = time.monotonic() + CONNECT_SECONDS
-    while not client.scheduler_info()["workers"]:
-        if time.monotonic() > limit:
-            raise UsageError(f"the Dask scheduler at {address} has no workers; start some: dask worker {address}")
-        time.sleep(0.1)
+@contextmanager
+def _client(address: str) -> Iterator[Any]:
+    """A connection to a scheduler that has workers."""
+    try:
+        client = _distributed().Client(address, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
+    with client:
+        limit = time.monotonic() + CONNECT_SECONDS
+        while not client.nthreads():
+            if time.monotonic() > limit:
+                raise UsageError(f"the Dask scheduler at {address} has no workers; start some: dask worker {address}")
+            time.sleep(0.1)
+        yield client
+
+
+def _distributed() -> Any:
+    """Dask's package, which is an extra."""
+    try:
+        return import_module("distributed")
+    except ModuleNotFoundError as error:
+        raise UsageError("--scheduler needs Dask: pip install 'physgraph-usd[farm]'") from error
+
+
+def _version() -> str:
+    """Version of the package here; a task is another process's, with another one perhaps."""
+    return str(import_module("physgraph_usd").__version__)
 
 
 def _call(version: str, function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, PhysGraphError | None]:
     """Call a function on a worker; what is wrong with the shot would be wrong on any other, and is not tried again."""
-    from distributed import get_worker
-
-    worker = get_worker()
+    worker = _distributed().get_worker()
     if worker.state.nthreads != 1:
         said = f"the worker {worker.name} has {worker.state.nthreads} threads; start each with --nthreads 1"
         return None, UsageError(said)
-    if version != __version__:
-        said = f"the worker {worker.name} has physgraph-usd {__version__}, this machine {version}; install one version"
+    if version != _version():
+        said = f"the worker {worker.name} has physgraph-usd {_version()}, this machine {version}; install one version"
         return None, UsageError(said)
     try:
         return function(*args), None

@@ -24,7 +24,13 @@ _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGN
 
 
 class Call:
-    """A function at work in a process of its own; it must be picklable, and its arguments and result too."""
+    """A function at work in a process of its own; it must be picklable, and its arguments and result too.
+
+    Attributes:
+        lag: How long after its end the files that it wrote may be hidden [s].
+    """
+
+    lag = 0.0
 
     def __init__(self, function: Callable[..., Any], *args: Any) -> None:
         """Start it."""

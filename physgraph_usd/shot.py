@@ -7,8 +7,8 @@ import os
 import resource
 import sys
 import time as clock
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from .chunks import RUN_UP, solve_in_chunks
 from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
+from .farm import connected, shots_at_once
 from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
 from .lead_in import lead_in
@@ -110,7 +111,7 @@ def refine_shots(
 
     Args:
         jobs: Shot, layer to write and options of each.
-        workers: Shots at a time.
+        workers: Shots at a time; with a scheduler, chunks of each shot, and as many shots as keep its workers busy.
         refine: What refines one of them; it must be picklable.
 
     Returns:
@@ -120,8 +121,11 @@ def refine_shots(
         UsageError: No job was begun: an option is wrong, or a file to write is one that another job reads or writes.
     """
     check_jobs(jobs)
-    alone = [(s, out, dataclasses.replace(options, workers=1, progress=None, say=None)) for s, out, options in jobs]
-    return call_each(refine, alone, workers=workers)
+    scheduler = jobs[0][2].scheduler if jobs else None
+    chunks, at_once = (workers, shots_at_once(scheduler, workers)) if scheduler else (1, workers)
+    alone = [dataclasses.replace(options, workers=chunks, progress=None, say=None) for *_, options in jobs]
+    calls = [(shot, out, options) for (shot, out, _), options in zip(jobs, alone, strict=True)]
+    return call_each(refine, calls, workers=at_once)
 
 
 def check_jobs(jobs: Sequence[Job]) -> None:
@@ -219,8 +223,10 @@ class _ShotSolver:
         self._opened: Shot | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the stage behind: each process opens its own."""
-        return self.__dict__ | {"_opened": None}
+        """Leave the stage behind, since each process opens its own, perhaps in another folder."""
+        weights = self._options.weights
+        options = self._options if weights is None else dataclasses.replace(self._options, weights=weights.absolute())
+        return self.__dict__ | {"_opened": None, "_shot": os.path.abspath(self._shot), "_options": options}
 
     def adopt(self, opened: Shot) -> None:
         """Use an open shot in this process."""
@@ -283,7 +289,7 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
     chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
     times, skip = _to_solve(opened, chunk, options)
     refinements = Refiner.subdivide(opened.scene, solver.levels)
-    began, written, provenance = clock.perf_counter(), 0.0, _provenance(opened, out, options)
+    began, provenance = clock.perf_counter(), _provenance(opened, out, options)
     run = provenance | {"levels": solver.levels, "times": times, "report": options.report is not None}
     frames = FrameFolder(
         frames_folder(out), run, resume=options.resume, drop=options.overwrite, keep=options.keep_frames
@@ -300,29 +306,39 @@ def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOp
             overwrite=options.overwrite,
             chunk=chunk,
         ) as writer,
+        ExitStack() as stack,
     ):
         run_up = _run_up(options)
-        solved = solve_in_chunks(solver, times, frames, workers=options.workers, run_up=run_up, skip=skip)
+        farm = stack.enter_context(connected(options.scheduler)) if options.scheduler else None
+        given = {"workers": options.workers, "run_up": run_up, "skip": skip, "start": farm}
+        solved = stack.enter_context(closing(solve_in_chunks(solver, times, frames, **given)))
         report.warnings += _tell(_resumed(frames, len(times) - skip, run_up), options)
-        with closing(solved):
-            if chunk is not None and chunk.times and times[skip] != chunk.times[0]:
-                _begin_after(next(solved), writer)
-            for done, outcome in enumerate(solved, start=1):
-                written += _take(outcome, writer, report)
-                if options.progress:
-                    options.progress(done, len(chunk.times) if chunk is not None else len(times))
-        if len(report.failed) == len(report.frames):
-            raise SolveError(next(iter(report.failed.values())))
-        report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
-        start = clock.perf_counter()
-        writer.close(lacking={FAILED: list(report.failed) or None, UNSETTLED: len(report.unsettled) or None})
-        report.seconds["close"] = clock.perf_counter() - start
-        report.warnings += [str(notice) for notice in writer.notices] + _of_frames(report)
-        say_what_was(report)
+        if chunk is not None and chunk.times and times[skip] != chunk.times[0]:
+            _begin_after(next(solved), writer)
+        _write_frames(writer, solved, len(chunk.times) if chunk is not None else len(times), options, report=report)
     report.strict = options.strict
-    report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
+
+
+def _write_frames(
+    writer: LayerWriter, solved: Generator[Outcome], count: int, options: RefineOptions, *, report: RefineReport
+) -> None:
+    """Write each frame as it comes, then close the layer."""
+    written = 0.0
+    for done, outcome in enumerate(solved, start=1):
+        written += _take(outcome, writer, report)
+        if options.progress:
+            options.progress(done, count)
+    if len(report.failed) == len(report.frames):
+        raise SolveError(next(iter(report.failed.values())))
+    report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
+    start = clock.perf_counter()
+    writer.close(lacking={FAILED: list(report.failed) or None, UNSETTLED: len(report.unsettled) or None})
+    report.seconds["close"] = clock.perf_counter() - start
+    report.seconds["write"] = written
+    report.warnings += [str(notice) for notice in writer.notices] + _of_frames(report)
+    say_what_was(report)
 
 
 def _run_up(options: RefineOptions) -> int:

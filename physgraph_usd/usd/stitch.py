@@ -387,7 +387,7 @@ def _clip_root(
         UsdUtils.StitchLayers(declared, Usd.ClipsAPI.GenerateClipManifestFromLayers(layers, path))
         clips = Usd.ClipsAPI(stage.OverridePrim(path))
         clips.SetClipPrimPath(path)
-        clips.SetClipAssetPaths(Sdf.AssetPathArray([Sdf.AssetPath(asset_path(p.file, folder)) for p, _ in held]))
+        clips.SetClipAssetPaths([Sdf.AssetPath(asset_path(part.file, folder)) for part, _ in held])
         clips.SetClipManifestAssetPath(Sdf.AssetPath(f"./{manifest}"))
         clips.SetClipActive(Vt.Vec2dArray([(ends[0], index) for index, (_, ends) in enumerate(held)]))
         clips.SetClipTimes(Vt.Vec2dArray([(time, time) for time in (held[0][1][0], held[-1][1][1])]))

@@ -42,7 +42,6 @@ class LayerWriter:
 
     Attributes:
         notices: What was hidden, emptied or changed, and why.
-        targets: Path of each garment's fine mesh.
     """
 
     def __init__(
@@ -82,15 +81,10 @@ class LayerWriter:
         check_targets([("the layer", out)], files_of(shot.path))
         _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
-        self._rate, self._velocities, self._open = _rate(shot.stage), velocities, True
+        self._velocities, self._open = velocities, True
         self._record = {"mode": mode} | dict(provenance or {})
-        self._chunk = chunk
-        self._held = _garments_in(shot, chunk)
+        self._chunk, self._meshes = chunk, dict[int, _RefinedMesh]()
         self.notices: list[Notice] = []
-        self.targets: list[Sdf.Path] = []
-        self._tracks: list[PointTrack] = []
-        self._hints: list[ModelHints] = []
-        self._heat: list[HeatTrack] = []
         with ExitStack() as stack:
             stack.enter_context(termination_raises())
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
@@ -102,36 +96,12 @@ class LayerWriter:
         times = self._shot.scene.times
         span = (times[0], times[-1]) if times else None
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
+        how = {"sibling": self._mode == "sibling", "velocities": self._velocities}
         with pxr_errors(f"cannot read {self._shot.path}"):
-            for index in self._held:
-                self._author_garment(index, refinements[index], span)
-
-    def _author_garment(self, index: int, steps: Sequence[Refinement], span: tuple[float, float] | None) -> None:
-        """Author one garment's defaults and start its track."""
-        stream, source = self._stream, self._shot.sources[index]
-        prim = self._shot.stage.GetPrimAtPath(source.path)
-        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
-        fine = FineMap(self._shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
-        self.notices += overs.open_instances(stream, source)
-        target = source.path
-        if self._mode == "sibling":
-            target = overs.make_sibling(stream, prim)
-        self.targets.append(target)
-        overs.author_topology(stream, target, prim, fine)
-        overs.author_unskinned(stream, target, prim, skinned=source.skinned)
-        self.notices += carry_primvars(stream, target, prim, fine, span=span)
-        self.notices += carry_subsets(stream, target, prim, fine, span=span)
-        self.notices += overs.author_rest_points(stream, target, prim, fine)
-        left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        rest = None if source.skinned or not source.times else _refined_default(prim, fine)
-        normals = VertexNormals(fine.fine, left_handed=left)
-        rate = self._rate if self._velocities or source.velocities else None
-        self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
-        track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
-        self._tracks.append(track)
-        self._heat.append(HeatTrack(stream, target, normals.vertex_count, still=not source.times))
-        purpose = "render" if self._mode == "sibling" else UsdGeom.Imageable(prim).ComputePurpose()
-        self._hints.append(ModelHints(stream, self._shot.stage, source.path, purpose=purpose))
+            for index in _garments_in(self._shot, self._chunk):
+                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **how)
+                self.notices += mesh.notices
+                self._meshes[index] = mesh
 
     def write(
         self,
@@ -156,15 +126,10 @@ class LayerWriter:
         self._check_call(time, points, heat)
         if self._time == -np.inf:
             self._author_values(time)
-        for place, index in enumerate(self._held):
-            array, track = points[index], self._tracks[place]
-            if array is None:
-                continue
-            different = True if changed is None else bool(changed[index])
-            track.write(time, array, self._shot.to_metres(index, time), changed=different)
-            self._hints[place].write(time, track.box)
-            if heat:
-                self._heat[place].write(time, heat[index] or {})
+        for index, mesh in self._meshes.items():
+            if (array := points[index]) is not None:
+                different = True if changed is None else bool(changed[index])
+                mesh.write(time, array, (heat[index] if heat else None) or {}, changed=different)
         self._time = np.inf if time is None else time
 
     def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
@@ -179,8 +144,8 @@ class LayerWriter:
         """
         assert self._chunk is not None, "only a chunk has a run-up"
         found = {
-            str(target): to_local(array, self._shot.to_metres(index, time), str(target), time)
-            for target, index in zip(self.targets, self._held, strict=True)
+            str(mesh.target): to_local(array, self._shot.to_metres(index, time), str(mesh.target), time)
+            for index, mesh in self._meshes.items()
             if (array := points[index]) is not None
         }
         self._chunk = replace(self._chunk, before=time, points=found)
@@ -188,7 +153,7 @@ class LayerWriter:
     def _author_values(self, time: float | None) -> None:
         """Leave the values used on the coarse prims."""
         frame = self._shot.frame(time)
-        for index in self._held:
+        for index in self._meshes:
             source, garment = self._shot.sources[index], self._shot.scene.garments[index]
             author_used_values(self._stream, source, garment, frame.garments[index])
 
@@ -208,10 +173,13 @@ class LayerWriter:
             raise LayerError(f"{len(points)} arrays of points for {count} garments")
         if heat and len(heat) != count:
             raise LayerError(f"heat maps of {len(heat)} garments for {count} garments")
-        for place, index in enumerate(self._held):
-            if (array := points[index]) is not None:
-                self._tracks[place].check(array, time)
-            self._heat[place].check((heat[index] if heat else None) or {}, time)
+        for index, mesh in self._meshes.items():
+            mesh.check(points[index], (heat[index] if heat else None) or {}, time)
+
+    @property
+    def targets(self) -> list[Sdf.Path]:
+        """Path of each garment's fine mesh."""
+        return [mesh.target for mesh in self._meshes.values()]
 
     def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path:
         """Finish, validate and move the layer to its final name.
@@ -227,8 +195,8 @@ class LayerWriter:
         """
         if self._time == -np.inf:
             raise LayerError(f"no time code was written to {self._stream.target}")
-        for track in (*self._tracks, *self._heat):
-            track.finish(hold=self._chunk is not None)
+        for mesh in self._meshes.values():
+            mesh.finish(hold=self._chunk is not None)
         facts = _facts(self._shot, self.targets, self._stream.target)
         facts |= {CHUNK: self._chunk.record()} if self._chunk is not None else {}
         provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
@@ -261,6 +229,74 @@ class LayerWriter:
         finally:
             self._open = False
             self._cleanup.close()
+
+
+class _RefinedMesh:
+    """The refined mesh of one garment as it is written.
+
+    Attributes:
+        target: Its path.
+        notices: What was hidden, emptied or changed, and why.
+    """
+
+    def __init__(
+        self,
+        stream: LayerStream,
+        shot: Shot,
+        index: int,
+        *,
+        steps: Sequence[Refinement],
+        sibling: bool,
+        velocities: bool,
+    ) -> None:
+        """Author one garment's defaults and start its tracks.
+
+        Args:
+            stream: The layer.
+            shot: The shot.
+            index: Which garment.
+            steps: Its refinements, coarse to fine.
+            sibling: Whether it goes beside the coarse mesh.
+            velocities: Whether to author velocities where the shot has none too.
+        """
+        source, times = shot.sources[index], shot.scene.times
+        prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
+        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
+        fine = FineMap(shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
+        self.notices = overs.open_instances(stream, source)
+        self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
+        overs.author_topology(stream, target, prim, fine)
+        overs.author_unskinned(stream, target, prim, skinned=source.skinned)
+        self.notices += carry_primvars(stream, target, prim, fine, span=span)
+        self.notices += carry_subsets(stream, target, prim, fine, span=span)
+        self.notices += overs.author_rest_points(stream, target, prim, fine)
+        left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        rest = None if source.skinned or not source.times else _refined_default(prim, fine)
+        normals = VertexNormals(fine.fine, left_handed=left)
+        rate = _rate(shot.stage) if velocities or source.velocities else None
+        self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
+        self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
+        self._heat = HeatTrack(stream, target, normals.vertex_count, still=not source.times)
+        purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
+        self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
+        self._shot, self._index = shot, index
+
+    def write(self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool) -> None:
+        """Write one time code, as `LayerWriter.write` takes it."""
+        self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed)
+        self._hints.write(time, self._track.box)
+        self._heat.write(time, heat)
+
+    def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
+        """Refuse points and heat maps that do not fit."""
+        if points is not None:
+            self._track.check(points, time)
+        self._heat.check(heat, time)
+
+    def finish(self, *, hold: bool) -> None:
+        """Author what waited for a next sample; ``hold`` as `PointTrack.finish` takes it."""
+        self._track.finish(hold=hold)
+        self._heat.finish(hold=hold)
 
 
 def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path) -> dict[str, Any]:
