@@ -47,7 +47,7 @@ class LayerWriter:
         self,
         shot: Shot,
         refinements: Sequence[Sequence[Refinement]],
-        out: Path,
+        out: Path | None,
         *,
         mode: str = "over",
         velocities: bool = False,
@@ -59,7 +59,7 @@ class LayerWriter:
         Args:
             shot: The opened shot; never edited.
             refinements: Per garment, coarse to fine; none keeps the cage.
-            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``.
+            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``; None for one in memory.
             mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
             velocities: Whether to author velocities, by finite differences, where the shot has none too.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
@@ -74,7 +74,8 @@ class LayerWriter:
             raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
-        check_targets([("the layer", out)], files_of(shot.path))
+        if out is not None:
+            check_targets([("the layer", out)], files_of(shot.path))
         _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._rate, self._velocities, self._open = _rate(shot.stage), velocities, True
@@ -146,7 +147,12 @@ class LayerWriter:
         Raises:
             LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
         """
-        self._check_call(time, points, heat)
+        if not self._open:
+            raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
+        if self._time == np.inf or (time is not None and time <= self._time):
+            raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
+        _check_sizes(self._tracks, points, time)
+        _check_maps(self._heat, heat, time)
         if self._time == -np.inf:
             self._author_values(time)
         for index, track in enumerate(self._tracks):
@@ -166,35 +172,14 @@ class LayerWriter:
         for source, garment, values in zip(self._shot.sources, self._shot.scene.garments, frame.garments, strict=True):
             author_used_values(self._stream, source, garment, values)
 
-    def _check_call(
-        self,
-        time: float | None,
-        points: Sequence[np.ndarray | None],
-        heat: Sequence[Mapping[str, np.ndarray] | None],
-    ) -> None:
-        """Refuse calls that would make a wrong layer."""
-        if not self._open:
-            raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
-        if self._time == np.inf or (time is not None and time <= self._time):
-            raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
-        if len(points) != len(self._tracks):
-            raise LayerError(f"{len(points)} arrays of points for {len(self._tracks)} garments")
-        for track, array in zip(self._tracks, points, strict=True):
-            if array is not None:
-                track.check(array, time)
-        if heat and len(heat) != len(self._heat):
-            raise LayerError(f"heat maps of {len(heat)} garments for {len(self._heat)} garments")
-        for track, maps in zip(self._heat, heat, strict=False):
-            track.check(maps or {}, time)
-
-    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path:
+    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path | None:
         """Finish, validate and move the layer to its final name.
 
         Args:
             lacking: Entries of the record about what the layer lacks.
 
         Returns:
-            The layer's path.
+            The layer's path; None for a layer in memory.
 
         Raises:
             LayerError: The layer is invalid or cannot be written.
@@ -215,10 +200,19 @@ class LayerWriter:
     def _check_written(self) -> None:
         """Validate the first, middle and last sample of what was written."""
         with pxr_errors(f"cannot read {self._shot.path} under the layer written", LayerError):
-            problems = check_layer(self._stream.layer, self._shot.stage.GetRootLayer(), samples=3)
+            problems = check_layer(self._stream.layer, self._shot.view, samples=3)
         errors = [problem for problem in problems if problem.severity == "error"]
         if errors:
             raise LayerError(f"the layer written is invalid ({len(errors)} problems); first: {errors[0]}")
+
+    @property
+    def layer(self) -> Sdf.Layer:
+        """The layer being written, or in memory.
+
+        Raises:
+            LayerError: It is a file that is closed.
+        """
+        return self._stream.layer
 
     def __enter__(self) -> LayerWriter:
         """Return itself."""
@@ -236,11 +230,30 @@ class LayerWriter:
             self._cleanup.close()
 
 
-def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path) -> dict[str, Any]:
+def _check_sizes(tracks: Sequence[PointTrack], points: Sequence[np.ndarray | None], time: float | None) -> None:
+    """Refuse points that do not fit the garments."""
+    if len(points) != len(tracks):
+        raise LayerError(f"{len(points)} arrays of points for {len(tracks)} garments")
+    for track, array in zip(tracks, points, strict=True):
+        if array is not None:
+            track.check(array, time)
+
+
+def _check_maps(
+    tracks: Sequence[HeatTrack], heat: Sequence[Mapping[str, np.ndarray] | None], time: float | None
+) -> None:
+    """Refuse heat maps that do not fit the garments."""
+    if heat and len(heat) != len(tracks):
+        raise LayerError(f"heat maps of {len(heat)} garments for {len(tracks)} garments")
+    for track, maps in zip(tracks, heat, strict=False):
+        track.check(maps or {}, time)
+
+
+def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
     """What the record says of the garments, and of what they were read from."""
     held = zip(targets, shot.sources, strict=True)
     return {
-        "shot": provenance.asset_path(shot.path, out.parent),
+        "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
         "garments": [str(path) for path in targets],
         "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
         "variants": shot.selections or None,
