@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .fabric import PRESETS, Fabric
     from .options import RefineOptions
     from .report import RefineReport
-    from .shot import inspect_shot, refine_shot, refine_shots
+    from .shot import inspect_shot, refine_shot, refine_shots, refine_stage
     from .usd.reader import Shot, open_shot
     from .usd.schema import schema_path
     from .usd.tag import tag
@@ -52,6 +52,7 @@ __all__ = [
     "open_shot",
     "refine_shot",
     "refine_shots",
+    "refine_stage",
     "schema_path",
     "tag",
     "validate_layer",
@@ -70,7 +71,7 @@ _ROOMS = {
     "fabric": ("PRESETS", "Fabric"),
     "options": ("RefineOptions",),
     "report": ("RefineReport",),
-    "shot": ("inspect_shot", "refine_shot", "refine_shots"),
+    "shot": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
     "usd.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
     "usd.tag": ("tag",),

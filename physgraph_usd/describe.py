@@ -22,19 +22,17 @@ from .usd.reader import Shot
 from .usd.stage import GarmentSource
 from .usd.survey import survey
 from .usd.times import within
+from .usd.view import Stage
 
 
-def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
-    """Start the report of a run: choose the levels, and look for what a few frames give away.
+def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> None:
+    """Fill in a report before the first frame: choose the levels, and look for what a few frames give away.
 
     Args:
+        report: An empty one.
         opened: The shot.
         options: The run's options.
-
-    Returns:
-        A report without frames.
     """
-    report = RefineReport(opened.path, None, options.plain())
     first, frames = _first_frame(opened), sample_frames(opened.scene, opened.frame)
     choices = choose_levels(opened.scene, frames)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
@@ -52,7 +50,6 @@ def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
     report.warnings = [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
-    return report
 
 
 def say_what_was(report: RefineReport) -> None:
@@ -95,7 +92,8 @@ def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str
 
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
-    report = begin_report(opened, options)
+    report = RefineReport(opened.path, None, options.plain())
+    begin_report(report, opened, options)
     large = too_large(opened, report, options)
     return {
         "shot": opened.path,
@@ -116,15 +114,15 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     }
 
 
-def describe_meshes(path: str, problem: str) -> dict[str, Any]:
+def describe_meshes(shot: str | Stage, problem: str) -> dict[str, Any]:
     """What can be said of a stage that could not be opened for refining: its meshes, and why not.
 
     Raises:
         StageError: The file cannot be opened at all.
     """
-    found = survey(path)
+    found = survey(shot)
     return {
-        "shot": path,
+        "shot": found.path,
         "metres_per_unit": found.metres_per_unit,
         "problem": problem,
         "meshes": [

@@ -12,6 +12,15 @@ from .usd.atomic import write_text
 DONE, FAILED, IN_PART = 0, 1, 3
 
 
+def is_of_failure(path: Path) -> bool:
+    """Whether a file is the report of a run that failed, which the next run may replace."""
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8")) if path.suffix == ".json" else None
+    except (OSError, ValueError):
+        return False
+    return isinstance(plain, dict) and bool(plain.get("error")) and "exit_code" in plain
+
+
 @dataclass(eq=False)
 class RefineReport:
     """What `refine_shot` did.
@@ -32,6 +41,7 @@ class RefineReport:
         warnings: What the user should know.
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB].
+        error: What ended the run; "" for one that came to its end.
     """
 
     shot: str
@@ -49,10 +59,13 @@ class RefineReport:
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float = 0.0
+    error: str = ""
 
     @property
     def exit_code(self) -> int:
-        """0 done, 1 every frame failed, 3 done in part: some failed, or where that is strict some did not settle."""
+        """0 done, 1 it failed, 3 done in part: some frames failed, or where that is strict some did not settle."""
+        if self.error:
+            return FAILED
         if not self.failed:
             return IN_PART if self.unsettled and self.strict else DONE
         return FAILED if len(self.failed) == len(self.frames) else IN_PART

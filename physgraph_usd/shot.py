@@ -8,7 +8,7 @@ import resource
 import sys
 import time as clock
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .processes import call_each, memory_is_named
-from .report import RefineReport
+from .report import RefineReport, is_of_failure
 from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
 from .usd.atomic import check_place
@@ -36,6 +36,8 @@ from .usd.chunk import Chunk, chunk_of
 from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
 from .usd.provenance import FAILED, UNSETTLED, asset_path, file_hashes, is_result_of, write_root
 from .usd.reader import Shot, open_shot
+from .usd.stage import shot_name
+from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
 
 MOST_LANES = 4
@@ -60,44 +62,95 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         SolveError: No frame could be solved.
         LayerError: The layer cannot be written.
     """
-    began = clock.perf_counter()
     out = Path(out)
     check_jobs([(shot, out, options)])
     if not options.dry_run:
         _check_places(out, options)
-    with memory_is_named():
-        return _refine(shot, out, options, began=began)
-
-
-def _refine(shot: str | Path, out: Path, options: RefineOptions, *, began: float) -> RefineReport:
-    opened = _open(shot, options)
-    try:
-        report = begin_report(opened, options)
-        report.seconds["open"] = clock.perf_counter() - began
-        if large := too_large(opened, report, options):
-            raise large
-        if options.dry_run:
-            return report
-        if options.resume and _is_done(opened, out, options):
-            report.warnings.append(f"{out} is taken as done: the same files, options and version made it")
-            report.out = out
+    with _run(str(shot), options) as (opened, report):
+        if options.dry_run or _is_done(opened, out, options, report):
             return report
         _check_new(out, options)
-        _tell(report.warnings, options)
-        solver = _ShotSolver(str(shot), [garment["level"] for garment in report.garments], options)
-        solver.adopt(opened)
-        _write_layer(opened, solver, out, options, report)
-        report.seconds["total"] = clock.perf_counter() - began
-        report.peak_memory_mb = _peak_memory_mb()
-        report.out = out
+        _refine(opened, out, options, report)
         if options.root is not None:
             files = {"layer": out, "shot": Path(shot), "absolute": options.asset_paths == "absolute"}
             write_root(Path(options.root), **files, overwrite=options.overwrite)
         if options.report is not None:
             _write_report(report, Path(options.report), opened)
-    finally:
-        opened.close()
     return report
+
+
+def refine_stage(
+    stage: Stage, options: RefineOptions = DEFAULTS, *, on_report: Callable[[RefineReport], None] | None = None
+) -> Layer:
+    """Refine the garments of an open stage into a layer in memory.
+
+        layer = pg.refine_stage(stage)
+        stage.GetSessionLayer().subLayerPaths.insert(0, layer.identifier)
+
+    The stage is read as it stands: session layer, edits that are not saved, muted layers, variant selections, payloads
+    and population. Neither it nor any of its layers is changed.
+
+    Args:
+        stage: The open stage.
+        options: What to do and how. An open stage lives in one process and its result in memory, so ``workers``,
+            ``resume``, ``dry_run``, ``root`` and a folder for the report are refused; a report's JSON file is written.
+        on_report: Called with the report, also of a run that failed.
+
+    Returns:
+        An anonymous layer, to be laid over the stage or exported; keep it alive as long as a stage names it. Frames
+        that could not be solved have no sample in it: they are in the report's ``failed`` and the layer's
+        ``customLayerData["physgraph"]["failed"]``.
+
+    Raises:
+        UsageError: An option is wrong, or of no use here.
+        StageError: The stage cannot be read as asked, or what it makes does not fit in memory.
+        SolveError: No frame could be solved.
+        LayerError: The layer is invalid, or the report cannot be written.
+    """
+    _check_of_stage(stage, options)
+    with _run(stage, options, on_report=on_report) as (opened, report):
+        layer = _refine(opened, None, options, report)
+        if options.report is not None:
+            _write_report(report, Path(options.report), opened)
+    assert layer is not None
+    return layer
+
+
+@contextmanager
+def _run(
+    shot: str | Stage, options: RefineOptions, *, on_report: Callable[[RefineReport], None] | None = None
+) -> Iterator[tuple[Shot, RefineReport]]:
+    """Open a shot and begin its report; a run that fails, not one used wrongly, writes it where it was asked for."""
+    report = RefineReport(shot_name(shot), None, options.plain())
+    began = clock.perf_counter()
+    try:
+        with memory_is_named(), closing(_open(shot, options)) as opened:
+            begin_report(report, opened, options)
+            report.seconds["open"] = clock.perf_counter() - began
+            if large := too_large(opened, report, options):
+                raise large
+            yield opened, report
+    except PhysGraphError as error:
+        report.error = str(error)
+        if not isinstance(error, UsageError):
+            _write_failure(report, options)
+        raise
+    finally:
+        if on_report is not None:
+            on_report(report)
+
+
+def _refine(opened: Shot, out: Path | None, options: RefineOptions, report: RefineReport) -> Layer | None:
+    """Solve and write all frames; returns the layer where it is in memory."""
+    began = clock.perf_counter()
+    _tell(report.warnings, options)
+    solver = _ShotSolver(opened.path, [garment["level"] for garment in report.garments], options)
+    solver.adopt(opened)
+    layer = _write_layer(opened, solver, out, options, report=report)
+    report.seconds["total"] = report.seconds["open"] + clock.perf_counter() - began
+    report.peak_memory_mb = _peak_memory_mb()
+    report.out = out
+    return layer
 
 
 Job = tuple[str | Path, Path, RefineOptions]
@@ -158,21 +211,48 @@ def _check_places(out: Path, options: RefineOptions) -> None:
 
 def _check_new(out: Path, options: RefineOptions) -> None:
     for _, path in options.targets(out):
-        if path.is_file() and not options.overwrite:
-            raise UsageError(f"{path} exists; choose another name or allow overwriting")
+        _check_none(path, options)
 
 
-def _is_done(opened: Shot, out: Path, options: RefineOptions) -> bool:
-    """Whether a run with these options has made everything there is to make, from the same files."""
-    made = all(path.is_file() for _, path in options.targets(out)) and not frames_folder(out).exists()
-    return made and is_result_of(out, _provenance(opened, out, options), settled=options.strict)
+def _check_none(path: Path, options: RefineOptions) -> None:
+    if path.is_file() and not (options.overwrite or is_of_failure(path)):
+        raise UsageError(f"{path} exists; choose another name or allow overwriting")
 
 
-def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
+def _is_done(opened: Shot, out: Path, options: RefineOptions, report: RefineReport) -> bool:
+    """Whether a run to go on with has made everything there is to make, from the same files; the report says so."""
+    made = options.resume and all(path.is_file() for _, path in options.targets(out))
+    if not made or frames_folder(out).exists():
+        return False
+    if not is_result_of(out, _provenance(opened, out, options), settled=options.strict):
+        return False
+    report.warnings.append(f"{out} is taken as done: the same files, options and version made it")
+    report.out = out
+    return True
+
+
+def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
+    """Refuse what an open stage cannot be refined with, and to write the report over a file that it is made of."""
+    options.check()
+    if options.workers > 1:
+        raise UsageError(f"workers is {options.workers}: an open stage lives in one process; save it, or take 1")
+    for name in ("resume", "dry_run", "root", "scheduler", "run_up"):
+        if getattr(options, name):
+            raise UsageError(f"{name} is for layers on disk; an open stage is refined into a layer in memory")
+    if options.report is not None:
+        report = Path(options.report)
+        if json_of(report) != report:
+            raise UsageError(f"the report of an open stage is a file: {report} does not end with .json")
+        check_targets([("the report", report)], files_of(stage))
+        check_place(report)
+        _check_none(report, options)
+
+
+def inspect_shot(shot: str | Path | Stage, **given: Any) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found.
 
     Args:
-        shot: The stage to read.
+        shot: The stage to read, a file or open.
         given: Options of `RefineOptions` that concern reading.
 
     Returns:
@@ -184,22 +264,18 @@ def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
         UsageError: An option is wrong.
     """
     options = RefineOptions(**given)
+    source = str(shot) if isinstance(shot, Path) else shot
     try:
-        opened = _open(shot, options)
+        with closing(_open(source, options)) as opened:
+            return describe(opened, options)
     except StageError as error:
-        return describe_meshes(str(shot), str(error))
-    try:
-        return describe(opened, options)
-    except StageError as error:
-        return describe_meshes(str(shot), str(error))
-    finally:
-        opened.close()
+        return describe_meshes(source, str(error))
 
 
-def _open(shot: str | Path, options: RefineOptions) -> Shot:
+def _open(shot: str | Stage, options: RefineOptions) -> Shot:
     """Open a shot with the options that concern reading."""
     return open_shot(
-        str(shot),
+        shot,
         garments=options.garments,
         colliders=options.colliders,
         frames=options.frames if options.run_up is None else None,
@@ -232,7 +308,7 @@ class _ShotSolver:
         """Use an open shot in this process."""
         self._opened = opened
 
-    def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
+    def __call__(self, times: Sequence[float | None]) -> Generator[Outcome]:
         """Solve time codes in order; one that fails yields its error, and the next starts from the last good one."""
         device = self._options.device
         prepare_device(device)
@@ -285,40 +361,29 @@ def prepare_device(device: str) -> None:
         raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device cpu")
 
 
-def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOptions, report: RefineReport) -> None:
+def _write_layer(
+    opened: Shot, solver: _ShotSolver, out: Path | None, options: RefineOptions, *, report: RefineReport
+) -> Layer | None:
+    """Solve and write all frames; returns the layer where it is in memory."""
     chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
     times, skip = _to_solve(opened, chunk, options)
-    refinements = Refiner.subdivide(opened.scene, solver.levels)
+    leads = chunk is not None and times[skip] not in (None, *chunk.times)
     began, provenance = clock.perf_counter(), _provenance(opened, out, options)
-    run = provenance | {"levels": solver.levels, "times": times, "report": options.report is not None}
-    frames = FrameFolder(
-        frames_folder(out), run, resume=options.resume, drop=options.overwrite, keep=options.keep_frames
-    )
-    with (
-        frames,
-        LayerWriter(
-            opened,
-            refinements,
-            out,
-            mode=options.mode,
-            velocities=options.velocities,
-            provenance=provenance,
-            overwrite=options.overwrite,
-            chunk=chunk,
-        ) as writer,
-        ExitStack() as stack,
-    ):
-        run_up = _run_up(options)
-        farm = stack.enter_context(connected(options.scheduler)) if options.scheduler else None
-        given = {"workers": options.workers, "run_up": run_up, "skip": skip, "start": farm}
-        solved = stack.enter_context(closing(solve_in_chunks(solver, times, frames, **given)))
-        report.warnings += _tell(_resumed(frames, len(times) - skip, run_up), options)
-        if chunk is not None and chunk.times and times[skip] != chunk.times[0]:
+    made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite, "chunk": chunk}
+    refinements = Refiner.subdivide(opened.scene, solver.levels)
+    with ExitStack() as stack:
+        frames = None if out is None else stack.enter_context(_frames(solver, times, out, options, provenance))
+        writer = stack.enter_context(LayerWriter(opened, refinements, out, provenance=provenance, **made))
+        solved = solver(times) if frames is None else _solved(solver, times, frames, options, report, skip=skip)
+        stack.enter_context(closing(solved))
+        if leads:
             _begin_after(next(solved), writer)
-        _write_frames(writer, solved, len(chunk.times) if chunk is not None else len(times), options, report=report)
+        _write_frames(writer, solved, len(times) - skip - leads, options, report=report)
+        layer = writer.layer if out is None else None
     report.strict = options.strict
     report.seconds["frames"] = clock.perf_counter() - began
     report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
+    return layer
 
 
 def _write_frames(
@@ -330,7 +395,7 @@ def _write_frames(
         written += _take(outcome, writer, report)
         if options.progress:
             options.progress(done, count)
-    if len(report.failed) == len(report.frames):
+    if len(report.failed) == count:
         raise SolveError(next(iter(report.failed.values())))
     report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
     start = clock.perf_counter()
@@ -339,6 +404,32 @@ def _write_frames(
     report.seconds["write"] = written
     report.warnings += [str(notice) for notice in writer.notices] + _of_frames(report)
     say_what_was(report)
+
+
+def _frames(
+    solver: _ShotSolver, times: list[float | None], out: Path, options: RefineOptions, provenance: dict[str, Any]
+) -> FrameFolder:
+    """The folder of a run's finished frames."""
+    run = provenance | {"levels": solver.levels, "times": times, "report": options.report is not None}
+    kept = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames}
+    return FrameFolder(frames_folder(out), run, **kept)
+
+
+def _solved(
+    solver: _ShotSolver,
+    times: list[float | None],
+    frames: FrameFolder,
+    options: RefineOptions,
+    report: RefineReport,
+    *,
+    skip: int,
+) -> Generator[Outcome]:
+    """Frames in order, those of an interrupted run among them; ``skip`` as `solve_in_chunks` takes it."""
+    run_up = _run_up(options)
+    report.warnings += _tell(_resumed(frames, len(times) - skip, run_up), options)
+    given = {"workers": options.workers, "run_up": run_up, "skip": skip}
+    with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
+        yield from solve_in_chunks(solver, times, frames, **given, start=farm)
 
 
 def _run_up(options: RefineOptions) -> int:
@@ -433,13 +524,23 @@ def _of_garments(report: RefineReport, tell: Callable[[str, Any], list[str]], na
     return said
 
 
-def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:
-    folder, absolute = out.resolve().parent, options.asset_paths == "absolute"
+def _write_failure(report: RefineReport, options: RefineOptions) -> None:
+    """Write the JSON of a run that failed, over no file that may not be replaced; its own error is told."""
+    if options.report is not None and not options.dry_run:
+        file = json_of(Path(options.report))
+        with suppress(LayerError):
+            if options.overwrite or not file.exists() or is_of_failure(file):
+                report.write(file)
+
+
+def _provenance(opened: Shot, out: Path | None, options: RefineOptions) -> dict[str, Any]:
+    folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
     return {
         "version": __version__,
         "options": options.plain(),
-        "shot": asset_path(opened.path, folder, absolute=absolute),
+        "shot": None if opened.view.root.anonymous else asset_path(opened.path, folder, absolute=absolute),
         "inputs": file_hashes(opened.stage, folder, absolute=absolute),
+        "unsaved": list(opened.unsaved) or None,
     }
 
 

@@ -10,6 +10,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel
 from .chunk import read_chunk
 from .provenance import read_record
 from .rules import Problem, code_of
+from .stage import root_metadata
 
 _SAME = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
 
@@ -24,7 +25,7 @@ def record(layer: Sdf.Layer) -> Iterator[Problem]:
     found = read_record(layer)
     if found is None:
         yield _error('has no customLayerData["physgraph"]; is it a refined layer?')
-    elif not found.get("garments") or not found.get("shot"):
+    elif not found.get("garments") or not (found.get("shot") or found.get("unsaved")):
         yield _error("its record names no garments or no shot")
 
 
@@ -60,9 +61,8 @@ def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
     if layer.timeCodesPerSecond != shot.GetTimeCodesPerSecond():
         said = f"timeCodesPerSecond is {layer.timeCodesPerSecond:g}; the shot has {shot.GetTimeCodesPerSecond():g}"
         yield _error(said)
-    root = shot.GetRootLayer().pseudoRoot
     for key in _SAME:
-        wanted = root.GetInfo(key) if root.HasInfo(key) else None
+        wanted = root_metadata(shot, key)
         found = layer.pseudoRoot.GetInfo(key) if layer.pseudoRoot.HasInfo(key) else None
         if wanted is not None and found != wanted:
             yield _error(f"{key} is {found!r}; the shot has {wanted!r}")

@@ -26,6 +26,7 @@ from .stage import is_there, pxr_errors
 from .stream import LayerStream
 from .times import within
 from .validate import check_layer
+from .view import StageView
 
 SEAM_BOUND = 0.05
 """Largest difference at a seam, RMS over a garment, in mean fine edge lengths. `docs/farm.md` has what was measured."""
@@ -293,8 +294,8 @@ def _write_layer(parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[
         for path in record["garments"]:
             _author_velocities(stream, path, {t for part in parts for t in _ends(part.layer, f"{path}.velocities")})
         stream.flush()
-        root = Sdf.Layer.FindOrOpen(str(shot)) if is_there(shot) else None
-        errors = [each for each in check_layer(stream.layer, root, samples=3) if each.severity == "error"]
+        below = StageView.of_layer(Sdf.Layer.FindOrOpen(str(shot))) if is_there(shot) else None
+        errors = [each for each in check_layer(stream.layer, below, samples=3) if each.severity == "error"]
         if errors:
             raise LayerError(f"the joined layer is invalid ({len(errors)} problems); first: {errors[0]}")
         stream.commit()

@@ -48,7 +48,7 @@ class LayerWriter:
         self,
         shot: Shot,
         refinements: Sequence[Sequence[Refinement]],
-        out: Path,
+        out: Path | None,
         *,
         mode: str = "over",
         velocities: bool = False,
@@ -61,7 +61,7 @@ class LayerWriter:
         Args:
             shot: The opened shot; never edited.
             refinements: Per garment, coarse to fine; none keeps the cage.
-            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``.
+            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``; None for one in memory.
             mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
             velocities: Whether to author velocities, by finite differences, where the shot has none too.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
@@ -78,7 +78,8 @@ class LayerWriter:
             raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
-        check_targets([("the layer", out)], files_of(shot.path))
+        if out is not None:
+            check_targets([("the layer", out)], files_of(shot.path))
         _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._velocities, self._open = velocities, True
@@ -123,7 +124,11 @@ class LayerWriter:
         Raises:
             LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
         """
-        self._check_call(time, points, heat)
+        if not self._open:
+            raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
+        if self._time == np.inf or (time is not None and time <= self._time):
+            raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
+        _check_sizes(self._meshes, len(self._shot.sources), points, heat=heat, time=time)
         if self._time == -np.inf:
             self._author_values(time)
         for index, mesh in self._meshes.items():
@@ -157,38 +162,19 @@ class LayerWriter:
             source, garment = self._shot.sources[index], self._shot.scene.garments[index]
             author_used_values(self._stream, source, garment, frame.garments[index])
 
-    def _check_call(
-        self,
-        time: float | None,
-        points: Sequence[np.ndarray | None],
-        heat: Sequence[Mapping[str, np.ndarray] | None],
-    ) -> None:
-        """Refuse calls that would make a wrong layer."""
-        if not self._open:
-            raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
-        if self._time == np.inf or (time is not None and time <= self._time):
-            raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
-        count = len(self._shot.sources)
-        if len(points) != count:
-            raise LayerError(f"{len(points)} arrays of points for {count} garments")
-        if heat and len(heat) != count:
-            raise LayerError(f"heat maps of {len(heat)} garments for {count} garments")
-        for index, mesh in self._meshes.items():
-            mesh.check(points[index], (heat[index] if heat else None) or {}, time)
-
     @property
     def targets(self) -> list[Sdf.Path]:
         """Path of each garment's fine mesh."""
         return [mesh.target for mesh in self._meshes.values()]
 
-    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path:
+    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path | None:
         """Finish, validate and move the layer to its final name.
 
         Args:
             lacking: Entries of the record about what the layer lacks.
 
         Returns:
-            The layer's path.
+            The layer's path; None for a layer in memory.
 
         Raises:
             LayerError: The layer is invalid or cannot be written.
@@ -210,10 +196,19 @@ class LayerWriter:
     def _check_written(self) -> None:
         """Validate the first, middle and last sample of what was written."""
         with pxr_errors(f"cannot read {self._shot.path} under the layer written", LayerError):
-            problems = check_layer(self._stream.layer, self._shot.stage.GetRootLayer(), samples=3)
+            problems = check_layer(self._stream.layer, self._shot.view, samples=3)
         errors = [problem for problem in problems if problem.severity == "error"]
         if errors:
             raise LayerError(f"the layer written is invalid ({len(errors)} problems); first: {errors[0]}")
+
+    @property
+    def layer(self) -> Sdf.Layer:
+        """The layer being written, or in memory.
+
+        Raises:
+            LayerError: It is a file that is closed.
+        """
+        return self._stream.layer
 
     def __enter__(self) -> LayerWriter:
         """Return itself."""
@@ -299,11 +294,28 @@ class _RefinedMesh:
         self._heat.finish(hold=hold)
 
 
-def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path) -> dict[str, Any]:
+def _check_sizes(
+    meshes: Mapping[int, _RefinedMesh],
+    count: int,
+    points: Sequence[np.ndarray | None],
+    *,
+    heat: Sequence[Mapping[str, np.ndarray] | None],
+    time: float | None,
+) -> None:
+    """Refuse points and heat maps that do not fit the garments, of which there are ``count``."""
+    if len(points) != count:
+        raise LayerError(f"{len(points)} arrays of points for {count} garments")
+    if heat and len(heat) != count:
+        raise LayerError(f"heat maps of {len(heat)} garments for {count} garments")
+    for index, mesh in meshes.items():
+        mesh.check(points[index], (heat[index] if heat else None) or {}, time)
+
+
+def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
     """What the record says of the garments, and of what they were read from."""
     held = zip(targets, shot.sources, strict=False)
     return {
-        "shot": provenance.asset_path(shot.path, out.parent),
+        "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
         "garments": [str(path) for path in targets],
         "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
         "variants": shot.selections or None,
