@@ -183,7 +183,7 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 
 
 @main.command()
-@click.argument("chunks", nargs=-1, required=True, metavar="CHUNK...", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("chunks", nargs=-1, required=True, metavar="CHUNK...", type=click.Path(path_type=Path))
 @out_option("LAYER", "Layer to write.")
 @click.option("--frames", type=FrameRange(), help="Time codes that must be there.  [default: all of the shot]")
 @click.option(
@@ -197,7 +197,7 @@ def refine(shots: tuple[str, ...], out: Path, *, report: Path | None, root: Path
 def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
     """Join each CHUNK of a shot, as refine --run-up writes them, into one layer and print its path.
 
-    How far each seam moves goes to stderr.
+    A folder stands for all layers in it. How far each seam moves goes to stderr.
     """
     from .usd.stitch import stitch as join
 

@@ -52,6 +52,7 @@ def fails(kind: str) -> int:
     return os.getpid()
 
 
+@pytest.mark.slow
 def test_h34_a_worker_that_is_killed_changes_no_byte(cluster: Any, shot: Path, tmp_path: Path):
     """A worker dies in the middle of its chunk; another one takes the chunk over."""
     local = layer_of(shot, tmp_path / "local", workers=4)
@@ -73,6 +74,7 @@ def test_h34_a_worker_that_is_killed_changes_no_byte(cluster: Any, shot: Path, t
     assert [file.name for file in farmed.parent.iterdir()] == ["fine.usdc"]
 
 
+@pytest.mark.slow
 def test_several_shots_each_in_chunks(cluster: Any, tmp_path: Path):
     """By the command, from another folder than the workers', and a shot that is broken leaves the others alone."""
     shots = [cloth_shot(tmp_path / f"{name}.usdc") for name in ("one", "two")]
@@ -94,7 +96,7 @@ def test_several_shots_each_in_chunks(cluster: Any, tmp_path: Path):
     [
         ("garment", GarmentError, "</World/cloth> at time code 5: torn"),
         ("bug", PhysGraphError, "unexpected ValueError on a worker: a bug"),
-        ("dies", SolveError, "perhaps for lack of memory"),
+        pytest.param("dies", SolveError, "perhaps for lack of memory", marks=pytest.mark.slow),
     ],
 )
 def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exception], said: str):
@@ -107,7 +109,7 @@ def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exceptio
 def test_workers_of_several_threads_are_refused():
     with (
         distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, host="127.0.0.1"
+            n_workers=1, threads_per_worker=2, processes=True, dashboard_address=None, host="127.0.0.1"
         ) as two,
         connected(two.scheduler_address) as start,
     ):

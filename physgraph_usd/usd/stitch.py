@@ -87,7 +87,7 @@ def stitch(
     """Join chunks of one shot into one layer.
 
     Args:
-        chunks: Layers that `refine_shot` wrote with ``run_up``, in any order.
+        chunks: Layers that `refine_shot` wrote with ``run_up``, in any order; a folder stands for all layers in it.
         out: Layer to write.
         frames: First and last time code that the layer must have; None for all of the shot.
         seam_bound: Largest difference at a seam, RMS over a garment, in mean fine edge lengths.
@@ -105,9 +105,10 @@ def stitch(
     """
     out = Path(out)
     with pxr_errors("cannot read the chunks", LayerError):
-        parts = sorted(map(_open, dict.fromkeys(map(Path, chunks))), key=lambda part: part.chunk.times)
+        files = dict.fromkeys(file for named in chunks for file in _layers_in(Path(named)))
+        parts = sorted(map(_open, files), key=lambda part: part.chunk.times)
         if not parts:
-            raise UsageError("there are no chunks to stitch")
+            raise UsageError(f"there are no chunks to stitch in {', '.join(map(str, chunks)) or 'no files'}")
         shot = _check_alike(parts)
         _check_frames(parts, frames)
         seams = [seam for pair in pairwise(parts) for seam in _seams(*pair)]
@@ -123,6 +124,13 @@ def _targets(out: Path, *, clips: bool) -> dict[str, Path]:
     """Files to write, by what they are."""
     beside = {"topology": out.with_suffix(".topology.usdc"), "manifest": out.with_suffix(".manifest.usda")}
     return {"layer": out} | (beside if clips else {})
+
+
+def _layers_in(place: Path) -> list[Path]:
+    """The layers in a folder but those that are being written; a file is its own only one."""
+    if not place.is_dir():
+        return [place]
+    return [file for file in sorted(place.iterdir()) if file.suffix in LAYER_SUFFIXES and ".tmp." not in file.name]
 
 
 def _open(file: Path) -> _Part:
