@@ -224,15 +224,15 @@ def _seams(before: _Part, after: _Part) -> Iterator[Seam]:
     if time is None or not before.chunk.times or time != before.chunk.times[-1]:
         return
     for path, run_up in after.chunk.points.items():
-        there = _points_at(before.layer, path, time)
+        there = points_at(before.layer, path, time)
         if there is None or there.shape != run_up.shape:
             continue
-        distances = np.linalg.norm(there.astype(np.float64) - run_up, axis=1) / _mean_edge(after.layer, path, there)
+        distances = np.linalg.norm(there.astype(np.float64) - run_up, axis=1) / mean_edge(after.layer, path, there)
         rms, largest = float(np.sqrt(np.mean(distances**2))), float(distances.max(initial=0.0))
         yield Seam(time, after.chunk.times[0], path, rms, largest)
 
 
-def _points_at(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
+def points_at(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
     """Points of a layer at one of its frames; between equal samples only the first and the last are written."""
     name = f"{path}.points"
     found, low, _ = layer.GetBracketingTimeSamplesForPath(name, time)
@@ -240,7 +240,7 @@ def _points_at(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
     return None if value is None or isinstance(value, Sdf.ValueBlock) else np.asarray(value)
 
 
-def _mean_edge(layer: Sdf.Layer, path: str, points: np.ndarray) -> float:
+def mean_edge(layer: Sdf.Layer, path: str, points: np.ndarray) -> float:
     """Mean length of the edges of a fine mesh's faces, in its own units."""
     counts, indices = (
         np.asarray(layer.GetAttributeAtPath(f"{path}.{name}").default)
