@@ -256,7 +256,7 @@ def _check_seams(parts: Sequence[_Part], seams: Sequence[Seam], bound: float) ->
     """Refuse a seam that moves too far, or of which nothing is known though frames depend on one another."""
     worst = max(seams, key=lambda seam: seam.rms, default=None)
     if worst is not None and worst.rms > bound:
-        remedy = "give a longer --run-up, or a larger --seam-bound"
+        remedy = "refine with a longer --run-up or with --temporal off, or allow more by --seam-bound"
         raise LayerError(f"{worst}; at most {bound:g} RMS is allowed: {remedy}")
     known = {seam.after for seam in seams}
     for part in parts[1:] if dict(parts[0].record["options"]).get("temporal") != "off" else ():
