@@ -24,7 +24,7 @@ NOWHERE = "tcp://127.0.0.1:9"
 def cluster() -> Iterator[Any]:
     """Two worker processes of one thread each."""
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", host="127.0.0.1"
     ) as started:
         yield started
 
@@ -106,10 +106,16 @@ def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exceptio
         assert start(fails, "").result() != os.getpid()
 
 
+def test_workers_of_another_version_are_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("physgraph_usd.farm._version", lambda: "0.0.0")
+    with connected(cluster.scheduler_address) as start, pytest.raises(UsageError, match=r"this machine 0\.0\.0"):
+        start(fails, "").result()
+
+
 def test_workers_of_several_threads_are_refused():
     with (
         distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=True, dashboard_address=None, host="127.0.0.1"
+            n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0", host="127.0.0.1"
         ) as two,
         connected(two.scheduler_address) as start,
     ):

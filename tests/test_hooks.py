@@ -55,8 +55,8 @@ class TestPublishHook:
         refine(file, tmp_path / "command.usdc")
         ours, theirs = (Sdf.Layer.FindOrOpen(str(tmp_path / name)) for name in ("cloth.usdc", "command.usdc"))
         for time in (1.0, 2.0, 3.0):
-            values = [layer.QueryTimeSample(f"{CLOTH}.points", time) for layer in (ours, theirs)]
-            assert np.array_equal(*map(np.asarray, values))
+            one, other = (np.asarray(layer.QueryTimeSample(f"{CLOTH}.points", time)) for layer in (ours, theirs))
+            assert np.array_equal(one, other)
 
     def test_publishes_nothing_where_a_frame_failed(self, stage: Usd.Stage, tmp_path: Path):
         points = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr()
@@ -71,7 +71,7 @@ class TestPyblish:
     @pytest.fixture
     def run(self, tmp_path: Path) -> Any:
         """Publish with our plug-ins alone; the context, whose ``results`` say what became of each."""
-        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base")
+        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which hides our package tests")
         util = importlib.import_module("pyblish.util")
         api.deregister_all_plugins()
         api.deregister_all_paths()
@@ -120,7 +120,8 @@ class TestSolaris:
         edits.timeCodesPerSecond = incoming.GetTimeCodesPerSecond()
         root = Sdf.Layer.CreateAnonymous("root.usda")
         root.timeCodesPerSecond = incoming.GetTimeCodesPerSecond()
-        root.subLayerPaths = [edits.identifier, str(file)]
+        for below in (edits.identifier, str(file)):
+            root.subLayerPaths.append(below)
         whole = Usd.Stage.Open(root)
         whole.SetMetadata("metersPerUnit", UsdGeom.GetStageMetersPerUnit(incoming))
         parms = {
