@@ -219,11 +219,22 @@ def odd_shot(tmp_path: Path) -> Path:
     return Path(save(stage))
 
 
-def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(odd_shot: Path, tmp_path: Path):
+def same(one: object, other: object) -> bool:
+    """Whether two values are equal; between samples up to the rounding of USD's interpolation."""
+    if one == other or one is None or other is None:
+        return one == other
+    a, b = np.asarray(one), np.asarray(other)
+    return a.shape == b.shape and a.dtype.kind == "f" and bool(np.allclose(a, b, rtol=0.0, atol=1e-6))
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(
+    odd_shot: Path, tmp_path: Path, *, velocities: bool
+):
     """Defaults, runs of equal frames, velocities at seams, boxes, heat maps; of garments in some chunks only, too."""
-    options: dict[str, Any] = {"temporal": "off", "velocities": True, "heat_map": True}
+    options: dict[str, Any] = {"temporal": "off", "velocities": velocities, "heat_map": True}
     refine(odd_shot, tmp_path / "one.usdc", **options)
-    chunks = refine_chunks(odd_shot, tmp_path, [(1.0, 3.0), (4.0, 6.0), (7.0, 8.0)], **options)
+    chunks = refine_chunks(odd_shot, tmp_path, [(1.0, 3.0), (4.0, 7.0), (8.0, 8.0)], **options)
     assert stitch(chunks, tmp_path / "joined.usdc") == []
     assert faults(tmp_path / "joined.usdc", odd_shot) == []
     one, joined = (open_over(odd_shot, tmp_path / name) for name in ("one.usdc", "joined.usdc"))
@@ -232,7 +243,7 @@ def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(odd_shot: P
         for attribute in prim.GetAuthoredAttributes():
             other = joined.GetAttributeAtPath(attribute.GetPath())
             for code in [Usd.TimeCode.Default(), *map(Usd.TimeCode, np.arange(1.0, 8.5, 0.5))]:
-                assert attribute.Get(code) == other.Get(code), (attribute, code)
+                assert same(attribute.Get(code), other.Get(code)), (attribute, code)
             compared += 1
     assert compared > 40
     records = [read_record(Sdf.Layer.FindOrOpen(str(tmp_path / name))) or {} for name in ("one.usdc", "joined.usdc")]
@@ -256,7 +267,7 @@ class TestClips:
         assert clips.GetAttributeAtPath(f"{CLOTH}.points").GetTimeSamples() == list(TIMES)
 
     def test_of_garments_that_not_every_chunk_has(self, odd_shot: Path, tmp_path: Path):
-        chunks = refine_chunks(odd_shot, tmp_path, [(1.0, 3.0), (4.0, 6.0), (7.0, 8.0)], temporal="off")
+        chunks = refine_chunks(odd_shot, tmp_path, [(1.0, 3.0), (4.0, 7.0), (8.0, 8.0)], temporal="off")
         stitch(chunks, tmp_path / "joined.usdc")
         stitch(chunks, tmp_path / "clips.usda", clips=True)
         joined, clips = (open_over(odd_shot, tmp_path / name) for name in ("joined.usdc", "clips.usda"))
