@@ -14,6 +14,8 @@ import importlib
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+from .version import __version__ as __version__
+
 if TYPE_CHECKING:
     from .errors import (
         GarmentError,
@@ -32,8 +34,6 @@ if TYPE_CHECKING:
     from .usd.schema import schema_path
     from .usd.tag import tag
     from .usd.validate import validate_layer
-
-__version__ = "0.1.0"
 
 __all__ = [
     "PRESETS",

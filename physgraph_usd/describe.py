@@ -25,13 +25,16 @@ from .usd.times import within
 from .usd.view import Stage
 
 
-def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> None:
+def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> list[str]:
     """Fill in a report before the first frame: choose the levels, and look for what a few frames give away.
 
     Args:
         report: An empty one.
         opened: The shot.
         options: The run's options.
+
+    Returns:
+        What the user should know.
     """
     first, frames = _first_frame(opened), sample_frames(opened.scene, opened.frame)
     choices = choose_levels(opened.scene, frames)
@@ -49,7 +52,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
-    report.warnings = [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
+    return [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
 
 
 def say_what_was(report: RefineReport) -> None:
@@ -93,7 +96,7 @@ def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
     report = RefineReport(opened.path, None, options.plain())
-    begin_report(report, opened, options)
+    warnings = begin_report(report, opened, options)
     large = too_large(opened, report, options)
     return {
         "shot": opened.path,
@@ -110,7 +113,7 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
             garment.path: [defect.message for defect in defects(garment.mesh, garment.rest)]
             for garment in opened.scene.garments
         },
-        "warnings": report.warnings,
+        "warnings": warnings,
     }
 
 

@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import Any
 
 from .errors import PhysGraphError, SolveError, UsageError
+from .version import __version__
 
 RETRIES = 2
 """How often a task is begun again after an error that nobody foresaw, such as a disk that was not there."""
@@ -82,7 +83,7 @@ def connected(address: str) -> Iterator[Start]:
     with _client(address) as client:
 
         def start(function: Callable[..., Any], *args: Any) -> FarmCall:
-            return FarmCall(client.submit(_call, _version(), function, args, pure=False, retries=RETRIES))
+            return FarmCall(client.submit(_call, __version__, function, args, pure=False, retries=RETRIES))
 
         yield start
 
@@ -121,19 +122,14 @@ def _distributed() -> Any:
         raise UsageError("--scheduler needs Dask: pip install 'physgraph-usd[farm]'") from error
 
 
-def _version() -> str:
-    """Version of the package here; a task is another process's, with another one perhaps."""
-    return str(import_module("physgraph_usd").__version__)
-
-
 def _call(version: str, function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, PhysGraphError | None]:
     """Call a function on a worker; what is wrong with the shot would be wrong on any other, and is not tried again."""
     worker = _distributed().get_worker()
     if worker.state.nthreads != 1:
         said = f"the worker {worker.name} has {worker.state.nthreads} threads; start each with --nthreads 1"
         return None, UsageError(said)
-    if version != _version():
-        said = f"the worker {worker.name} has physgraph-usd {_version()}, this machine {version}; install one version"
+    if version != __version__:
+        said = f"the worker {worker.name} has physgraph-usd {__version__}, this machine {version}; install one version"
         return None, UsageError(said)
     try:
         return function(*args), None

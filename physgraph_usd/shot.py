@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import resource
 import sys
 import time as clock
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -13,9 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import warp as wp
 
-from . import __version__
 from .chunks import RUN_UP, solve_in_chunks
 from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
@@ -24,11 +21,12 @@ from .farm import connected, shots_at_once
 from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
 from .lead_in import lead_in
+from .mesh.lanes import start_warp
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .processes import call_each, memory_is_named
-from .report import RefineReport, is_of_failure
+from .report import LOG, RefineReport, is_of_failure
 from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
 from .usd.atomic import check_place
@@ -39,10 +37,16 @@ from .usd.reader import Shot, open_shot
 from .usd.stage import shot_name
 from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
+from .version import __version__
 
+try:
+    import resource
+except ImportError:  # Windows has none.
+    resource = None
 MOST_LANES = 4
 """Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
 DEFAULTS = RefineOptions()
+Outcomes = Generator[Outcome, None, None]
 
 
 def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFAULTS) -> RefineReport:
@@ -64,6 +68,8 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     """
     out = Path(out)
     check_jobs([(shot, out, options)])
+    if skipped := _skipped(shot, out, options):
+        return skipped
     if not options.dry_run:
         _check_places(out, options)
     with _run(str(shot), options) as (opened, report):
@@ -121,14 +127,15 @@ def _run(
     shot: str | Stage, options: RefineOptions, *, on_report: Callable[[RefineReport], None] | None = None
 ) -> Iterator[tuple[Shot, RefineReport]]:
     """Open a shot and begin its report; a run that fails, not one used wrongly, writes it where it was asked for."""
-    report = RefineReport(shot_name(shot), None, options.plain())
+    report = RefineReport(shot_name(shot), None, options.plain(), options.told_sources())
     began = clock.perf_counter()
     try:
         with memory_is_named(), closing(_open(shot, options)) as opened:
-            begin_report(report, opened, options)
+            warnings = begin_report(report, opened, options)
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
                 raise large
+            report.warn(*warnings)
             yield opened, report
     except PhysGraphError as error:
         report.error = str(error)
@@ -143,7 +150,6 @@ def _run(
 def _refine(opened: Shot, out: Path | None, options: RefineOptions, report: RefineReport) -> Layer | None:
     """Solve and write all frames; returns the layer where it is in memory."""
     began = clock.perf_counter()
-    _tell(report.warnings, options)
     solver = _ShotSolver(opened.path, [garment["level"] for garment in report.garments], options)
     solver.adopt(opened)
     layer = _write_layer(opened, solver, out, options, report=report)
@@ -176,18 +182,42 @@ def refine_shots(
     check_jobs(jobs)
     scheduler = jobs[0][2].scheduler if jobs else None
     chunks, at_once = (workers, shots_at_once(scheduler, workers)) if scheduler else (1, workers)
-    alone = [dataclasses.replace(options, workers=chunks, progress=None, say=None) for *_, options in jobs]
-    calls = [(shot, out, options) for (shot, out, _), options in zip(jobs, alone, strict=True)]
-    return call_each(refine, calls, workers=at_once)
+    skipped = [_skipped(*job) for job in jobs]
+    alone = [
+        (shot, out, dataclasses.replace(options, workers=chunks, progress=None))
+        for (shot, out, options), there in zip(jobs, skipped, strict=True)
+        if there is None
+    ]
+    return _in_order(skipped, call_each(refine, alone, workers=at_once))
 
 
-def check_jobs(jobs: Sequence[Job]) -> None:
+def _in_order(
+    skipped: Sequence[RefineReport | None], done: Generator[RefineReport | PhysGraphError, None, None]
+) -> Iterator[RefineReport | PhysGraphError]:
+    with closing(done):
+        for there in skipped:
+            yield next(done) if there is None else there
+
+
+def _skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
+    """The report of a shot whose layer is there already and is to be left, or None."""
+    if not options.skip_existing or not out.is_file():
+        return None
+    LOG.info("skipped: %s is there", out, extra={"shot": str(shot)})
+    return RefineReport(str(shot), out, options.plain(), options.told_sources(), skipped=True)
+
+
+def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
     """Refuse options that no shot could be refined with, and to write over what is read or written by any of the jobs.
+
+    Args:
+        jobs: Shot, layer to write and options of each.
+        also: What else is to be written.
 
     Raises:
         UsageError: With the value, and the file.
     """
-    targets: list[Target] = []
+    targets = [*also]
     inputs: set[Path] = set()
     for shot, out, options in jobs:
         options.check()
@@ -226,7 +256,7 @@ def _is_done(opened: Shot, out: Path, options: RefineOptions, report: RefineRepo
         return False
     if not is_result_of(out, _provenance(opened, out, options), settled=options.strict):
         return False
-    report.warnings.append(f"{out} is taken as done: the same files, options and version made it")
+    report.warn(f"{out} is taken as done: the same files, options and version made it")
     report.out = out
     return True
 
@@ -294,7 +324,7 @@ class _ShotSolver:
 
     def __init__(self, shot: str, levels: list[int], options: RefineOptions) -> None:
         self.levels = levels
-        self._shot, self._options = shot, dataclasses.replace(options, progress=None, say=None)
+        self._shot, self._options = shot, dataclasses.replace(options, progress=None)
         self._lanes = min(MOST_LANES, max(1, (os.cpu_count() or 1) // options.workers))
         self._opened: Shot | None = None
 
@@ -308,7 +338,7 @@ class _ShotSolver:
         """Use an open shot in this process."""
         self._opened = opened
 
-    def __call__(self, times: Sequence[float | None]) -> Generator[Outcome]:
+    def __call__(self, times: Sequence[float | None]) -> Outcomes:
         """Solve time codes in order; one that fails yields its error, and the next starts from the last good one."""
         device = self._options.device
         prepare_device(device)
@@ -354,8 +384,7 @@ def prepare_device(device: str) -> None:
     Raises:
         UsageError: CUDA was asked for and is not there.
     """
-    wp.config.log_level = wp.LOG_WARNING
-    wp.init()
+    start_warp()
     torch.set_num_threads(1)
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device cpu")
@@ -382,17 +411,24 @@ def _write_layer(
         layer = writer.layer if out is None else None
     report.strict = options.strict
     report.seconds["frames"] = clock.perf_counter() - began
-    report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
+    report.warn(*map(str, opened.warnings))
     return layer
 
 
 def _write_frames(
-    writer: LayerWriter, solved: Generator[Outcome], count: int, options: RefineOptions, *, report: RefineReport
+    writer: LayerWriter,
+    solved: Outcomes,
+    count: int,
+    options: RefineOptions,
+    *,
+    report: RefineReport,
 ) -> None:
     """Write each frame as it comes, then close the layer."""
-    written = 0.0
+    written, shot = 0.0, {"shot": report.shot}
     for done, outcome in enumerate(solved, start=1):
         written += _take(outcome, writer, report)
+        LOG.info("frame %d of %d: time code %s", done, count, _time_name(outcome.time), extra=shot)
+        LOG.debug("%s", outcome.record, extra=shot)
         if options.progress:
             options.progress(done, count)
     if len(report.failed) == count:
@@ -402,7 +438,7 @@ def _write_frames(
     writer.close(lacking={FAILED: list(report.failed) or None, UNSETTLED: len(report.unsettled) or None})
     report.seconds["close"] = clock.perf_counter() - start
     report.seconds["write"] = written
-    report.warnings += [str(notice) for notice in writer.notices] + _of_frames(report)
+    report.warn(*map(str, writer.notices), *_of_frames(report))
     say_what_was(report)
 
 
@@ -423,10 +459,10 @@ def _solved(
     report: RefineReport,
     *,
     skip: int,
-) -> Generator[Outcome]:
+) -> Outcomes:
     """Frames in order, those of an interrupted run among them; ``skip`` as `solve_in_chunks` takes it."""
     run_up = _run_up(options)
-    report.warnings += _tell(_resumed(frames, len(times) - skip, run_up), options)
+    report.warn(*_resumed(frames, len(times) - skip, run_up))
     given = {"workers": options.workers, "run_up": run_up, "skip": skip}
     with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
         yield from solve_in_chunks(solver, times, frames, **given, start=farm)
@@ -454,14 +490,6 @@ def _begin_after(outcome: Outcome, writer: LayerWriter) -> None:
         writer.begin_after(outcome.time, outcome.points)
 
 
-def _tell(warnings: list[str], options: RefineOptions) -> list[str]:
-    """Say warnings before the first frame, and return them."""
-    if options.say is not None:
-        for warning in warnings:
-            options.say(warning)
-    return warnings
-
-
 def _resumed(frames: FrameFolder, count: int, run_up: int) -> list[str]:
     """A warning where frames of an earlier run are used, or could have been."""
     if frames.dropped:
@@ -477,13 +505,17 @@ def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
     """Write one time code's result and record it; returns the seconds that writing took."""
     report.frames.append(outcome.record)
     if not outcome.points:
-        name = "default" if outcome.time is None else f"{outcome.time:g}"
+        name = _time_name(outcome.time)
         report.failed[name] = str(outcome.record["error"])
-        report.warnings.append(f"no sample is written at time code {name}: {report.failed[name]}")
+        report.warn(f"no sample is written at time code {name}: {report.failed[name]}")
         return 0.0
     start = clock.perf_counter()
     writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused], heat=outcome.heat)
     return clock.perf_counter() - start
+
+
+def _time_name(time: float | None) -> str:
+    return "default" if time is None else f"{time:g}"
 
 
 def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
@@ -525,7 +557,7 @@ def _of_garments(report: RefineReport, tell: Callable[[str, Any], list[str]], na
 
 
 def _write_failure(report: RefineReport, options: RefineOptions) -> None:
-    """Write the JSON of a run that failed, over no file that may not be replaced; its own error is told."""
+    """Write the JSON of a run that failed over no file that may not be replaced; that error is the one told."""
     if options.report is not None and not options.dry_run:
         file = json_of(Path(options.report))
         with suppress(LayerError):
@@ -544,7 +576,10 @@ def _provenance(opened: Shot, out: Path | None, options: RefineOptions) -> dict[
     }
 
 
-def _peak_memory_mb() -> float:
-    """Peak resident memory of this process [MB]; Linux counts kilobytes, macOS bytes."""
+def _peak_memory_mb() -> float | None:
+    """Peak resident memory of this process [MB]; None where the system does not tell, as on Windows."""
+    if resource is None:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Linux counts kilobytes, macOS bytes.
     return round(peak / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)

@@ -107,7 +107,7 @@ def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exceptio
 
 
 def test_workers_of_another_version_are_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("physgraph_usd.farm._version", lambda: "0.0.0")
+    monkeypatch.setattr("physgraph_usd.farm.__version__", "0.0.0")
     with connected(cluster.scheduler_address) as start, pytest.raises(UsageError, match=r"this machine 0\.0\.0"):
         start(fails, "").result()
 

@@ -13,9 +13,9 @@ from .actions import Actions
 class PhysGraphContainer(PluginContainer):
     """Registers the commands and puts them into a menu."""
 
-    def registerPlugins(self, plugRegistry: Any, usdviewApi: Any) -> None:
+    def registerPlugins(self, plugRegistry: Any, plugCtx: Any) -> None:
         """Register the commands."""
-        del usdviewApi
+        del plugCtx
         actions = Actions()
         commands = {
             "refine": ("Refine Current Frame", actions.refine_frame),
