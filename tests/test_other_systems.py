@@ -12,7 +12,8 @@ from shots import cloth_shot, command
 POSIX_ONLY = ("fcntl", "grp", "pwd", "resource", "termios")
 BLOCKED = f"""
 import sys, types
-import torch, warp, scipy.sparse.linalg, trimesh, click._termui_impl, pxr.Usd  # what they do on other systems is their business
+# What others do on other systems is their business.
+import torch, warp, scipy.sparse.linalg, trimesh, click._termui_impl, pxr.Usd
 held = types.ModuleType("msvcrt")
 held.LK_NBLCK, held.locked = 2, []
 held.locking = lambda handle, mode, size: held.locked.append(handle)
