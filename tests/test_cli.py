@@ -44,10 +44,10 @@ def run(*args: object) -> Result:
 
 @pytest.fixture
 def refined(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
-    """Calls of refine_shot, which does nothing here; an element's ``report`` is what it returns."""
+    """Calls of refine_shot, which does nothing here."""
     calls: list[SimpleNamespace] = []
 
-    def refine_shot(shot: str, out: Path, options: object) -> SimpleNamespace:
+    def refine_shot(shot: str, out: Path, options: object) -> RefineReport:
         calls.append(SimpleNamespace(shot=shot, out=out, options=options))
         return RefineReport(shot, out, {})
 
@@ -206,12 +206,12 @@ class TestRefine:
         from physgraph_usd.integrate import METHODS
 
         said = run("refine", "--help").output
-        headings = ["Files:", "Scene:", "Solver:", "Layer:", "Several shots", "What is said:", "Options:"]
+        headings = ["Files:", "Scene:", "Solver:", "Layer:", "Several shots, and", "What is said:", "Options:"]
         assert [said.index(heading) for heading in headings] == sorted(said.index(heading) for heading in headings)
         assert tuple(METHODS) == INTEGRATORS
-        words = " ".join(said.split())
-        assert "physgraph- paper. [default: auto]" in words
-        assert "Most steps at the finest level. [default: 12; x>=0]" in words
+        letters = "".join(said.split())
+        assert ",".join(METHODS) + ".[default:auto]" in letters
+        assert "Moststepsatthefinestlevel.[default:12;x>=0]" in letters
         assert "denim" in run("tag", "--help").output
 
 
@@ -221,7 +221,7 @@ class TestSeveralShots:
         """What refine_shots is asked for; it does nothing here."""
         asked: list[tuple[str, Path, Any]] = []
 
-        def refine_shots(jobs: list[tuple[str, Path, Any]], **_: object) -> list[SimpleNamespace]:
+        def refine_shots(jobs: list[tuple[str, Path, Any]], **_: object) -> list[RefineReport]:
             asked.extend(jobs)
             return [RefineReport(shot, out, {}) for shot, out, _ in jobs]
 
@@ -358,9 +358,8 @@ class TestErrors:
         assert (result.exit_code, result.stderr) == (1, f"error: {tmp_path / 'run.toml'}: File exists\n")
 
     def test_done_in_part_is_3(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        report = RefineReport(
-            "a.usda", tmp_path / "a.usdc", {}, failed={"3": "is torn"}, frames=[{}, {}], seconds={"frames": 1.0}
-        )
+        report = RefineReport("a.usda", tmp_path / "a.usdc", {}, failed={"3": "is torn"})
+        report.frames, report.seconds = [{}, {}], {"frames": 1.0}
 
         def refine_shot(*_: object) -> RefineReport:
             report.warn("frame 3 failed")

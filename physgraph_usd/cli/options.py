@@ -74,7 +74,7 @@ scene_options = together(
         "overrides",
         multiple=True,
         metavar="PRIM.ATTR=VALUE",
-        help="Override an attribute, such as material:preset=denim for all garments; repeatable.",
+        help="Override an attribute, such as bendStiffness=2e-4 for all garments; repeatable.",
     ),
     _scene(
         "--rest",

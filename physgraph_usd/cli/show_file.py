@@ -3,7 +3,7 @@
 [refine]
 level = 2
 self-contact = "auto"
-set = ["material:preset=denim"]
+set = ["bendStiffness=2e-4"]
 """
 
 from __future__ import annotations

@@ -70,6 +70,6 @@ class GroupedCommand(click.Command):
             record = param.get_help_record(ctx) if isinstance(param, click.Option) else None
             if record is not None:
                 groups.setdefault(param.heading if isinstance(param, Option) else "Options", []).append(record)
-        for heading, records in groups.items():
+        for heading in sorted(groups, key="Options".__eq__):  # what has no heading comes last
             with formatter.section(heading):
-                formatter.write_dl(records)
+                formatter.write_dl(groups[heading])
