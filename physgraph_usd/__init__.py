@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .shot import inspect_shot, refine_shot, refine_shots, refine_stage
     from .usd.reader import Shot, open_shot
     from .usd.schema import schema_path
+    from .usd.stitch import stitch
     from .usd.tag import tag
     from .usd.validate import validate_layer
 
@@ -54,6 +55,7 @@ __all__ = [
     "refine_shots",
     "refine_stage",
     "schema_path",
+    "stitch",
     "tag",
     "validate_layer",
 ]
@@ -74,6 +76,7 @@ _ROOMS = {
     "shot": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
     "usd.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
+    "usd.stitch": ("stitch",),
     "usd.tag": ("tag",),
     "usd.validate": ("validate_layer",),
 }

@@ -172,6 +172,23 @@ class TestRefused:
             refine_chunks(cloth_shot(tmp_path / "shot.usdc"), tmp_path, [(7.0, 9.0)])
 
 
+def test_frames_that_failed_are_told_of_and_leave_their_seam_unknown(tmp_path: Path):
+    shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: float("nan")})
+    chunks = [tmp_path / "c1.usdc", tmp_path / "c2.usdc"]
+    codes = [
+        refine(shot, chunk, frames=span, run_up=2).exit_code
+        for chunk, span in zip(chunks, ((1.0, 3.0), (4.0, 6.0)), strict=True)
+    ]
+    assert codes == [3, 0]
+    with pytest.raises(LayerError, match="nothing tells how far the seam at 4 moves"):
+        stitch(chunks, tmp_path / "joined.usdc")
+    stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf"))
+    assert sample_times(tmp_path / "joined.usdc") == (1.0, 2.0, 4.0, 5.0, 6.0)
+    record = read_record(Sdf.Layer.FindOrOpen(str(tmp_path / "joined.usdc")))
+    assert record is not None
+    assert list(record["failed"]) == ["3"]
+
+
 def test_part_of_a_shot_is_stitched_where_it_is_asked_for(runs: Runs, tmp_path: Path):
     with pytest.raises(UsageError, match=r"chunk37\.usdc holds the frames 37:48, of which some lie outside --frames"):
         stitch(runs.chunks[1:], tmp_path / "joined.usdc", frames=(13.0, 36.0))
