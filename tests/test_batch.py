@@ -184,6 +184,12 @@ class TestLogging:
         assert sum(f"ERROR {shots[1]}: " in line for line in lines) == done.stderr.count("error: ") == 1
         assert "frame 1 of 2" not in done.stderr
 
+    def test_it_is_never_appended_to_the_shot(self, tmp_path: Path) -> None:
+        shot = cloth_shot(tmp_path / "good.usda", times=(1.0,))
+        before = shot.read_bytes()
+        done = run("refine", shot, "-o", tmp_path / "o.usdc", "--log-file", shot, *SMALL)
+        assert (done.exit_code, "the log" in done.stderr, shot.read_bytes()) == (2, True, before)
+
     def test_more_is_said_when_asked(self, tmp_path: Path) -> None:
         shot = cloth_shot(tmp_path / "good.usda", times=(1.0, 2.0))
         said = run("refine", shot, "-o", tmp_path / "o.usdc", "-v", *SMALL).stderr

@@ -81,9 +81,10 @@ def test_a_report_of_a_run_that_ended_well_is_kept(tmp_path: Path) -> None:
     shot, file = cloth_shot(tmp_path / "s.usda", times=(1.0,)), tmp_path / "report.json"
     refine(shot, tmp_path / "fine.usdc", report=file)
     before = file.read_bytes()
-    with pytest.raises(Exception, match="exists"):
-        refine(shot, tmp_path / "other.usdc", report=file, garments=["/World/gone"])
-    assert file.read_bytes() == before
+    for resume, said in ((False, "exists"), (True, "gone")):
+        with pytest.raises(PhysGraphError, match=said):
+            refine(shot, tmp_path / "other.usdc", report=file, garments=["/World/gone"], resume=resume)
+        assert file.read_bytes() == before
 
 
 def test_values_are_told_with_where_they_are_from(tmp_path: Path) -> None:

@@ -59,12 +59,16 @@ def refine(
     Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
     comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
     """
+    from ..shot import check_jobs
     from ..usd.atomic import termination_raises
 
     jobs = _jobs(ctx, shots, out)
     layers = [layer for _, layer, _ in jobs]
     verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
     saying = Saying(verbose, log_file, in_lines, several=len(jobs) > 1)
+    also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
+    if also:
+        check_jobs(jobs, also=also)
     with termination_raises(), _folder_of(layers, out, dry_run=dry_run), saying.logged():
         code = _refine_each(jobs, saying, summary=None if dry_run else summary)
     sys.exit(code)
@@ -89,11 +93,9 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
 
 def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -> int:
     """Refine the jobs and say of each what became of it; returns the exit code."""
-    from ..shot import check_jobs
     from ..summary import check_summary, exit_code_of, row_of, table_of, write_summary
 
     if summary is not None:
-        check_jobs(jobs, also=[("the summary", summary)])
         check_summary(summary, overwrite=jobs[0][2].overwrite)
     rows: list[Row] = []
     failed: list[PhysGraphError] = []
