@@ -14,6 +14,8 @@ import importlib
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+from .version import __version__ as __version__
+
 if TYPE_CHECKING:
     from .errors import (
         GarmentError,
@@ -27,13 +29,12 @@ if TYPE_CHECKING:
     from .fabric import PRESETS, Fabric
     from .options import RefineOptions
     from .report import RefineReport
-    from .shot import inspect_shot, refine_shot, refine_shots
+    from .shot import inspect_shot, refine_shot, refine_shots, refine_stage
     from .usd.reader import Shot, open_shot
     from .usd.schema import schema_path
+    from .usd.stitch import stitch
     from .usd.tag import tag
     from .usd.validate import validate_layer
-
-__version__ = "0.1.0"
 
 __all__ = [
     "PRESETS",
@@ -52,7 +53,9 @@ __all__ = [
     "open_shot",
     "refine_shot",
     "refine_shots",
+    "refine_stage",
     "schema_path",
+    "stitch",
     "tag",
     "validate_layer",
 ]
@@ -70,9 +73,10 @@ _ROOMS = {
     "fabric": ("PRESETS", "Fabric"),
     "options": ("RefineOptions",),
     "report": ("RefineReport",),
-    "shot": ("inspect_shot", "refine_shot", "refine_shots"),
+    "shot": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
     "usd.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
+    "usd.stitch": ("stitch",),
     "usd.tag": ("tag",),
     "usd.validate": ("validate_layer",),
 }

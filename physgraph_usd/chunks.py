@@ -10,6 +10,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Generator, Iterator, Sequence
 from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,6 +23,25 @@ RUN_UP = 6
 
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 """Solves time codes in order; must be picklable to run in several processes."""
+
+
+class Work(Protocol):
+    """A function at work in another process, as `Call` is."""
+
+    lag: float
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has returned, failed or died."""
+        ...
+
+    def result(self) -> Any:
+        """What the function returned; raises what ended it."""
+        ...
+
+    def end(self) -> None:
+        """End it, if it is still at work."""
+        ...
 
 
 def chunks_of(missing: Sequence[int], workers: int) -> list[list[range]]:
@@ -42,7 +62,14 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
 
 
 def solve_in_chunks(
-    solver: Solver, times: Sequence[float | None], frames: FrameFolder, *, workers: int, run_up: int = RUN_UP
+    solver: Solver,
+    times: Sequence[float | None],
+    frames: FrameFolder,
+    *,
+    workers: int,
+    run_up: int = RUN_UP,
+    skip: int = 0,
+    start: Callable[..., Work] | None = None,
 ) -> Generator[Outcome, None, None]:
     """Solve all time codes but those that are kept, in this process or in several, and yield all in order.
 
@@ -52,22 +79,27 @@ def solve_in_chunks(
         frames: Where results go; frames in its ``kept`` are taken from there.
         workers: Number of processes; 1 solves in this one.
         run_up: Frames solved before each chunk but the first of the shot.
+        skip: How many of the first time codes serve for a run-up alone; they are not yielded.
+        start: What starts a function in a process of its own, with its arguments, in place of `Call`; then one chunk
+            is not solved in this process either.
 
     Raises:
         SolveError: A process died.
         LayerError: A result cannot be written.
     """
-    shares = chunks_of([k for k in range(len(times)) if k not in frames.kept], workers)
-    if len(shares) < 2:
+    wanted = range(skip, len(times))
+    shares = chunks_of([k for k in wanted if k not in frames.kept], workers)
+    if len(shares) < 2 and start is None:
         solved = (pair for share in shares for pair in _solve(solver, times, share, frames=frames, run_up=run_up))
-        for index, time in enumerate(times):
+        for index in wanted:
+            time = times[index]
             yield (frames.read(index, time) if index in frames.kept else next(solved, (0, None))[1]) or _lost(time)
         return
-    calls = [Call(_work, solver, list(times), share, frames, run_up) for share in shares]
+    calls = [(start or Call)(_work, solver, list(times), share, frames, run_up) for share in shares]
     owners = {k: call for share, call in zip(shares, calls, strict=True) for part in share for k in part}
     try:
-        for index, time in enumerate(times):
-            yield _collect(frames, index, time, owner=owners.get(index))
+        for index in wanted:
+            yield _collect(frames, index, times[index], owner=owners.get(index))
     finally:
         for call in calls:
             call.end()
@@ -94,8 +126,9 @@ def _work(
         pass
 
 
-def _collect(frames: FrameFolder, index: int, time: float | None, *, owner: Call | None) -> Outcome:
+def _collect(frames: FrameFolder, index: int, time: float | None, *, owner: Work | None) -> Outcome:
     """Wait for one frame's file and read it."""
+    ended: float | None = None
     while True:
         over = owner is None or owner.ready
         outcome = frames.read(index, time)
@@ -104,7 +137,9 @@ def _collect(frames: FrameFolder, index: int, time: float | None, *, owner: Call
         if over:
             if owner is not None:
                 owner.result()
-            _lost(time)
+            ended = ended or clock.monotonic()
+            if owner is None or clock.monotonic() - ended >= owner.lag:
+                _lost(time)
         clock.sleep(POLL_SECONDS)
 
 

@@ -21,19 +21,21 @@ from .strain import strained_parts, stretched
 from .usd.reader import Shot
 from .usd.stage import GarmentSource
 from .usd.survey import survey
+from .usd.times import within
+from .usd.view import Stage
 
 
-def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
-    """Start the report of a run: choose the levels, and look for what a few frames give away.
+def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> list[str]:
+    """Fill in a report before the first frame: choose the levels, and look for what a few frames give away.
 
     Args:
+        report: An empty one.
         opened: The shot.
         options: The run's options.
 
     Returns:
-        A report without frames.
+        What the user should know.
     """
-    report = RefineReport(opened.path, None, options.plain())
     first, frames = _first_frame(opened), sample_frames(opened.scene, opened.frame)
     choices = choose_levels(opened.scene, frames)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
@@ -50,8 +52,7 @@ def begin_report(opened: Shot, options: RefineOptions) -> RefineReport:
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
-    report.warnings = [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
-    return report
+    return [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
 
 
 def say_what_was(report: RefineReport) -> None:
@@ -88,12 +89,14 @@ def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> Gar
 def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
     """What decides the size of a run beside its garments."""
     levels = [garment["level"] for garment in report.garments]
-    return {"levels": levels, "frames": max(len(opened.scene.times), 1), "workers": options.workers}
+    times = opened.scene.times if options.run_up is None else within(opened.scene.times, options.frames)
+    return {"levels": levels, "frames": max(len(times), 1), "workers": options.workers}
 
 
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
-    report = begin_report(opened, options)
+    report = RefineReport(opened.path, None, options.plain())
+    warnings = begin_report(report, opened, options)
     large = too_large(opened, report, options)
     return {
         "shot": opened.path,
@@ -110,19 +113,19 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
             garment.path: [defect.message for defect in defects(garment.mesh, garment.rest)]
             for garment in opened.scene.garments
         },
-        "warnings": report.warnings,
+        "warnings": warnings,
     }
 
 
-def describe_meshes(path: str, problem: str) -> dict[str, Any]:
+def describe_meshes(shot: str | Stage, problem: str) -> dict[str, Any]:
     """What can be said of a stage that could not be opened for refining: its meshes, and why not.
 
     Raises:
         StageError: The file cannot be opened at all.
     """
-    found = survey(path)
+    found = survey(shot)
     return {
-        "shot": path,
+        "shot": found.path,
         "metres_per_unit": found.metres_per_unit,
         "problem": problem,
         "meshes": [

@@ -100,7 +100,8 @@ class FrameFolder:
         self.dropped = 0 if resume or different else len(found)
         if not self.kept:
             self._clear()
-        (self.folder / RUN).write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+        self._run = json.dumps(wanted, indent=2) + "\n"
+        (self.folder / RUN).write_text(self._run, encoding="utf-8")
 
     def _check_ours(self) -> None:
         names = {file.name for file in self.folder.glob("*")}
@@ -124,11 +125,16 @@ class FrameFolder:
     def _file(self, index: int, suffix: str = _DONE) -> Path:
         return self.folder / f"{index}{suffix}"
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Name the folder for processes that may be at work elsewhere."""
+        return self.__dict__ | {"folder": self.folder.absolute()}
+
     def write(self, index: int, outcome: Outcome) -> None:
         """Write what came of a frame.
 
         Raises:
-            LayerError: The disk is full, or the folder is gone.
+            LayerError: The disk is full, or the folder is gone or another run's: a task on another machine may outlast
+                the run that it is of.
         """
         arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
@@ -136,6 +142,8 @@ class FrameFolder:
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
         temporary = temporary_path(self._file(index), suffix="")
         try:
+            if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
+                raise LayerError(f"{self.folder} is another run's by now")
             with temporary.open("wb") as stream:
                 np.savez(stream, **arrays)
             temporary.replace(self._file(index, _DONE if outcome.points else _FAILED))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,14 +11,15 @@ from .usd.atomic import HOST
 
 LOCK = "run.lock"
 """The file that is held; it says by whom."""
-if sys.platform == "win32":
+try:
+    import fcntl
+except ImportError:  # Windows has another module.
     import msvcrt
 
     def _hold(handle: int) -> None:
         os.lseek(handle, 1 << 20, os.SEEK_SET)  # what is held there cannot be read
-        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
 else:
-    import fcntl
 
     def _hold(handle: int) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

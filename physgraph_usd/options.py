@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,8 @@ REPORT_NAME, PAGE_NAME = "report.json", "report.html"
 SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
 """Forms of contact of cloth with cloth by their names on the command line."""
 _NOT_OF_THE_RESULT = {
-    "progress", "say", "report", "overwrite", "dry_run", "workers", "root", "asset_paths", "resume",
-    "keep_frames", "strict",
+    "progress", "report", "overwrite", "dry_run", "workers", "root", "asset_paths", "resume", "keep_frames", "strict",
+    "skip_existing", "sources", "scheduler",
 }  # fmt: skip
 
 
@@ -51,12 +51,16 @@ class RefineOptions:
         potential: "continuum" or "paper".
         contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
         self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
-        workers: Processes that share the frames.
+        workers: Processes that share the frames; with a scheduler, tasks.
+        run_up: Frames solved before ``frames`` and not written: the layer is a chunk, which `stitch` joins to others.
+            None for a layer by itself.
+        scheduler: Address of a Dask scheduler whose workers solve the frames, or None.
         report: JSON file to write, or a folder for it and a page, or None.
         overwrite: Replace files that exist.
         dry_run: Read and check everything, write nothing.
         resume: Go on from the finished frames of a run that was interrupted, in ``<layer>.frames``; a layer that the
             same run has finished is left as it is.
+        skip_existing: Leave a shot whose layer is there already as it is.
         keep_frames: Leave finished frames there when the run is interrupted.
         velocities: Also write point velocities of garments that have none in the shot.
         heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
@@ -65,7 +69,7 @@ class RefineOptions:
         strict: Count a shot with frames that did not settle as done in part.
         asset_paths: "relative" or "absolute": how the layer and the root name other files.
         progress: Called with (frames done, frames in all), or None.
-        say: Called with each warning that is known before the first frame, then; or None.
+        sources: Where values are from, by the option's name, for the report: "command line" or a file.
     """
 
     frames: tuple[float, float] | None = None
@@ -85,10 +89,13 @@ class RefineOptions:
     contact: str = "quadratic"
     self_contact: str = "auto"
     workers: int = 1
+    run_up: int | None = None
+    scheduler: str | None = None
     report: Path | None = None
     overwrite: bool = False
     dry_run: bool = False
     resume: bool = False
+    skip_existing: bool = False
     keep_frames: bool = True
     velocities: bool = False
     heat_map: bool = False
@@ -97,17 +104,29 @@ class RefineOptions:
     strict: bool = False
     asset_paths: str = "relative"
     progress: Callable[[int, int], None] | None = None
-    say: Callable[[str], None] | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
         """The options that decide the result, ready for JSON."""
         names = {f.name for f in dataclasses.fields(self)} - _NOT_OF_THE_RESULT
         # A layer without these is as it was before there were any.
-        names -= {name for name in ("heat_map", "weights") if not getattr(self, name)}
+        names -= {
+            name
+            for name in ("heat_map", "weights", "run_up")
+            if getattr(self, name) is None or getattr(self, name) is False
+        }
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         if self.weights:
             values["weights"] = {"file": str(self.weights), "sha256": weights_hash(self.weights)}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    def told_sources(self) -> dict[str, str]:
+        """Where the value of each option that decides the result is from: as told, "default", or "given" to Python."""
+        fields = {f.name: f for f in dataclasses.fields(self)}
+        return {
+            name: self.sources.get(name, "default" if getattr(self, name) == fields[name].default else "given")
+            for name in self.plain()
+        }
 
     def contact_settings(self) -> ContactSettings:
         """The part that concerns contact."""
@@ -144,8 +163,12 @@ class RefineOptions:
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")
+        if self.skip_existing and self.overwrite:
+            raise UsageError("skip existing leaves layers that are there, overwrite replaces them; choose one")
         if self.workers < 1 or self.steps < 0 or not self.tolerance >= 0:
             raise UsageError("workers must be at least 1, steps and tolerance at least 0")
+        if self.run_up is not None and self.run_up < 0:
+            raise UsageError(f"run-up of {self.run_up} frames: give 0 or more")
         if self.budget_ms is not None and not self.budget_ms > 0:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):

@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
@@ -24,7 +24,13 @@ _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGN
 
 
 class Call:
-    """A function at work in a process of its own; it must be picklable, and its arguments and result too."""
+    """A function at work in a process of its own; it must be picklable, and its arguments and result too.
+
+    Attributes:
+        lag: How long after its end the files that it wrote may be hidden [s].
+    """
+
+    lag = 0.0
 
     def __init__(self, function: Callable[..., Any], *args: Any) -> None:
         """Start it."""
@@ -69,7 +75,9 @@ class Call:
         self._here.close()
 
 
-def call_each(function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: int) -> Iterator[Any]:
+def call_each(
+    function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: int
+) -> Generator[Any, None, None]:
     """Call a function once a job, each call in a process of its own, and yield results in order.
 
     Args:
@@ -154,6 +162,7 @@ def _outlast_parent() -> None:
 
 def _obituary(code: int) -> str:
     """How a process died, by its exit code."""
-    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    why = ", perhaps for lack of memory; use fewer --workers or a lower --level" if code == -signal.SIGKILL else ""
+    name = signal.Signals(-code).name if code < 0 else ""
+    how = name or f"exit code {code}"
+    why = ", perhaps for lack of memory; use fewer --workers or a lower --level" if name == "SIGKILL" else ""
     return f"a worker process died ({how}){why}"

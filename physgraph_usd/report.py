@@ -3,13 +3,38 @@
 from __future__ import annotations
 
 import json
+import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from .usd.atomic import write_text
+from .version import __version__
 
+FORMAT = 1
+"""Version of the JSON's format; another one where a reader of the last one could fail. See report.schema.json."""
+SCHEMA = Path(__file__).with_name("report.schema.json")
 DONE, FAILED, IN_PART = 0, 1, 3
+LOG = logging.getLogger("physgraph_usd")
+"""Where warnings and progress go, for the whole package."""
+_FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
+_GARMENT: dict[str, Any] = dict.fromkeys(
+    (
+        "start", "levels", "milliseconds", "energy_joules", "strain", "sharp_folds", "chosen", "contact", "near",
+        "together", "collapsed", "passed_through", "broken_before",
+    )
+)  # fmt: skip
+_CONTACT: dict[str, Any] = dict.fromkeys(("bodies", "cloth", "repaired", "projected"))
+
+
+def is_of_failure(path: Path) -> bool:
+    """Whether a file is the report of a run that failed, which the next run may replace."""
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8")) if path.suffix == ".json" else None
+    except (OSError, ValueError):
+        return False
+    return isinstance(plain, dict) and bool(plain.get("error")) and "exit_code" in plain
 
 
 @dataclass(eq=False)
@@ -20,6 +45,7 @@ class RefineReport:
         shot: Input file.
         out: Layer written, or None after a dry run.
         options: The options used.
+        option_sources: Where each option's value is from: "command line", a file, "default", or "given" from Python.
         estimate: What it was expected to cost, as `Estimate.plain` gives it.
         garments: Per garment: path, counts, level and why, material values and their sources.
         modelled: Terms of the potential that were on, with the reason.
@@ -31,12 +57,15 @@ class RefineReport:
         variants: Variant selections in force on what the garments depend on, as paths ``/World/coat{fit=loose}``.
         warnings: What the user should know.
         seconds: Wall time of each stage [s].
-        peak_memory_mb: Peak resident memory of this process [MB].
+        peak_memory_mb: Peak resident memory of this process [MB]; None where the system does not tell.
+        error: What ended the run; "" for one that came to its end.
+        skipped: Whether the layer was there already and was left as it is.
     """
 
     shot: str
     out: Path | None
     options: dict[str, Any]
+    option_sources: dict[str, str] = field(default_factory=dict)
     estimate: dict[str, float] = field(default_factory=dict)
     garments: list[dict[str, Any]] = field(default_factory=list)
     modelled: dict[str, str] = field(default_factory=dict)
@@ -48,19 +77,48 @@ class RefineReport:
     variants: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
-    peak_memory_mb: float = 0.0
+    peak_memory_mb: float | None = None
+    error: str = ""
+    skipped: bool = False
 
     @property
     def exit_code(self) -> int:
-        """0 done, 1 every frame failed, 3 done in part: some failed, or where that is strict some did not settle."""
+        """0 done, 1 it failed, 3 done in part: some frames failed, or where that is strict some did not settle."""
+        if self.error:
+            return FAILED
         if not self.failed:
             return IN_PART if self.unsettled and self.strict else DONE
         return FAILED if len(self.failed) == len(self.frames) else IN_PART
 
+    @property
+    def crossings(self) -> int | None:
+        """Edges through faces that are left, of cloth and of bodies, in all frames; None where none were looked for."""
+        paths = [garment["path"] for garment in self.garments]
+        entries = [pair for frame in self.frames for pair in zip(paths, frame.get("garments", ()), strict=False)]
+        # Garments that are solved together have one measurement, which each of them tells.
+        own = [entry for path, entry in entries if entry.get("together", [path])[0] == path]
+        found = [entry["contact"] for entry in own if "contact" in entry]
+        sides = [side for contact in found for side in (contact.get("cloth"), *contact.get("bodies", {}).values())]
+        return sum(side["after"]["crossings"] for side in sides if side) if found else None
+
+    def warn(self, *warnings: str) -> None:
+        """Take warnings that are not there yet, and log them."""
+        for warning in warnings:
+            if warning not in self.warnings:
+                self.warnings.append(warning)
+                LOG.warning(warning, extra={"shot": self.shot})
+
     def to_dict(self) -> dict[str, Any]:
-        """The report as plain values."""
+        """The report as plain values, every frame and every garment in it with the same names."""
         plain = {name: value for name, value in vars(self).items() if name != "out"}
-        return {"out": None if self.out is None else str(self.out), "exit_code": self.exit_code, **plain}
+        return {
+            "format": FORMAT,
+            "version": __version__,
+            "out": None if self.out is None else str(self.out),
+            "exit_code": self.exit_code,
+            **plain,
+            "frames": [_whole_frame(frame) for frame in self.frames],
+        }
 
     def to_json(self) -> str:
         """The report as JSON."""
@@ -73,3 +131,13 @@ class RefineReport:
             LayerError: It cannot be written.
         """
         write_text(path, self.to_json() + "\n")
+
+
+def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:
+    """A frame's entry with a value for every name."""
+    return {**_FRAME, **frame, "garments": [_whole_garment(entry) for entry in frame.get("garments", ())]}
+
+
+def _whole_garment(entry: Mapping[str, Any]) -> dict[str, Any]:
+    whole = {**_GARMENT, **entry}
+    return whole | {"contact": {**_CONTACT, **entry["contact"]}} if "contact" in entry else whole

@@ -4,41 +4,49 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import resource
 import sys
 import time as clock
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import torch
-import warp as wp
 
-from . import __version__
 from .chunks import RUN_UP, solve_in_chunks
 from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
+from .farm import connected, shots_at_once
 from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
 from .lead_in import lead_in
+from .mesh.lanes import start_warp
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .processes import call_each, memory_is_named
-from .report import RefineReport
+from .report import LOG, RefineReport, is_of_failure
 from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
 from .usd.atomic import check_place
+from .usd.chunk import Chunk, chunk_of
 from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
 from .usd.provenance import FAILED, UNSETTLED, asset_path, file_hashes, is_result_of, write_root
 from .usd.reader import Shot, open_shot
+from .usd.stage import shot_name
+from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
+from .version import __version__
 
+try:
+    import resource
+except ImportError:  # Windows has none.
+    resource = None
 MOST_LANES = 4
 """Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
 DEFAULTS = RefineOptions()
+Outcomes = Generator[Outcome, None, None]
 
 
 def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFAULTS) -> RefineReport:
@@ -58,44 +66,97 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         SolveError: No frame could be solved.
         LayerError: The layer cannot be written.
     """
-    began = clock.perf_counter()
     out = Path(out)
     check_jobs([(shot, out, options)])
+    if skipped := _skipped(shot, out, options):
+        return skipped
     if not options.dry_run:
         _check_places(out, options)
-    with memory_is_named():
-        return _refine(shot, out, options, began=began)
-
-
-def _refine(shot: str | Path, out: Path, options: RefineOptions, *, began: float) -> RefineReport:
-    opened = _open(shot, options)
-    try:
-        report = begin_report(opened, options)
-        report.seconds["open"] = clock.perf_counter() - began
-        if large := too_large(opened, report, options):
-            raise large
-        if options.dry_run:
-            return report
-        if options.resume and _is_done(opened, out, options):
-            report.warnings.append(f"{out} is taken as done: the same files, options and version made it")
-            report.out = out
+    with _run(str(shot), options) as (opened, report):
+        if options.dry_run or _is_done(opened, out, options, report):
             return report
         _check_new(out, options)
-        _tell(report.warnings, options)
-        solver = _ShotSolver(str(shot), [garment["level"] for garment in report.garments], options)
-        solver.adopt(opened)
-        _write_layer(opened, solver, out, options, report)
-        report.seconds["total"] = clock.perf_counter() - began
-        report.peak_memory_mb = _peak_memory_mb()
-        report.out = out
+        _refine(opened, out, options, report)
         if options.root is not None:
             files = {"layer": out, "shot": Path(shot), "absolute": options.asset_paths == "absolute"}
             write_root(Path(options.root), **files, overwrite=options.overwrite)
         if options.report is not None:
             _write_report(report, Path(options.report), opened)
-    finally:
-        opened.close()
     return report
+
+
+def refine_stage(
+    stage: Stage, options: RefineOptions = DEFAULTS, *, on_report: Callable[[RefineReport], None] | None = None
+) -> Layer:
+    """Refine the garments of an open stage into a layer in memory.
+
+        layer = pg.refine_stage(stage)
+        stage.GetSessionLayer().subLayerPaths.insert(0, layer.identifier)
+
+    The stage is read as it stands: session layer, edits that are not saved, muted layers, variant selections, payloads
+    and population. Neither it nor any of its layers is changed.
+
+    Args:
+        stage: The open stage.
+        options: What to do and how. An open stage lives in one process and its result in memory, so ``workers``,
+            ``resume``, ``dry_run``, ``root`` and a folder for the report are refused; a report's JSON file is written.
+        on_report: Called with the report, also of a run that failed.
+
+    Returns:
+        An anonymous layer, to be laid over the stage or exported; keep it alive as long as a stage names it. Frames
+        that could not be solved have no sample in it: they are in the report's ``failed`` and the layer's
+        ``customLayerData["physgraph"]["failed"]``.
+
+    Raises:
+        UsageError: An option is wrong, or of no use here.
+        StageError: The stage cannot be read as asked, or what it makes does not fit in memory.
+        SolveError: No frame could be solved.
+        LayerError: The layer is invalid, or the report cannot be written.
+    """
+    _check_of_stage(stage, options)
+    with _run(stage, options, on_report=on_report) as (opened, report):
+        layer = _refine(opened, None, options, report)
+        if options.report is not None:
+            _write_report(report, Path(options.report), opened)
+    assert layer is not None
+    return layer
+
+
+@contextmanager
+def _run(
+    shot: str | Stage, options: RefineOptions, *, on_report: Callable[[RefineReport], None] | None = None
+) -> Iterator[tuple[Shot, RefineReport]]:
+    """Open a shot and begin its report; a run that fails, not one used wrongly, writes it where it was asked for."""
+    report = RefineReport(shot_name(shot), None, options.plain(), options.told_sources())
+    began = clock.perf_counter()
+    try:
+        with memory_is_named(), closing(_open(shot, options)) as opened:
+            warnings = begin_report(report, opened, options)
+            report.seconds["open"] = clock.perf_counter() - began
+            if large := too_large(opened, report, options):
+                raise large
+            report.warn(*warnings)
+            yield opened, report
+    except PhysGraphError as error:
+        report.error = str(error)
+        if not isinstance(error, UsageError):
+            _write_failure(report, options)
+        raise
+    finally:
+        if on_report is not None:
+            on_report(report)
+
+
+def _refine(opened: Shot, out: Path | None, options: RefineOptions, report: RefineReport) -> Layer | None:
+    """Solve and write all frames; returns the layer where it is in memory."""
+    began = clock.perf_counter()
+    solver = _ShotSolver(opened.path, [garment["level"] for garment in report.garments], options)
+    solver.adopt(opened)
+    layer = _write_layer(opened, solver, out, options, report=report)
+    report.seconds["total"] = report.seconds["open"] + clock.perf_counter() - began
+    report.peak_memory_mb = _peak_memory_mb()
+    report.out = out
+    return layer
 
 
 Job = tuple[str | Path, Path, RefineOptions]
@@ -109,7 +170,7 @@ def refine_shots(
 
     Args:
         jobs: Shot, layer to write and options of each.
-        workers: Shots at a time.
+        workers: Shots at a time; with a scheduler, chunks of each shot, and as many shots as keep its workers busy.
         refine: What refines one of them; it must be picklable.
 
     Returns:
@@ -119,17 +180,44 @@ def refine_shots(
         UsageError: No job was begun: an option is wrong, or a file to write is one that another job reads or writes.
     """
     check_jobs(jobs)
-    alone = [(s, out, dataclasses.replace(options, workers=1, progress=None, say=None)) for s, out, options in jobs]
-    return call_each(refine, alone, workers=workers)
+    scheduler = jobs[0][2].scheduler if jobs else None
+    chunks, at_once = (workers, shots_at_once(scheduler, workers)) if scheduler else (1, workers)
+    skipped = [_skipped(*job) for job in jobs]
+    alone = [
+        (shot, out, dataclasses.replace(options, workers=chunks, progress=None))
+        for (shot, out, options), there in zip(jobs, skipped, strict=True)
+        if there is None
+    ]
+    return _in_order(skipped, call_each(refine, alone, workers=at_once))
 
 
-def check_jobs(jobs: Sequence[Job]) -> None:
+def _in_order(
+    skipped: Sequence[RefineReport | None], done: Generator[RefineReport | PhysGraphError, None, None]
+) -> Iterator[RefineReport | PhysGraphError]:
+    with closing(done):
+        for there in skipped:
+            yield next(done) if there is None else there
+
+
+def _skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
+    """The report of a shot whose layer is there already and is to be left, or None."""
+    if not options.skip_existing or not out.is_file():
+        return None
+    LOG.info("skipped: %s is there", out, extra={"shot": str(shot)})
+    return RefineReport(str(shot), out, options.plain(), options.told_sources(), skipped=True)
+
+
+def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
     """Refuse options that no shot could be refined with, and to write over what is read or written by any of the jobs.
+
+    Args:
+        jobs: Shot, layer to write and options of each.
+        also: What else is to be written.
 
     Raises:
         UsageError: With the value, and the file.
     """
-    targets: list[Target] = []
+    targets = [*also]
     inputs: set[Path] = set()
     for shot, out, options in jobs:
         options.check()
@@ -153,21 +241,48 @@ def _check_places(out: Path, options: RefineOptions) -> None:
 
 def _check_new(out: Path, options: RefineOptions) -> None:
     for _, path in options.targets(out):
-        if path.is_file() and not options.overwrite:
-            raise UsageError(f"{path} exists; choose another name or allow overwriting")
+        _check_none(path, options)
 
 
-def _is_done(opened: Shot, out: Path, options: RefineOptions) -> bool:
-    """Whether a run with these options has made everything there is to make, from the same files."""
-    made = all(path.is_file() for _, path in options.targets(out)) and not frames_folder(out).exists()
-    return made and is_result_of(out, _provenance(opened, out, options), settled=options.strict)
+def _check_none(path: Path, options: RefineOptions) -> None:
+    if path.is_file() and not (options.overwrite or is_of_failure(path)):
+        raise UsageError(f"{path} exists; choose another name or allow overwriting")
 
 
-def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
+def _is_done(opened: Shot, out: Path, options: RefineOptions, report: RefineReport) -> bool:
+    """Whether a run to go on with has made everything there is to make, from the same files; the report says so."""
+    made = options.resume and all(path.is_file() for _, path in options.targets(out))
+    if not made or frames_folder(out).exists():
+        return False
+    if not is_result_of(out, _provenance(opened, out, options), settled=options.strict):
+        return False
+    report.warn(f"{out} is taken as done: the same files, options and version made it")
+    report.out = out
+    return True
+
+
+def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
+    """Refuse what an open stage cannot be refined with, and to write the report over a file that it is made of."""
+    options.check()
+    if options.workers > 1:
+        raise UsageError(f"workers is {options.workers}: an open stage lives in one process; save it, or take 1")
+    for name in ("resume", "dry_run", "root", "scheduler", "run_up"):
+        if getattr(options, name):
+            raise UsageError(f"{name} is for layers on disk; an open stage is refined into a layer in memory")
+    if options.report is not None:
+        report = Path(options.report)
+        if json_of(report) != report:
+            raise UsageError(f"the report of an open stage is a file: {report} does not end with .json")
+        check_targets([("the report", report)], files_of(stage))
+        check_place(report)
+        _check_none(report, options)
+
+
+def inspect_shot(shot: str | Path | Stage, **given: Any) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found.
 
     Args:
-        shot: The stage to read.
+        shot: The stage to read, a file or open.
         given: Options of `RefineOptions` that concern reading.
 
     Returns:
@@ -179,25 +294,21 @@ def inspect_shot(shot: str | Path, **given: Any) -> dict[str, Any]:
         UsageError: An option is wrong.
     """
     options = RefineOptions(**given)
+    source = str(shot) if isinstance(shot, Path) else shot
     try:
-        opened = _open(shot, options)
+        with closing(_open(source, options)) as opened:
+            return describe(opened, options)
     except StageError as error:
-        return describe_meshes(str(shot), str(error))
-    try:
-        return describe(opened, options)
-    except StageError as error:
-        return describe_meshes(str(shot), str(error))
-    finally:
-        opened.close()
+        return describe_meshes(source, str(error))
 
 
-def _open(shot: str | Path, options: RefineOptions) -> Shot:
+def _open(shot: str | Stage, options: RefineOptions) -> Shot:
     """Open a shot with the options that concern reading."""
     return open_shot(
-        str(shot),
+        shot,
         garments=options.garments,
         colliders=options.colliders,
-        frames=options.frames,
+        frames=options.frames if options.run_up is None else None,
         level=options.level,
         overrides=options.overrides,
         rest_frame=options.rest_frame,
@@ -213,19 +324,21 @@ class _ShotSolver:
 
     def __init__(self, shot: str, levels: list[int], options: RefineOptions) -> None:
         self.levels = levels
-        self._shot, self._options = shot, dataclasses.replace(options, progress=None, say=None)
+        self._shot, self._options = shot, dataclasses.replace(options, progress=None)
         self._lanes = min(MOST_LANES, max(1, (os.cpu_count() or 1) // options.workers))
         self._opened: Shot | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the stage behind: each process opens its own."""
-        return self.__dict__ | {"_opened": None}
+        """Leave the stage behind, since each process opens its own, perhaps in another folder."""
+        weights = self._options.weights
+        options = self._options if weights is None else dataclasses.replace(self._options, weights=weights.absolute())
+        return self.__dict__ | {"_opened": None, "_shot": os.path.abspath(self._shot), "_options": options}
 
     def adopt(self, opened: Shot) -> None:
         """Use an open shot in this process."""
         self._opened = opened
 
-    def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
+    def __call__(self, times: Sequence[float | None]) -> Outcomes:
         """Solve time codes in order; one that fails yields its error, and the next starts from the last good one."""
         device = self._options.device
         prepare_device(device)
@@ -271,61 +384,110 @@ def prepare_device(device: str) -> None:
     Raises:
         UsageError: CUDA was asked for and is not there.
     """
-    wp.config.log_level = wp.LOG_WARNING
-    wp.init()
+    start_warp()
     torch.set_num_threads(1)
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device cpu")
 
 
-def _write_layer(opened: Shot, solver: _ShotSolver, out: Path, options: RefineOptions, report: RefineReport) -> None:
-    times: list[float | None] = list(opened.scene.times) or [None]
+def _write_layer(
+    opened: Shot, solver: _ShotSolver, out: Path | None, options: RefineOptions, *, report: RefineReport
+) -> Layer | None:
+    """Solve and write all frames; returns the layer where it is in memory."""
+    chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
+    times, skip = _to_solve(opened, chunk, options)
+    leads = chunk is not None and times[skip] not in (None, *chunk.times)
+    began, provenance = clock.perf_counter(), _provenance(opened, out, options)
+    made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite, "chunk": chunk}
     refinements = Refiner.subdivide(opened.scene, solver.levels)
-    began, written, provenance = clock.perf_counter(), 0.0, _provenance(opened, out, options)
-    run = provenance | {"levels": solver.levels, "times": times, "report": options.report is not None}
-    frames = FrameFolder(
-        frames_folder(out), run, resume=options.resume, drop=options.overwrite, keep=options.keep_frames
-    )
-    with (
-        frames,
-        LayerWriter(
-            opened,
-            refinements,
-            out,
-            mode=options.mode,
-            velocities=options.velocities,
-            provenance=provenance,
-            overwrite=options.overwrite,
-        ) as writer,
-    ):
-        run_up = 0 if options.temporal == "off" else RUN_UP
-        solved = solve_in_chunks(solver, times, frames, workers=options.workers, run_up=run_up)
-        report.warnings += _tell(_resumed(frames, len(times), run_up), options)
-        with closing(solved):
-            for done, outcome in enumerate(solved, start=1):
-                written += _take(outcome, writer, report)
-                if options.progress:
-                    options.progress(done, len(times))
-        if len(report.failed) == len(times):
-            raise SolveError(next(iter(report.failed.values())))
-        report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
-        start = clock.perf_counter()
-        writer.close(lacking={FAILED: list(report.failed) or None, UNSETTLED: len(report.unsettled) or None})
-        report.seconds["close"] = clock.perf_counter() - start
-        report.warnings += [str(notice) for notice in writer.notices] + _of_frames(report)
-        say_what_was(report)
+    with ExitStack() as stack:
+        frames = None if out is None else stack.enter_context(_frames(solver, times, out, options, provenance))
+        writer = stack.enter_context(LayerWriter(opened, refinements, out, provenance=provenance, **made))
+        solved = solver(times) if frames is None else _solved(solver, times, frames, options, report, skip=skip)
+        stack.enter_context(closing(solved))
+        if leads:
+            _begin_after(next(solved), writer)
+        _write_frames(writer, solved, len(times) - skip - leads, options, report=report)
+        layer = writer.layer if out is None else None
     report.strict = options.strict
-    report.seconds["write"] = written
     report.seconds["frames"] = clock.perf_counter() - began
-    report.warnings += [str(notice) for notice in opened.warnings if str(notice) not in report.warnings]
+    report.warn(*map(str, opened.warnings))
+    return layer
 
 
-def _tell(warnings: list[str], options: RefineOptions) -> list[str]:
-    """Say warnings before the first frame, and return them."""
-    if options.say is not None:
-        for warning in warnings:
-            options.say(warning)
-    return warnings
+def _write_frames(
+    writer: LayerWriter,
+    solved: Outcomes,
+    count: int,
+    options: RefineOptions,
+    *,
+    report: RefineReport,
+) -> None:
+    """Write each frame as it comes, then close the layer."""
+    written, shot = 0.0, {"shot": report.shot}
+    for done, outcome in enumerate(solved, start=1):
+        written += _take(outcome, writer, report)
+        LOG.info("frame %d of %d: time code %s", done, count, _time_name(outcome.time), extra=shot)
+        LOG.debug("%s", outcome.record, extra=shot)
+        if options.progress:
+            options.progress(done, count)
+    if len(report.failed) == count:
+        raise SolveError(next(iter(report.failed.values())))
+    report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
+    start = clock.perf_counter()
+    writer.close(lacking={FAILED: list(report.failed) or None, UNSETTLED: len(report.unsettled) or None})
+    report.seconds["close"] = clock.perf_counter() - start
+    report.seconds["write"] = written
+    report.warn(*map(str, writer.notices), *_of_frames(report))
+    say_what_was(report)
+
+
+def _frames(
+    solver: _ShotSolver, times: list[float | None], out: Path, options: RefineOptions, provenance: dict[str, Any]
+) -> FrameFolder:
+    """The folder of a run's finished frames."""
+    run = provenance | {"levels": solver.levels, "times": times, "report": options.report is not None}
+    kept = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames}
+    return FrameFolder(frames_folder(out), run, **kept)
+
+
+def _solved(
+    solver: _ShotSolver,
+    times: list[float | None],
+    frames: FrameFolder,
+    options: RefineOptions,
+    report: RefineReport,
+    *,
+    skip: int,
+) -> Outcomes:
+    """Frames in order, those of an interrupted run among them; ``skip`` as `solve_in_chunks` takes it."""
+    run_up = _run_up(options)
+    report.warn(*_resumed(frames, len(times) - skip, run_up))
+    given = {"workers": options.workers, "run_up": run_up, "skip": skip}
+    with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
+        yield from solve_in_chunks(solver, times, frames, **given, start=farm)
+
+
+def _run_up(options: RefineOptions) -> int:
+    """Frames solved before a chunk, where frames depend on one another."""
+    asked = RUN_UP if options.run_up is None else options.run_up
+    return 0 if options.temporal == "off" else asked
+
+
+def _to_solve(opened: Shot, chunk: Chunk | None, options: RefineOptions) -> tuple[list[float | None], int]:
+    """Time codes to solve, in order, and how many of the first are neither written nor compared with a chunk before."""
+    every: list[float | None] = list(opened.scene.times) or [None]
+    if chunk is None or not chunk.times:
+        return every, 0
+    first = every.index(chunk.times[0])
+    lead = min(first, _run_up(options))
+    return every[first - lead : first + len(chunk.times)], max(lead - 1, 0)
+
+
+def _begin_after(outcome: Outcome, writer: LayerWriter) -> None:
+    """Keep where the run-up of a chunk ended, unless that frame failed."""
+    if outcome.points and outcome.time is not None:
+        writer.begin_after(outcome.time, outcome.points)
 
 
 def _resumed(frames: FrameFolder, count: int, run_up: int) -> list[str]:
@@ -343,13 +505,17 @@ def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
     """Write one time code's result and record it; returns the seconds that writing took."""
     report.frames.append(outcome.record)
     if not outcome.points:
-        name = "default" if outcome.time is None else f"{outcome.time:g}"
+        name = _time_name(outcome.time)
         report.failed[name] = str(outcome.record["error"])
-        report.warnings.append(f"no sample is written at time code {name}: {report.failed[name]}")
+        report.warn(f"no sample is written at time code {name}: {report.failed[name]}")
         return 0.0
     start = clock.perf_counter()
     writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused], heat=outcome.heat)
     return clock.perf_counter() - start
+
+
+def _time_name(time: float | None) -> str:
+    return "default" if time is None else f"{time:g}"
 
 
 def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
@@ -390,17 +556,30 @@ def _of_garments(report: RefineReport, tell: Callable[[str, Any], list[str]], na
     return said
 
 
-def _provenance(opened: Shot, out: Path, options: RefineOptions) -> dict[str, Any]:
-    folder, absolute = out.resolve().parent, options.asset_paths == "absolute"
+def _write_failure(report: RefineReport, options: RefineOptions) -> None:
+    """Write the JSON of a run that failed over no file that may not be replaced; that error is the one told."""
+    if options.report is not None and not options.dry_run:
+        file = json_of(Path(options.report))
+        with suppress(LayerError):
+            if options.overwrite or not file.exists() or is_of_failure(file):
+                report.write(file)
+
+
+def _provenance(opened: Shot, out: Path | None, options: RefineOptions) -> dict[str, Any]:
+    folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
     return {
         "version": __version__,
         "options": options.plain(),
-        "shot": asset_path(opened.path, folder, absolute=absolute),
+        "shot": None if opened.view.root.anonymous else asset_path(opened.path, folder, absolute=absolute),
         "inputs": file_hashes(opened.stage, folder, absolute=absolute),
+        "unsaved": list(opened.unsaved) or None,
     }
 
 
-def _peak_memory_mb() -> float:
-    """Peak resident memory of this process [MB]; Linux counts kilobytes, macOS bytes."""
+def _peak_memory_mb() -> float | None:
+    """Peak resident memory of this process [MB]; None where the system does not tell, as on Windows."""
+    if resource is None:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Linux counts kilobytes, macOS bytes.
     return round(peak / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)

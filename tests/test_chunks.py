@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pickle
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -116,6 +118,46 @@ def test_what_a_gpu_lacks_may_be_there_without_it(said: str):
     with pytest.raises(SolveError, match="out of memory on the CUDA device; a lower --level or --device cpu"):
         with memory_is_named():
             raise RuntimeError(said)
+
+
+class Late:
+    """A function that ran on another machine, whose files are seen here only after a while."""
+
+    lag, ready = 5.0, True
+
+    def __init__(self, function: Callable[..., Any], *args: Any) -> None:
+        self._timer = threading.Timer(0.3, function, args)
+        self._timer.start()
+
+    def result(self) -> None: ...
+
+    def end(self) -> None:
+        self._timer.join()
+
+
+def test_files_that_are_seen_late_are_waited_for(tmp_path: Path):
+    with FrameFolder(tmp_path / "f", {}) as frames:
+        outcomes = list(solve_in_chunks(Counting(), TIMES, frames, workers=1, start=Late))
+    assert before(outcomes) == list(range(8))
+
+
+def test_a_task_that_outlasts_its_run_writes_nothing_into_another(tmp_path: Path):
+    with FrameFolder(tmp_path / "f", {"level": 2}) as frames:
+        outlasting = pickle.loads(pickle.dumps(frames))
+    outcome = next(iter(Counting()([0.0])))
+    with pytest.raises(LayerError):
+        outlasting.write(0, outcome)
+    with FrameFolder(tmp_path / "f", {"level": 3}) as other:
+        with pytest.raises(LayerError, match="another run's by now"):
+            outlasting.write(0, outcome)
+        assert other.read(0, 0.0) is None
+
+
+def test_frames_of_a_run_up_alone_are_not_handed_back(tmp_path: Path):
+    with FrameFolder(tmp_path / "f", {}) as frames:
+        outcomes = list(solve_in_chunks(Counting(), TIMES, frames, workers=1, run_up=3, skip=2))
+    assert [outcome.time for outcome in outcomes] == TIMES[2:]
+    assert before(outcomes) == list(range(2, 8))
 
 
 class TestKeptFrames:

@@ -20,6 +20,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from physgraph_usd import cli, errors
+from physgraph_usd.cli.options import INTEGRATORS
+from physgraph_usd.cli.printing import Saying
+from physgraph_usd.cli.refine import refine
+from physgraph_usd.report import RefineReport
 
 pytest.importorskip("pxr", reason="the commands read stages with usd-core")
 
@@ -40,12 +44,12 @@ def run(*args: object) -> Result:
 
 @pytest.fixture
 def refined(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
-    """Calls of refine_shot, which does nothing here; an element's ``report`` is what it returns."""
+    """Calls of refine_shot, which does nothing here."""
     calls: list[SimpleNamespace] = []
 
-    def refine_shot(shot: str, out: Path, options: object) -> SimpleNamespace:
+    def refine_shot(shot: str, out: Path, options: object) -> RefineReport:
         calls.append(SimpleNamespace(shot=shot, out=out, options=options))
-        return SimpleNamespace(out=out, warnings=(), exit_code=0, to_json=lambda: "{}")
+        return RefineReport(shot, out, {})
 
     monkeypatch.setattr("physgraph_usd.shot.refine_shot", refine_shot)
     return calls
@@ -188,14 +192,27 @@ class TestRefine:
 
         run("refine", "a.usda", "-o", tmp_path / "a.usdc")
         for field in fields(RefineOptions):
-            if field.name not in {"progress", "say"}:
+            if field.name not in {"progress", "sources"}:
                 assert getattr(refined[0].options, field.name) == getattr(RefineOptions(), field.name), field.name
 
     def test_every_option_is_one_of_the_call(self) -> None:
         from physgraph_usd.options import RefineOptions
 
-        declared = {parameter.name for parameter in cli.refine.params} - {"shots", "out"}
-        assert declared == {field.name for field in fields(RefineOptions)} - {"say"}
+        own = {"shots", "out", "summary", "config", "verbose", "log_file"}
+        declared = {parameter.name for parameter in refine.params} - own
+        assert declared == {field.name for field in fields(RefineOptions)} - {"sources"}
+
+    def test_help_is_in_groups_with_the_names_that_options_take(self) -> None:
+        from physgraph_usd.integrate import METHODS
+
+        said = run("refine", "--help").output
+        headings = ["Files:", "Scene:", "Solver:", "Layer:", "Several shots, and", "What is said:", "Options:"]
+        assert [said.index(heading) for heading in headings] == sorted(said.index(heading) for heading in headings)
+        assert tuple(METHODS) == INTEGRATORS
+        letters = "".join(said.split())
+        assert ",".join(METHODS) + ".[default:auto]" in letters
+        assert "Moststepsatthefinestlevel.[default:12;x>=0]" in letters
+        assert "denim" in run("tag", "--help").output
 
 
 class TestSeveralShots:
@@ -204,9 +221,9 @@ class TestSeveralShots:
         """What refine_shots is asked for; it does nothing here."""
         asked: list[tuple[str, Path, Any]] = []
 
-        def refine_shots(jobs: list[tuple[str, Path, Any]], **_: object) -> list[SimpleNamespace]:
+        def refine_shots(jobs: list[tuple[str, Path, Any]], **_: object) -> list[RefineReport]:
             asked.extend(jobs)
-            return [SimpleNamespace(out=out, warnings=(), exit_code=0) for _, out, _ in jobs]
+            return [RefineReport(shot, out, {}) for shot, out, _ in jobs]
 
         monkeypatch.setattr("physgraph_usd.shot.refine_shots", refine_shots)
         return asked
@@ -341,8 +358,14 @@ class TestErrors:
         assert (result.exit_code, result.stderr) == (1, f"error: {tmp_path / 'run.toml'}: File exists\n")
 
     def test_done_in_part_is_3(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        report = SimpleNamespace(out=tmp_path / "a.usdc", warnings=("frame 3 failed",), exit_code=3)
-        monkeypatch.setattr("physgraph_usd.shot.refine_shot", lambda *_: report)
+        report = RefineReport("a.usda", tmp_path / "a.usdc", {}, failed={"3": "is torn"})
+        report.frames, report.seconds = [{}, {}], {"frames": 1.0}
+
+        def refine_shot(*_: object) -> RefineReport:
+            report.warn("frame 3 failed")
+            return report
+
+        monkeypatch.setattr("physgraph_usd.shot.refine_shot", refine_shot)
         result = run("refine", "a.usda", "-o", report.out)
         assert (result.exit_code, result.stderr) == (3, "warning: frame 3 failed\n")
 
@@ -406,7 +429,7 @@ def test_progress_shows_time_left_on_a_terminal(monkeypatch: pytest.MonkeyPatch)
 
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    with cli._progress("shot.usda") as progress:
+    with Saying().progress("shot.usda") as progress:
         for done in range(1, 5):
             progress(done, 4)
     assert "shot.usda" in terminal.getvalue()

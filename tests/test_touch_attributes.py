@@ -8,7 +8,7 @@ import pytest
 from pxr import Usd, UsdGeom
 from stages import COLLIDER_API, add_sheet, author, new_stage, save
 
-from physgraph_usd.cli import _outline
+from physgraph_usd.cli.printing import outline
 from physgraph_usd.errors import SchemaError, UsageError
 from physgraph_usd.scene import Garment
 from physgraph_usd.shot import inspect_shot
@@ -164,7 +164,7 @@ class TestExclusion:
         }
         assert cloth["apart_from"]["/World/body/torso"] == f"<{CLOTH}>.physgraph:contact:exclude = </World/body>"
         assert (cloth["colliders"], len(belt["colliders"])) == ([], 3)
-        assert "\n".join(_outline(found)).count("physgraph:contact:exclude") == 5
+        assert "\n".join(outline(found)).count("physgraph:contact:exclude") == 5
 
     def test_contact_is_left_out_for_the_reason_that_holds(self, dressed: Usd.Stage):
         dressed.RemovePrim("/World/belt")

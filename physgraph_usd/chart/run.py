@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from .. import __version__
 from ..errors import UsageError
 from ..options import RefineOptions
 from ..resolution import choose_levels, sample_frames
@@ -24,6 +23,7 @@ from ..usd.atomic import check_place
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import file_hashes
 from ..usd.reader import Shot, open_shot
+from ..version import __version__
 from .journal import NAME as JOURNAL
 from .journal import Journal
 from .measure import measure_curves, rungs

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..level import Level
+from ..mesh.lanes import start_warp
 
 
 class Clusters:
@@ -33,7 +34,7 @@ class Clusters:
             beside: Adjacency of its vertices, shape (V, V).
             sides: The edges that each face owns, -1 for those that another face owns, shape (T, 3).
         """
-        wp.init()  # Views of tensors do not start Warp by themselves.
+        start_warp()  # Views of tensors do not start Warp by themselves.
         self._device = level.device
         cluster = _in_space(_gathered(beside), level)
         self.count = int(cluster.max(initial=-1)) + 1

@@ -15,7 +15,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.lanes import Launch
+from ..mesh.lanes import Launch, start_warp
 from ..mesh.stencil import vectors
 from ..mesh.topology import joined_by
 from .base import Nearest, Surface
@@ -184,7 +184,7 @@ def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *m
     """Launch over edges; the kernel is told first where they are and how far their ends are from the surface."""
     if not len(edges):
         return
-    wp.init()  # Views of tensors do not start Warp by themselves.
+    start_warp()  # Views of tensors do not start Warp by themselves.
     points, away = (each.to(torch.float32).contiguous() for each in (x, distance))
     where = [wp.from_torch(edges.to(torch.int32).contiguous(), dtype=wp.vec2i), vectors(points), wp.from_torch(away)]
     Launch(kernel, len(edges), [*where, *more], device=str(x.device))({})

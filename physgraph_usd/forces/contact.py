@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.lanes import Launch
+from ..mesh.lanes import Launch, start_warp
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 
 wp.set_module_options({"enable_backward": False})
@@ -117,7 +117,7 @@ class Contact:
 
     @staticmethod
     def _prepare(level: Level, planes: Planes, weight: Tensor, energy: Tensor) -> Launch:
-        wp.init()  # Views of tensors do not start Warp by themselves.
+        start_warp()  # Views of tensors do not start Warp by themselves.
         x = vectors(torch.zeros_like(level.rest))
         own = [wp.from_torch(planes.vertex), vectors(planes.normal), wp.from_torch(planes.height)]
         inputs = [x, *own, wp.from_torch(weight), wp.from_torch(energy), x]

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import copy
 import functools
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 
 import torch
 import warp as wp
 
+_STDERR = 2
 LEAST_PER_LANE = 4000
 """Items below which another lane costs more than it saves."""
 LEAST_QUERIES = 250
@@ -22,6 +25,32 @@ LEAST_QUERIES = 250
 SLICES, LEAST_SLICE = 8, 32
 """Slices of a lane there, and what they have at least on average: some items cost a hundred times as much as others, so
 whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
+
+
+@functools.cache
+def start_warp() -> None:
+    """Start Warp, without what its library prints itself where no CUDA driver is found: most machines have none."""
+    wp.config.log_level = wp.LOG_WARNING
+    with nullcontext() if torch.cuda.is_available() else _stderr_to_nowhere():
+        wp.init()
+
+
+@contextmanager
+def _stderr_to_nowhere() -> Iterator[None]:
+    """Keep off the terminal what C code prints; does nothing in a program that has no standard error."""
+    try:
+        kept = os.dup(_STDERR)
+    except OSError:
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, _STDERR)
+        yield
+    finally:
+        os.dup2(kept, _STDERR)
+        os.close(kept)
+        os.close(nowhere)
 
 
 class Launch:

@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .lanes import Launch
+from .lanes import Launch, start_warp
 from .stencil import SCALAR, VECTOR, vectors
 
 wp.set_module_options({"enable_backward": False})
@@ -88,7 +88,7 @@ class _Measure:
     def __init__(
         self, kernels: Mapping[torch.dtype, wp.Kernel], elements: Tensor, like: Tensor, *, corners: type, lanes: int
     ) -> None:
-        wp.init()  # Views of tensors do not start Warp by themselves.
+        start_warp()  # Views of tensors do not start Warp by themselves.
         self.count, self._elements, self._launch = len(elements), elements.contiguous(), None
         if len(elements):  # Empty tensors keep strides that Warp refuses.
             out = like.new_empty(len(elements), *([3] if kernels is _NORMALS else []))

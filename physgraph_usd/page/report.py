@@ -77,10 +77,10 @@ def _head(report: RefineReport) -> str:
     done = f"{count - failed} of {count} time codes" if failed else f"{count} time code{'s' if count != 1 else ''}"
     seconds = report.seconds.get("total", 0.0)
     each = f", {1e3 * report.seconds.get('frames', 0.0) / count:.0f} ms each" if count else ""
+    memory = "" if report.peak_memory_mb is None else f"; peak memory {report.peak_memory_mb:.0f} MB"
     return (
         f"<h1>{html.escape(Path(report.shot).name)}</h1>"
-        f"<p id='summary'>{done} written to {html.escape(str(report.out))} in {seconds:.1f} s{each}; "
-        f"peak memory {report.peak_memory_mb:.0f} MB.</p>"
+        f"<p id='summary'>{done} written to {html.escape(str(report.out))} in {seconds:.1f} s{each}{memory}.</p>"
     )
 
 

@@ -14,11 +14,11 @@ from typing import Any, TypeVar
 
 import torch
 
-from .. import __version__
 from ..errors import UsageError
 from ..integrate.network import VECTORS, PhysgraphConfig
 from ..integrate.paper_network import PaperConfig
 from ..integrate.weights import save_network
+from ..version import __version__
 from .loop import TrainConfig, Trainer
 from .patches import PatchConfig, describe
 

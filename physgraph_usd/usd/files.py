@@ -22,17 +22,20 @@ Target = tuple[str, Path]
 """What is to be written, in words, and where."""
 
 
-def files_of(shot: str | Path) -> set[Path]:
+def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
     """Every file that a shot is made of, or would be with other variants.
 
     Sublayers, references, payloads, value clips and assets such as textures, through all layers. A refined layer in it
     is left out with what it needs: it is a result, which is not read and may be written again.
 
     Args:
-        shot: Any file that USD opens; one that it cannot open is its only file.
+        shot: Any file that USD opens; one that it cannot open is its only file. Or an open stage.
     """
     found: set[Path] = set()
-    waiting = [str(shot)]
+    if isinstance(shot, Usd.Stage):
+        waiting = [layer.realPath for layer in shot.GetUsedLayers() if layer.realPath]
+    else:
+        waiting = [str(shot)]
     with quiet():
         while waiting:
             file = Path(Ar.SplitPackageRelativePathOuter(waiting.pop())[0])

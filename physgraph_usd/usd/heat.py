@@ -70,6 +70,12 @@ class HeatTrack:
             self._set(name, time, values)
             self._runs[name] = values, None
 
+    def finish(self, *, hold: bool = False) -> None:
+        """Author the ends of runs of equal samples where further samples are to follow them (``hold``)."""
+        for name, (last, held) in self._runs.items() if hold else ():
+            if held is not None and not self._still:
+                self._set(name, held, last)
+
     def _path(self, name: str) -> Sdf.Path:
         return self._target.AppendProperty(PREFIX + name)
 

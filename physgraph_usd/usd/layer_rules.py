@@ -7,8 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
+from .chunk import read_chunk
 from .provenance import read_record
 from .rules import Problem, code_of
+from .stage import root_metadata
 
 _SAME = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
 
@@ -23,7 +25,7 @@ def record(layer: Sdf.Layer) -> Iterator[Problem]:
     found = read_record(layer)
     if found is None:
         yield _error('has no customLayerData["physgraph"]; is it a refined layer?')
-    elif not found.get("garments") or not found.get("shot"):
+    elif not found.get("garments") or not (found.get("shot") or found.get("unsaved")):
         yield _error("its record names no garments or no shot")
 
 
@@ -37,6 +39,10 @@ def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
     """All samples of the shot were refined: outside those that were, the cloth stands still."""
     for path, said in (read_record(layer) or {}).get("left_out", {}).items():
         yield Problem("warning", path, None, f"was refined without {said}, where it stands still (--frames)", "")
+    chunk = read_chunk(layer)
+    if chunk is not None and chunk.times != chunk.every:
+        said = f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch it to the others"
+        yield Problem("warning", "/", None, said, "")
 
 
 def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:
@@ -55,9 +61,8 @@ def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
     if layer.timeCodesPerSecond != shot.GetTimeCodesPerSecond():
         said = f"timeCodesPerSecond is {layer.timeCodesPerSecond:g}; the shot has {shot.GetTimeCodesPerSecond():g}"
         yield _error(said)
-    root = shot.GetRootLayer().pseudoRoot
     for key in _SAME:
-        wanted = root.GetInfo(key) if root.HasInfo(key) else None
+        wanted = root_metadata(shot, key)
         found = layer.pseudoRoot.GetInfo(key) if layer.pseudoRoot.HasInfo(key) else None
         if wanted is not None and found != wanted:
             yield _error(f"{key} is {found!r}; the shot has {wanted!r}")

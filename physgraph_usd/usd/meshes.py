@@ -10,9 +10,10 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from ..errors import StageError
 from .find import has_schema, traverse
-from .provenance import recorded_shot, root_over
+from .provenance import recorded_shot
 from .stage import check_there, list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
 from .times import garment_times, merge
+from .view import root_over
 
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh that says nothing of its own."""

@@ -12,17 +12,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError
 from .atomic import prepare_target, publish, temporary_path
 from .stage import TRAVERSAL, USD_ERRORS, reason_of
+from .view import root_over
 
 RECORD = "physgraph"
 FAILED, UNSETTLED = "failed", "unsettled"
 """Entries of the record: time codes without a sample, and how many were written though they did not settle."""
 _COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
-_NOT_FOR_ROOT = {"subLayers", "subLayerOffsets", "customLayerData", "documentation", "comment", "hasOwnedSubLayers"}
 
 
 def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float, float] | None = None) -> None:
@@ -111,12 +112,22 @@ def mute_refined(stage: Usd.Stage) -> list[str]:
     return identifiers
 
 
-def file_hashes(stage: Usd.Stage, folder: Path, *, absolute: bool = False) -> dict[str, str]:
+def unsaved_layers(stage: Usd.Stage) -> tuple[str, ...]:
+    """Names of a stage's layers whose content is in no file: edited and not saved, or in memory alone.
+
+    A layer in memory that holds no prims, such as an empty session, is none of them, unless it is the root.
+    """
+    dirty = [layer for layer in stage.GetUsedLayers() if layer.dirty]
+    held = [layer for layer in dirty if layer.rootPrims or not layer.anonymous or layer == stage.GetRootLayer()]
+    return tuple(sorted(layer.GetDisplayName() or "in memory" for layer in held))
+
+
+def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False) -> dict[str, str]:
     """SHA-256 of every layer that a stage is composed from, value clips included.
 
     Args:
         stage: The shot.
-        folder: Folder to name the files from.
+        folder: Folder to name the files from; None for absolute paths.
         absolute: Whether to name them by absolute paths.
 
     Returns:
@@ -138,10 +149,10 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def asset_path(path: str | Path, folder: Path, *, absolute: bool = False) -> str:
+def asset_path(path: str | Path, folder: Path | None, *, absolute: bool = False) -> str:
     """A path as seen from a folder, as USD writes it; absolute on request and where there is no relative one."""
     full = Path(path).resolve()
-    if absolute:
+    if absolute or folder is None:
         return full.as_posix()
     try:
         relative = Path(os.path.relpath(full, folder.resolve())).as_posix()
@@ -151,9 +162,11 @@ def asset_path(path: str | Path, folder: Path, *, absolute: bool = False) -> str
 
 
 def _plain(value: Any) -> Any:
-    """Bring a record to types that layer metadata holds."""
+    """Bring a record to types that layer metadata holds; an array is one of points, shape (V, 3), float32."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in sorted(value.items(), key=str) if item is not None}
+    if isinstance(value, np.ndarray):
+        return Vt.Vec3fArray.FromNumpy(value)
     if isinstance(value, list | tuple | set | frozenset):
         return _plain_list(sorted(value) if isinstance(value, set | frozenset) else list(value))
     if isinstance(value, bool | int | float | str):
@@ -195,26 +208,6 @@ def write_root(path: Path, *, layer: Path, shot: Path, absolute: bool = False, o
         raise LayerError(f"cannot read {shot}")
     below = [asset_path(file, path.parent, absolute=absolute) for file in (layer, shot)]
     return export_layer(root_over(source, below), path)
-
-
-def root_over(source: Sdf.Layer, below: list[str]) -> Sdf.Layer:
-    """Make a root layer in memory with a shot's stage metadata.
-
-    Args:
-        source: The shot's root layer.
-        below: Identifiers of its sublayers, strongest first.
-
-    Returns:
-        The anonymous layer.
-    """
-    root = Sdf.Layer.CreateAnonymous(".usda")
-    for key in source.pseudoRoot.ListInfoKeys():
-        if key not in _NOT_FOR_ROOT and "elocates" not in key:
-            root.pseudoRoot.SetInfo(key, source.pseudoRoot.GetInfo(key))
-    root.timeCodesPerSecond = source.timeCodesPerSecond
-    for identifier in below:
-        root.subLayerPaths.append(identifier)
-    return root
 
 
 def export_layer(layer: Sdf.Layer, path: Path) -> Path:

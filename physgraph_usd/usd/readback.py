@@ -40,7 +40,11 @@ class RefinedLayer:
             index: Which garment.
             time: Time code, or None for the default.
         """
-        path = Sdf.Path(self.targets[index]).AppendProperty("points")
+        coarse = str(shot.sources[index].path)
+        target = next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
+        if target is None:  # a chunk without a sample of it
+            return None
+        path = Sdf.Path(target).AppendProperty("points")
         if time is None:
             attribute = self._layer.GetAttributeAtPath(path)
             local = None if attribute is None else attribute.default

@@ -26,7 +26,7 @@ from .find import felt_by, find_colliders, find_garments, instance_roots
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .placement import to_metres
-from .provenance import mute_refined
+from .provenance import mute_refined, unsaved_layers
 from .rest import AUTO
 from .schema import GARMENT
 from .skinning import Bake
@@ -39,10 +39,12 @@ from .stage import (
     read_units,
     refuse_missing_arcs,
     root_metadata,
+    shot_name,
 )
 from .times import merge, snap, within
 from .unread import unread
 from .variants import selections
+from .view import StageView
 
 
 class Shot:
@@ -50,7 +52,9 @@ class Shot:
 
     Attributes:
         stage: The composed stage, with skinning baked in an anonymous session layer; never edited on disk.
-        path: The shot file.
+        path: The shot file, or the name of a stage that has none.
+        view: What the stage showed before anything was baked into it or muted on it.
+        unsaved: Names of its layers whose content is in no file.
         scene: What stays the same over the shot.
         sources: How each garment sits on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
@@ -59,11 +63,14 @@ class Shot:
         metres_per_unit: Length of one stage unit [m].
     """
 
-    def __init__(self, path: str, stage: Usd.Stage, request: Request, *, readers: Sequence[GarmentReader]) -> None:
+    def __init__(
+        self, path: str, stage: Usd.Stage, view: StageView, *, request: Request, readers: Sequence[GarmentReader]
+    ) -> None:
         """Put together what ``open_shot`` read."""
-        self.path, self.stage = path, stage
+        self.path, self.stage, self.view = path, stage, view
         self.colliders: tuple[str, ...] = ()
         self.selections: tuple[str, ...] = ()
+        self.unsaved: tuple[str, ...] = ()
         self.warnings: list[Notice] = []
         self.metres_per_unit = request.units.metres
         times = merge(time for reader in readers for time in reader.source.times)
@@ -144,11 +151,11 @@ class Shot:
     def close(self) -> None:
         """Let go of the stage; nothing can be read afterwards."""
         self._readers, self._bodies = (), ()
-        del self.stage, self._request
+        del self.stage, self.view, self._request
 
 
 def open_shot(
-    path: str | os.PathLike[str],
+    shot: str | os.PathLike[str] | Usd.Stage,
     *,
     garments: Sequence[str] = (),
     colliders: Sequence[str] = (),
@@ -161,7 +168,7 @@ def open_shot(
     """Open a shot for refining.
 
     Args:
-        path: The shot file, any that USD opens.
+        shot: The shot file, any that USD opens; or an open stage, read as it stands and not changed.
         garments: Prim paths, prim names, globs over paths or collections (``/Prim.collection:name``); empty: the
             meshes with PhysGraphGarmentAPI.
         colliders: The same for colliders; empty: what the garments name, else every prim with PhysGraphColliderAPI
@@ -184,9 +191,13 @@ def open_shot(
     """
     asked = parse_overrides(overrides)
     _check_options(frames, level, rest_frame)
-    stage, notices = open_stage(str(path))
+    source = shot if isinstance(shot, Usd.Stage) else os.fspath(shot)
+    path = shot_name(source)
+    stage, notices = open_stage(source)
+    view = StageView.of(stage)
     notices += [Notice("", None, f"{layer} holds refined cloth and is left out") for layer in mute_refined(stage)]
     with pxr_errors(f"cannot read {path}"), quiet():
+        unsaved = unsaved_layers(stage)
         prims = _find(stage, garments, notices)
         check_overrides(asked, [prim.GetPath() for prim in prims])
         found = find_colliders(stage, prims, colliders)
@@ -202,15 +213,16 @@ def open_shot(
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
-        shot = Shot(str(path), stage, request, readers=readers)
-        _add_colliders(shot, bodies, colliders, notices=notices)
-        shot.selections = selections(
-            map(stage.GetPrimAtPath, [*(s.path for s in shot.sources), *bodies, *bake.prims()])
+        opened = Shot(path, stage, view, request=request, readers=readers)
+        _add_colliders(opened, bodies, colliders, notices=notices)
+        opened.selections = selections(
+            map(stage.GetPrimAtPath, [*(s.path for s in opened.sources), *bodies, *bake.prims()])
         )
-    shot.colliders = tuple(str(path) for path in bodies)
+    opened.unsaved = unsaved
+    opened.colliders = tuple(str(path) for path in bodies)
     read_notices = [notice for reader in readers for notice in reader.notices]
-    shot.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
-    return shot
+    opened.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
+    return opened
 
 
 def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:

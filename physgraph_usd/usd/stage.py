@@ -16,6 +16,7 @@ import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from ..errors import PhysGraphError, StageError
+from .view import StageView
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
 """The name of a rule of USD's own parser, which tells a user nothing."""
@@ -249,11 +250,20 @@ def is_sound(layer: Sdf.Layer) -> bool:
     return all(not path.isEmpty and (not path.IsPrimPath() or layer.GetPrimAtPath(path)) for path in paths)
 
 
-def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
-    """Open a stage with all payloads, for reading.
+def shot_name(shot: str | Usd.Stage) -> str:
+    """What a shot is called: its file, or for a stage that has none the name of its root layer in memory."""
+    if isinstance(shot, str):
+        return shot
+    root = shot.GetRootLayer()
+    return root.realPath or root.GetDisplayName() or "the stage in memory"
+
+
+def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
+    """Open a stage of our own, for reading.
 
     Args:
-        path: The shot file.
+        shot: The shot file, which is opened with all payloads; or an open stage, which is not changed and whose session
+            layer, muted layers, payloads and population ours has too.
 
     Returns:
         The stage, and a notice for each layer, reference or payload that is missing.
@@ -261,12 +271,14 @@ def open_stage(path: str) -> tuple[Usd.Stage, list[Notice]]:
     Raises:
         StageError: When the file or a layer that it needs cannot be read, or references run in a circle.
     """
-    check_there(path)
+    path = shot_name(shot)
+    if isinstance(shot, str):
+        check_there(shot)
     with pxr_errors(f"cannot open {path}"), quiet() as diagnostics:
-        root = Sdf.Layer.FindOrOpen(path)
+        root = Sdf.Layer.FindOrOpen(shot) if isinstance(shot, str) else shot.GetRootLayer()
         if root is not None and not is_sound(root):
             raise StageError(f"cannot open {path}: it lists prims that it does not hold; the file is damaged")
-        stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
+        stage = Usd.Stage.Open(shot, Usd.Stage.LoadAll) if isinstance(shot, str) else StageView.of(shot).open()
         if not stage:
             raise StageError(f"cannot open {path}")
         said = [item.commentary for item in diagnostics.TakeUncoalescedDiagnostics()]

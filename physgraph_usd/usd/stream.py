@@ -16,41 +16,50 @@ from .atomic import leave_if_asked, prepare_target, publish, temporary_path
 from .files import LAYER_SUFFIXES, check_suffix
 from .stage import reason_of
 
+IN_MEMORY = "refined.usda"
+"""What a layer in memory is called."""
 FLUSH_BYTES = 16_000_000
 """Pending array bytes at which the layer is saved; each save rewrites a few kilobytes of tables."""
 
 
 class LayerStream:
-    """One new layer, atomic and streaming.
+    """One new layer, atomic and streaming, or in memory.
 
     Values go to a temporary binary layer beside the target; `commit` moves it to the final name, converting to text
-    where the target asks for it. Leaving the ``with`` block without `commit` removes the temporary file.
+    where the target asks for it. Leaving the ``with`` block without `commit` removes the temporary file. A layer
+    without a target is anonymous, stays in memory and touches no disk.
     """
 
-    def __init__(self, target: Path, *, overwrite: bool = False) -> None:
-        """Start a temporary layer.
+    def __init__(self, target: Path | None, *, overwrite: bool = False) -> None:
+        """Start a temporary layer, or one in memory.
 
         Args:
-            target: Final path, ``.usdc``, ``.usda`` or ``.usd``.
+            target: Final path, ``.usdc``, ``.usda`` or ``.usd``; None for a layer in memory.
             overwrite: Whether an existing file may be replaced, at `commit`.
 
         Raises:
             UsageError: The extension is not a layer's, or the target exists and may not be replaced.
             LayerError: The folder cannot be written, or this process is writing the same layer already.
         """
+        self.target = target
+        self.temporary = None if target is None else temporary_path(target)
+        self._pending = 0
+        self._layer: Sdf.Layer | None = Sdf.Layer.CreateAnonymous(IN_MEMORY) if target is None else None
+        if target is not None and self.temporary is not None:
+            self._layer = self._created(target, self.temporary, overwrite=overwrite)
+
+    def _created(self, target: Path, temporary: Path, *, overwrite: bool) -> Sdf.Layer:
         check_suffix("the layer", target, LAYER_SUFFIXES)
-        if Sdf.Layer.Find(str(temporary_path(target))):
+        if Sdf.Layer.Find(str(temporary)):
             raise LayerError(f"{target} is being written by this process already")
         prepare_target(target, overwrite=overwrite)
-        self.target = target
-        self.temporary = temporary_path(target)
-        self._pending = 0
         try:
-            self._layer: Sdf.Layer | None = Sdf.Layer.CreateNew(str(self.temporary))
+            layer = Sdf.Layer.CreateNew(str(temporary))
         except Tf.ErrorException as error:
             raise self._failure(error) from error
-        if self._layer is None:
+        if layer is None:
             raise LayerError(f"cannot write in {target.parent}: check that the folder is writable")
+        return layer
 
     @property
     def layer(self) -> Sdf.Layer:
@@ -125,25 +134,31 @@ class LayerStream:
             SystemExit: A termination signal came.
         """
         leave_if_asked()
+        if self.target is not None:
+            self._save()
+        self._pending = 0
+
+    def _save(self) -> None:
         try:
             saved = self.layer.Save()
         except Tf.ErrorException as error:
             raise self._failure(error) from error
         if not saved:
             raise LayerError(f"cannot write {self.target}: saving failed without a reason")
-        self._pending = 0
 
-    def commit(self) -> Path:
+    def commit(self) -> Path | None:
         """Move the layer to its final name.
 
         Returns:
-            The final path.
+            The final path; None for a layer in memory, which stays in ``layer``.
 
         Raises:
             LayerError: The disk is full, or the target is held open by another program.
         """
         self.flush()
-        finished = self._as_text() if self.target.suffix == ".usda" else self.temporary
+        if self.target is None or self.temporary is None:
+            return None
+        finished = self._as_text(self.target) if self.target.suffix == ".usda" else self.temporary
         # A layer that is still mapped into memory cannot be moved on Windows.
         self._layer = None
         publish(finished, self.target)
@@ -153,9 +168,9 @@ class LayerStream:
             loaded.Reload(True)
         return self.target
 
-    def _as_text(self) -> Path:
+    def _as_text(self, target: Path) -> Path:
         """Convert the temporary layer to text."""
-        path = temporary_path(self.target, suffix=".usda")
+        path = temporary_path(target, suffix=".usda")
         try:
             self.layer.Export(str(path))
         except Tf.ErrorException as error:
@@ -164,7 +179,9 @@ class LayerStream:
         return path
 
     def discard(self) -> None:
-        """Remove the temporary file, if it is still there."""
+        """Remove the temporary file, if it is still there; a layer in memory stays."""
+        if self.temporary is None:
+            return
         self._layer = None
         self.temporary.unlink(missing_ok=True)
 

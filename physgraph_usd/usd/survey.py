@@ -13,7 +13,7 @@ from .placement import check_placement
 from .points import PointReader
 from .schema import GARMENT_API
 from .skinning import skel_root
-from .stage import Notice, list_meshes, metres_per_unit, open_stage, pxr_errors, quiet, read_units
+from .stage import Notice, list_meshes, metres_per_unit, open_stage, pxr_errors, quiet, read_units, shot_name
 from .times import garment_times
 
 
@@ -49,7 +49,7 @@ class Survey:
     """What is on a stage.
 
     Attributes:
-        path: The shot file.
+        path: The shot file, or the name of a stage that has none.
         metres_per_unit: Length of one stage unit [m].
         meshes: Every mesh.
         notices: What is odd about the stage itself.
@@ -61,13 +61,14 @@ class Survey:
     notices: tuple[Notice, ...]
 
 
-def survey(path: str) -> Survey:
-    """Look at every mesh of a stage, broken ones included.
+def survey(shot: str | Usd.Stage) -> Survey:
+    """Look at every mesh of a shot, broken ones included.
 
     Raises:
         StageError: When the file cannot be opened at all.
     """
-    stage, notices = open_stage(path)
+    path = shot_name(shot)
+    stage, notices = open_stage(shot)
     with pxr_errors(f"cannot read {path}"), quiet():
         units, odd = read_units(stage)
         meshes = tuple(survey_mesh(stage.GetPrimAtPath(mesh), units.metres) for mesh in list_meshes(stage))

@@ -13,9 +13,10 @@ from ..sides import SIDES
 from .atomic import ASSET_PATHS, prepare_target
 from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .find import find_colliders, find_garments
-from .provenance import asset_path, export_layer, root_over
+from .provenance import asset_path, export_layer
 from .schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, Property
 from .stage import open_stage
+from .view import root_over
 
 
 def tag(

@@ -88,7 +88,7 @@ class PointTrack:
             self._repeat(_Sample(time, self._last.points))
             return
         self._matrix = to_metres
-        points = _to_local(world, to_metres, str(self._paths["points"].GetPrimPath()), time)
+        points = to_local(world, to_metres, str(self._paths["points"].GetPrimPath()), time)
         if not self._has_default:
             self._author(None, points if self._rest is None else self._rest)
             self._has_default, self._rest = True, None
@@ -142,8 +142,15 @@ class PointTrack:
             self._author_velocity(self._queue[1], self._queue[0], self._queue[2])
             self._queue.pop(0)
 
-    def finish(self) -> None:
-        """Author what waited for a next sample."""
+    def finish(self, *, hold: bool = False) -> None:
+        """Author what waited for a next sample.
+
+        Args:
+            hold: Whether the end of a run of equal samples is written too, because further samples are to follow it.
+        """
+        if hold and self._held is not None and self._last is not None and not self._still:
+            self._emit(_Sample(self._held, self._last.points))
+            self._held = None
         if len(self._queue) == 1:
             self._author_velocity(self._queue[0], self._queue[0], self._queue[0])
         elif self._queue:
@@ -167,8 +174,18 @@ class PointTrack:
         self._stream.set(path, Vt.Vec3fArray.FromNumpy(velocity.astype(np.float32)), time=at.time)
 
 
-def _to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:
-    """Bring world metres to local units: float64 inside, float32 out."""
+def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:
+    """Bring world metres to local units, shape (V, 3): float64 inside, float32 out.
+
+    Args:
+        world: Positions [m], shape (V, 3).
+        to_metres: Local space to world metres, shape (4, 4), for column vectors.
+        path: The prim, for the message.
+        time: The time code, for the message.
+
+    Raises:
+        LayerError: A position is not finite, or the matrix cannot be inverted.
+    """
     when = "" if time is None else f" at time code {time:g}"
     try:
         inverse = np.linalg.inv(to_metres[:3, :3])

@@ -12,22 +12,23 @@ from pxr import Sdf, Usd
 
 from ..errors import LayerError
 from . import layer_rules
-from .provenance import read_record, recorded_shot, root_over
+from .provenance import read_record, recorded_shot
 from .rules import RULES, Fine, Problem, subsets
 from .stage import USD_ERRORS, check_there, is_there, pxr_errors, reason_of
 from .variants import same_variants
+from .view import StageView
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
 _COUNTS = "InvalidSubsetFamily"
 """USD's rule whose message lists indices: the same fault reads otherwise on the fine mesh."""
 
 
-def validate_layer(path: str | Path, shot: str | Path | None = None) -> list[Problem]:
+def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage | None = None) -> list[Problem]:
     """Check a refined layer.
 
     Args:
-        path: The layer.
-        shot: The shot that it goes over; by default the one named in its record.
+        layer: The layer, a file or in memory.
+        shot: The shot that it goes over, a file or an open stage; by default the one named in its record.
 
     Returns:
         Problems, errors first; each names its path and time. A recorded shot that is not there is one of them.
@@ -35,26 +36,26 @@ def validate_layer(path: str | Path, shot: str | Path | None = None) -> list[Pro
     Raises:
         LayerError: The layer or the shot cannot be opened or read.
     """
-    layer = _open(path)
-    below = shot if shot is not None else recorded_shot(layer)
-    lost = shot is None and below is not None and not is_there(below)
-    root = None if below is None or lost else _open(below)
-    with pxr_errors(f"cannot read {path} over {below}", LayerError):
-        problems = check_layer(layer, root)
+    opened = layer if isinstance(layer, Sdf.Layer) else _open(layer)
+    below = shot if shot is not None else recorded_shot(opened)
+    lost = isinstance(below, str) and shot is None and not is_there(below)
+    view = None if lost else _view(below)
+    with pxr_errors(f"cannot read {layer} over {below}", LayerError):
+        problems = check_layer(opened, view)
         if lost:
             said = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
             problems.append(Problem("error", "/", None, said, "record"))
-        elif root is not None and not any(problem.rule == "composition" for problem in problems):
-            problems += _own_validators(layer, root)
+        elif view is not None and not any(problem.rule == "composition" for problem in problems):
+            problems += _own_validators(opened, view)
     return sorted(problems, key=lambda problem: problem.severity != "error")
 
 
-def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None = None) -> list[Problem]:
+def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None = None) -> list[Problem]:
     """Run our rules.
 
     Args:
         layer: The refined layer.
-        shot: Root layer of the shot, or None to check the layer alone.
+        shot: The shot, or None to check the layer alone.
         samples: How many time samples to look at, spread over the range; None for all.
 
     Returns:
@@ -71,8 +72,7 @@ def check_layer(layer: Sdf.Layer, shot: Sdf.Layer | None, *, samples: int | None
     # Only the garments are composed: a set around them may be large.
     mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
     problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
-    composed = Usd.Stage.OpenMasked(root_over(shot, [layer.identifier, shot.identifier]), mask)
-    alone = Usd.Stage.OpenMasked(shot, mask)
+    composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
     problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
     for path in paths:
         fault = layer_rules.is_mesh(path, composed)
@@ -137,7 +137,14 @@ def _open(path: str | Path) -> Sdf.Layer:
     return layer
 
 
-def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
+def _view(shot: str | Path | Usd.Stage | None) -> StageView | None:
+    """What a shot shows; None for no shot."""
+    if shot is None:
+        return None
+    return StageView.of(shot) if isinstance(shot, Usd.Stage) else StageView.of_layer(_open(shot))
+
+
+def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
     """Run USD's validators, as many as there are here; what the shot itself already has is left out."""
     try:
         from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
@@ -145,11 +152,8 @@ def _own_validators(layer: Sdf.Layer, shot: Sdf.Layer) -> list[Problem]:
         return []
     if not hasattr(UsdValidation, "ValidationContext"):
         return []
-    # Both under an anonymous root, whose name the messages repeat and `_without_names` drops.
-    stages = [
-        Usd.Stage.Open(root_over(shot, below)) for below in ([shot.identifier], [layer.identifier, shot.identifier])
-    ]
-    (before, after), missing = _findings(UsdValidation, stages)
+    # Both with an anonymous session, whose name the messages repeat and `_without_names` drops.
+    (before, after), missing = _findings(UsdValidation, [shot.open(), shot.open(over=[layer])])
     fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
     sites = {key[:2] for key in before}
     new = [

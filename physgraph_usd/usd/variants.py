@@ -12,8 +12,9 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from .lookup import bound_materials, with_ancestors
-from .provenance import mute_refined, read_record, root_over
+from .provenance import mute_refined, read_record
 from .rules import Problem
+from .view import StageView
 
 _CLOTH = ("faceVertexCounts", "faceVertexIndices", "points")
 
@@ -41,12 +42,12 @@ def recorded(layer: Sdf.Layer) -> list[Sdf.Path]:
     return [Sdf.Path(text) for text in (read_record(layer) or {}).get("variants", ())]
 
 
-def same_variants(layer: Sdf.Layer, shot: Sdf.Layer, garments: Sequence[str]) -> Iterator[Problem]:
+def same_variants(layer: Sdf.Layer, shot: StageView, garments: Sequence[str]) -> Iterator[Problem]:
     """The shot selects what the layer was made under; another selection's cloth must be refined by itself.
 
     Args:
         layer: The refined layer.
-        shot: Root layer of the shot.
+        shot: The shot.
         garments: Paths of the coarse meshes.
 
     Yields:
@@ -69,13 +70,13 @@ def same_variants(layer: Sdf.Layer, shot: Sdf.Layer, garments: Sequence[str]) ->
             yield Problem("warning", str(path.GetPrimPath()), None, f"{said}; the garments' meshes are the same", "")
 
 
-def _coarse(shot: Sdf.Layer, mask: Usd.StagePopulationMask, wanted: Sequence[Sdf.Path]) -> Usd.Stage:
+def _coarse(shot: StageView, mask: Usd.StagePopulationMask, wanted: Sequence[Sdf.Path]) -> Usd.Stage:
     """A shot without refined layers, with variants selected."""
-    root = root_over(shot, [shot.identifier])
+    selected = Sdf.Layer.CreateAnonymous("selections.usda")
     for path in wanted:
         name, selection = path.GetVariantSelection()
-        Sdf.CreatePrimInLayer(root, path.GetPrimPath()).variantSelections[name] = selection
-    stage = Usd.Stage.OpenMasked(root, mask)
+        Sdf.CreatePrimInLayer(selected, path.GetPrimPath()).variantSelections[name] = selection
+    stage = shot.open(over=[selected], mask=mask)
     mute_refined(stage)
     return stage
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,6 +21,7 @@ from ..mesh.subdivide import Refinement
 from . import overs, provenance
 from .atomic import termination_raises
 from .carry import FineMap
+from .chunk import CHUNK, Chunk
 from .files import check_targets, files_of
 from .heat import HeatTrack
 from .hints import ModelHints
@@ -29,7 +31,7 @@ from .primvars import carry_primvars, carry_subsets
 from .reader import Shot
 from .stage import Notice, pxr_errors
 from .stream import LayerStream
-from .track import PointTrack
+from .track import PointTrack, to_local
 from .validate import check_layer
 
 MODES = ("over", "sibling")
@@ -40,30 +42,32 @@ class LayerWriter:
 
     Attributes:
         notices: What was hidden, emptied or changed, and why.
-        targets: Path of each garment's fine mesh.
     """
 
     def __init__(
         self,
         shot: Shot,
         refinements: Sequence[Sequence[Refinement]],
-        out: Path,
+        out: Path | None,
         *,
         mode: str = "over",
         velocities: bool = False,
         provenance: Mapping[str, Any] | None = None,
         overwrite: bool = False,
+        chunk: Chunk | None = None,
     ) -> None:
         """Start the layer and author everything that does not move.
 
         Args:
             shot: The opened shot; never edited.
             refinements: Per garment, coarse to fine; none keeps the cage.
-            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``.
+            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``; None for one in memory.
             mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
             velocities: Whether to author velocities, by finite differences, where the shot has none too.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
+            chunk: Which frames of the shot the layer is for; garments without a sample there are not in it. None for
+                all.
 
         Raises:
             UsageError: The mode is unknown, the file exists or is one that the shot is made of, or a garment is refined
@@ -74,16 +78,14 @@ class LayerWriter:
             raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
-        check_targets([("the layer", out)], files_of(shot.path))
+        if out is not None:
+            check_targets([("the layer", out)], files_of(shot.path))
         _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
-        self._rate, self._velocities, self._open = _rate(shot.stage), velocities, True
+        self._velocities, self._open = velocities, True
         self._record = {"mode": mode} | dict(provenance or {})
+        self._chunk, self._meshes = chunk, dict[int, _RefinedMesh]()
         self.notices: list[Notice] = []
-        self.targets: list[Sdf.Path] = []
-        self._tracks: list[PointTrack] = []
-        self._hints: list[ModelHints] = []
-        self._heat: list[HeatTrack] = []
         with ExitStack() as stack:
             stack.enter_context(termination_raises())
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
@@ -95,36 +97,12 @@ class LayerWriter:
         times = self._shot.scene.times
         span = (times[0], times[-1]) if times else None
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
+        how = {"sibling": self._mode == "sibling", "velocities": self._velocities}
         with pxr_errors(f"cannot read {self._shot.path}"):
-            for index, steps in enumerate(refinements):
-                self._author_garment(index, steps, span)
-
-    def _author_garment(self, index: int, steps: Sequence[Refinement], span: tuple[float, float] | None) -> None:
-        """Author one garment's defaults and start its track."""
-        stream, source = self._stream, self._shot.sources[index]
-        prim = self._shot.stage.GetPrimAtPath(source.path)
-        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
-        fine = FineMap(self._shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
-        self.notices += overs.open_instances(stream, source)
-        target = source.path
-        if self._mode == "sibling":
-            target = overs.make_sibling(stream, prim)
-        self.targets.append(target)
-        overs.author_topology(stream, target, prim, fine)
-        overs.author_unskinned(stream, target, prim, skinned=source.skinned)
-        self.notices += carry_primvars(stream, target, prim, fine, span=span)
-        self.notices += carry_subsets(stream, target, prim, fine, span=span)
-        self.notices += overs.author_rest_points(stream, target, prim, fine)
-        left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        rest = None if source.skinned or not source.times else _refined_default(prim, fine)
-        normals = VertexNormals(fine.fine, left_handed=left)
-        rate = self._rate if self._velocities or source.velocities else None
-        self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
-        track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
-        self._tracks.append(track)
-        self._heat.append(HeatTrack(stream, target, normals.vertex_count, still=not source.times))
-        purpose = "render" if self._mode == "sibling" else UsdGeom.Imageable(prim).ComputePurpose()
-        self._hints.append(ModelHints(stream, self._shot.stage, source.path, purpose=purpose))
+            for index in _garments_in(self._shot, self._chunk):
+                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **how)
+                self.notices += mesh.notices
+                self._meshes[index] = mesh
 
     def write(
         self,
@@ -146,64 +124,67 @@ class LayerWriter:
         Raises:
             LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
         """
-        self._check_call(time, points, heat)
-        if self._time == -np.inf:
-            self._author_values(time)
-        for index, track in enumerate(self._tracks):
-            array = points[index]
-            if array is None:
-                continue
-            different = True if changed is None else bool(changed[index])
-            track.write(time, array, self._shot.to_metres(index, time), changed=different)
-            self._hints[index].write(time, track.box)
-            if heat:
-                self._heat[index].write(time, heat[index] or {})
-        self._time = np.inf if time is None else time
-
-    def _author_values(self, time: float | None) -> None:
-        """Leave the values used on the coarse prims."""
-        frame = self._shot.frame(time)
-        for source, garment, values in zip(self._shot.sources, self._shot.scene.garments, frame.garments, strict=True):
-            author_used_values(self._stream, source, garment, values)
-
-    def _check_call(
-        self,
-        time: float | None,
-        points: Sequence[np.ndarray | None],
-        heat: Sequence[Mapping[str, np.ndarray] | None],
-    ) -> None:
-        """Refuse calls that would make a wrong layer."""
         if not self._open:
             raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
         if self._time == np.inf or (time is not None and time <= self._time):
             raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
-        if len(points) != len(self._tracks):
-            raise LayerError(f"{len(points)} arrays of points for {len(self._tracks)} garments")
-        for track, array in zip(self._tracks, points, strict=True):
-            if array is not None:
-                track.check(array, time)
-        if heat and len(heat) != len(self._heat):
-            raise LayerError(f"heat maps of {len(heat)} garments for {len(self._heat)} garments")
-        for track, maps in zip(self._heat, heat, strict=False):
-            track.check(maps or {}, time)
+        _check_sizes(self._meshes, len(self._shot.sources), points, heat=heat, time=time)
+        if self._time == -np.inf:
+            self._author_values(time)
+        for index, mesh in self._meshes.items():
+            if (array := points[index]) is not None:
+                different = True if changed is None else bool(changed[index])
+                mesh.write(time, array, (heat[index] if heat else None) or {}, changed=different)
+        self._time = np.inf if time is None else time
 
-    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path:
+    def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
+        """Take the last frame of a chunk's run-up into the chunk's record.
+
+        Args:
+            time: Its time code.
+            points: As `write` takes them.
+
+        Raises:
+            LayerError: A point is not finite.
+        """
+        assert self._chunk is not None, "only a chunk has a run-up"
+        found = {
+            str(mesh.target): to_local(array, self._shot.to_metres(index, time), str(mesh.target), time)
+            for index, mesh in self._meshes.items()
+            if (array := points[index]) is not None
+        }
+        self._chunk = replace(self._chunk, before=time, points=found)
+
+    def _author_values(self, time: float | None) -> None:
+        """Leave the values used on the coarse prims."""
+        frame = self._shot.frame(time)
+        for index in self._meshes:
+            source, garment = self._shot.sources[index], self._shot.scene.garments[index]
+            author_used_values(self._stream, source, garment, frame.garments[index])
+
+    @property
+    def targets(self) -> list[Sdf.Path]:
+        """Path of each garment's fine mesh."""
+        return [mesh.target for mesh in self._meshes.values()]
+
+    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path | None:
         """Finish, validate and move the layer to its final name.
 
         Args:
             lacking: Entries of the record about what the layer lacks.
 
         Returns:
-            The layer's path.
+            The layer's path; None for a layer in memory.
 
         Raises:
             LayerError: The layer is invalid or cannot be written.
         """
         if self._time == -np.inf:
             raise LayerError(f"no time code was written to {self._stream.target}")
-        for track in self._tracks:
-            track.finish()
+        for mesh in self._meshes.values():
+            mesh.finish(hold=self._chunk is not None)
         facts = _facts(self._shot, self.targets, self._stream.target)
+        facts |= {CHUNK: self._chunk.record()} if self._chunk is not None else {}
         provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
         self._stream.flush()
         self._check_written()
@@ -215,10 +196,19 @@ class LayerWriter:
     def _check_written(self) -> None:
         """Validate the first, middle and last sample of what was written."""
         with pxr_errors(f"cannot read {self._shot.path} under the layer written", LayerError):
-            problems = check_layer(self._stream.layer, self._shot.stage.GetRootLayer(), samples=3)
+            problems = check_layer(self._stream.layer, self._shot.view, samples=3)
         errors = [problem for problem in problems if problem.severity == "error"]
         if errors:
             raise LayerError(f"the layer written is invalid ({len(errors)} problems); first: {errors[0]}")
+
+    @property
+    def layer(self) -> Sdf.Layer:
+        """The layer being written, or in memory.
+
+        Raises:
+            LayerError: It is a file that is closed.
+        """
+        return self._stream.layer
 
     def __enter__(self) -> LayerWriter:
         """Return itself."""
@@ -236,15 +226,109 @@ class LayerWriter:
             self._cleanup.close()
 
 
-def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path) -> dict[str, Any]:
+class _RefinedMesh:
+    """The refined mesh of one garment as it is written.
+
+    Attributes:
+        target: Its path.
+        notices: What was hidden, emptied or changed, and why.
+    """
+
+    def __init__(
+        self,
+        stream: LayerStream,
+        shot: Shot,
+        index: int,
+        *,
+        steps: Sequence[Refinement],
+        sibling: bool,
+        velocities: bool,
+    ) -> None:
+        """Author one garment's defaults and start its tracks.
+
+        Args:
+            stream: The layer.
+            shot: The shot.
+            index: Which garment.
+            steps: Its refinements, coarse to fine.
+            sibling: Whether it goes beside the coarse mesh.
+            velocities: Whether to author velocities where the shot has none too.
+        """
+        source, times = shot.sources[index], shot.scene.times
+        prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
+        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
+        fine = FineMap(shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
+        self.notices = overs.open_instances(stream, source)
+        self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
+        overs.author_topology(stream, target, prim, fine)
+        overs.author_unskinned(stream, target, prim, skinned=source.skinned)
+        self.notices += carry_primvars(stream, target, prim, fine, span=span)
+        self.notices += carry_subsets(stream, target, prim, fine, span=span)
+        self.notices += overs.author_rest_points(stream, target, prim, fine)
+        left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        rest = None if source.skinned or not source.times else _refined_default(prim, fine)
+        normals = VertexNormals(fine.fine, left_handed=left)
+        rate = _rate(shot.stage) if velocities or source.velocities else None
+        self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
+        self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
+        self._heat = HeatTrack(stream, target, normals.vertex_count, still=not source.times)
+        purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
+        self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
+        self._shot, self._index = shot, index
+
+    def write(self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool) -> None:
+        """Write one time code, as `LayerWriter.write` takes it."""
+        self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed)
+        self._hints.write(time, self._track.box)
+        self._heat.write(time, heat)
+
+    def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
+        """Refuse points and heat maps that do not fit."""
+        if points is not None:
+            self._track.check(points, time)
+        self._heat.check(heat, time)
+
+    def finish(self, *, hold: bool) -> None:
+        """Author what waited for a next sample; ``hold`` as `PointTrack.finish` takes it."""
+        self._track.finish(hold=hold)
+        self._heat.finish(hold=hold)
+
+
+def _check_sizes(
+    meshes: Mapping[int, _RefinedMesh],
+    count: int,
+    points: Sequence[np.ndarray | None],
+    *,
+    heat: Sequence[Mapping[str, np.ndarray] | None],
+    time: float | None,
+) -> None:
+    """Refuse points and heat maps that do not fit the garments, of which there are ``count``."""
+    if len(points) != count:
+        raise LayerError(f"{len(points)} arrays of points for {count} garments")
+    if heat and len(heat) != count:
+        raise LayerError(f"heat maps of {len(heat)} garments for {count} garments")
+    for index, mesh in meshes.items():
+        mesh.check(points[index], (heat[index] if heat else None) or {}, time)
+
+
+def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
     """What the record says of the garments, and of what they were read from."""
-    held = zip(targets, shot.sources, strict=True)
+    held = zip(targets, shot.sources, strict=False)
     return {
-        "shot": provenance.asset_path(shot.path, out.parent),
+        "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
         "garments": [str(path) for path in targets],
         "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
         "variants": shot.selections or None,
     }
+
+
+def _garments_in(shot: Shot, chunk: Chunk | None) -> list[int]:
+    """Numbers of the garments that have a sample in a chunk; one without samples is in that of the first frame."""
+    every = range(len(shot.sources))
+    if chunk is None or not chunk.times:
+        return [*every]
+    first = shot.scene.times[0]
+    return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(chunk.times)]
 
 
 def _rate(stage: Usd.Stage) -> float:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import click
 
+_RANGE = re.compile(r"(-?[\d.]+)-(-?[\d.]+)")
+
 
 class FrameRange(click.ParamType):
-    """Time codes ``A:B``, or one time code ``A``."""
+    """Time codes ``A:B``, or one time code ``A``; ``A-B`` too, as farms write the frames of a task."""
 
     name = "A:B"
 
@@ -16,7 +19,7 @@ class FrameRange(click.ParamType):
         """Turn the text into the first and the last time code."""
         if isinstance(value, tuple):
             return value
-        first, colon, last = value.partition(":")
+        first, colon, last = _RANGE.sub(r"\1:\2", value).partition(":")
         try:
             span = float(first), float(last if colon else first)
         except ValueError:

@@ -1,0 +1,24 @@
+"""The console command: each subcommand declares its options, imports its work and makes one call.
+
+Data goes to stdout; progress, warnings and errors go to stderr.
+Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part.
+"""
+
+from __future__ import annotations
+
+import click
+
+from ..version import __version__
+from .commands import chart, inspect, preview, report_schema, sample, schema_path, stitch, tag, train, validate
+from .refine import refine
+from .structure import Commands
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
+@click.version_option(__version__, prog_name="physgraph-usd")
+def main() -> None:
+    """Refine coarse animated garments in USD shots into fine cloth."""
+
+
+for command in (refine, stitch, inspect, tag, validate, sample, preview, chart, train, schema_path, report_schema):
+    main.add_command(command)

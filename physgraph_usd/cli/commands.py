@@ -1,0 +1,198 @@
+"""The commands beside ``refine``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..fabric import PRESETS
+from .options import (
+    asset_paths_option,
+    collider_option,
+    config_option,
+    garment_option,
+    json_option,
+    out_option,
+    overwrite_option,
+    scene_options,
+    shot_argument,
+)
+from .printing import outline, tell
+from .refine import refine
+from .show_file import values_for
+from .structure import DONE, FAILED
+from .types import FrameRange, PictureSize
+
+
+@click.command()
+@click.argument("chunks", nargs=-1, required=True, metavar="CHUNK...", type=click.Path(path_type=Path))
+@out_option("LAYER", "Layer to write.")
+@click.option("--frames", type=FrameRange(), help="Time codes that must be there.  [default: all of the shot]")
+@click.option(
+    "--seam-bound",
+    type=click.FloatRange(min=0),
+    metavar="EDGES",
+    default=0.05,
+    help="Most that a seam may move, RMS, in mean fine edge lengths.",
+)
+@click.option("--clips", is_flag=True, help="Play the chunks as value clips instead of copying them into one file.")
+@overwrite_option
+def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
+    """Join each CHUNK of a shot, as refine --run-up writes them, into one layer and print its path.
+
+    A folder stands for all layers in it. How far each seam moves goes to stderr.
+    """
+    from ..usd.stitch import stitch as join
+
+    for seam in join(chunks, out, **options):
+        click.echo(seam, err=True)
+    click.echo(out)
+
+
+@click.command()
+@shot_argument
+@scene_options
+@config_option
+@json_option
+@click.pass_context
+def inspect(ctx: click.Context, shot: str, *, as_json: bool, **options: Any) -> None:
+    """Print what would be refined, with what, from where, and every defect found in SHOT.
+
+    Exits with 1 when SHOT cannot be refined as asked.
+    """
+    from ..shot import inspect_shot
+
+    values, _ = values_for(ctx, shot, refine)
+    found = inspect_shot(shot, **{name: values[name] for name in options if name != "config"})
+    click.echo(json.dumps(found, indent=2) if as_json else "\n".join(outline(found)))
+    sys.exit(FAILED if "problem" in found else DONE)
+
+
+@click.command()
+@shot_argument
+@out_option("OUT", "Layer to write.")
+@garment_option
+@collider_option
+@click.option("--preset", metavar="FABRIC", help=f"Fabric of the garments: {', '.join(PRESETS)}.")
+@click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
+@click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
+@asset_paths_option
+@overwrite_option
+def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
+    """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
+    from ..usd.tag import tag as tag_shot
+
+    given = {name: value for name, value in options.items() if value is not None}
+    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **given))
+
+
+@click.command()
+@click.argument("layer", type=click.Path(dir_okay=False))
+@click.option(
+    "--shot", type=click.Path(dir_okay=False), help="The shot it goes over.  [default: the one the layer names]"
+)
+@json_option
+def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
+    """Check a refined LAYER by our rules and by USD's own validators; exit with 1 when it breaks one."""
+    from ..usd.validate import validate_layer
+
+    problems = validate_layer(layer, shot)
+    if as_json:
+        click.echo(json.dumps([asdict(problem) for problem in problems], indent=2))
+    else:
+        for problem in problems:
+            click.echo(problem)
+    sys.exit(FAILED if any(problem.severity == "error" for problem in problems) else DONE)
+
+
+@click.command()
+@click.argument("name", default="sleeve")
+@out_option("DIR", "Folder to write into.")
+@overwrite_option
+def sample(name: str, out: Path, *, overwrite: bool) -> None:
+    """Write the sample shot NAME and print its path; an unknown name lists those there are."""
+    from ..samples import write_sample
+
+    click.echo(write_sample(name, out, overwrite=overwrite))
+
+
+@click.command()
+@click.argument("layer", type=click.Path(dir_okay=False))
+@out_option("PNG|GIF", "Picture to write.")
+@click.option("--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the one the layer names]")
+@click.option("--time", "times", type=float, multiple=True, metavar="T", help="Time code to draw; repeatable.")
+@click.option("--size", type=PictureSize(), default="1280x640", help="Pixels.")
+@click.option("--camera", type=(float, float), metavar="AZIMUTH ELEVATION", help="Where to look from, in degrees.")
+def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
+    """Draw the coarse cloth beside the fine cloth of LAYER and print the picture's path.
+
+    A PNG shows one time code, a GIF all of them.
+    """
+    from ..preview import preview as draw
+
+    click.echo(draw(layer, out, times=times or None, **options))
+
+
+@click.command()
+@shot_argument
+@out_option("DIR", "Folder to write into; a chart that was begun there goes on.")
+@scene_options
+@click.option("--device", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--clock", type=click.Choice(["wall", "cpu"]), help="cpu: one core's own time, for busy machines.")
+@click.option("--method", "methods", multiple=True, metavar="NAME", help="Integrator to measure; repeatable.")
+@click.option(
+    "--peer", "peers", multiple=True, metavar="NAME=PYTHON", help="Solver outside, and the Python that has it."
+)
+@click.option("--count", type=click.IntRange(min=1), metavar="N", help="Frames to measure.")
+@click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="How often each time is taken.")
+@click.option("--short", is_flag=True, help="Take less than 15 minutes.")
+@click.option("--budget-minutes", type=float, metavar="M", help="Plan with this time.")
+@overwrite_option
+def chart(shot: str, out: Path, **options: Any) -> None:
+    """Measure SHOT's frames by every method, draw speed against accuracy, and print a summary."""
+    from ..chart.options import ChartOptions
+    from ..chart.run import chart_shot
+
+    given = {name: value for name, value in options.items() if value not in (None, ())}
+    done = chart_shot(shot, out, ChartOptions(**given, progress=tell))
+    click.echo("\n".join(done.lines()))
+
+
+@click.command()
+@click.option(
+    "--config", "config_file", required=True, type=click.Path(path_type=Path), metavar="FILE.toml", help="What and how."
+)
+@out_option("DIR", "Folder for the log, the checkpoint, the weights and their card.")
+@click.option("--device", default="cpu", metavar="cpu|cuda", help="Where to compute.")
+@click.option("--minutes", type=float, metavar="M", help="Train so long.  [default: the configuration's]")
+@click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
+def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
+    """Train a learned integrator and print its weights' path."""
+    from ..shot import prepare_device
+    from ..train.record import run_training
+
+    prepare_device(device)
+    click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))
+
+
+@click.command("report-schema")
+@click.argument("name", type=click.Choice(["report", "summary"]), default="report")
+def report_schema(name: str) -> None:
+    """Print the JSON Schema of the report of a run, or of the summary of several."""
+    from .. import report, summary
+
+    click.echo({"report": report.SCHEMA, "summary": summary.SCHEMA}[name].read_text(encoding="utf-8"), nl=False)
+
+
+@click.command("schema-path")
+def schema_path() -> None:
+    """Print the folder of the schemas, for PXR_PLUGINPATH_NAME."""
+    from ..usd.schema import schema_path as find
+
+    click.echo(find())

@@ -1,0 +1,130 @@
+"""What commands print: warnings and progress on stderr, reports in words, a log in a file."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..errors import PhysGraphError
+
+MOST_LISTED = 8
+"""Longest list of numbers that is printed in full."""
+LOGGER = "physgraph_usd"
+_LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
+_LINE = "%(asctime)s %(levelname)s %(shot)s: %(message)s"
+
+
+@dataclass(frozen=True)
+class Saying:
+    """How much a command says, and where.
+
+    Attributes:
+        verbose: 0 warnings, 1 each frame too, 2 what was measured in it too.
+        log_file: A file to append to, with each frame at least, or None.
+        in_lines: Say progress in lines, into files and pipes too.
+        several: Name the shot in each line.
+    """
+
+    verbose: int = 0
+    log_file: Path | None = None
+    in_lines: bool = False
+    several: bool = False
+
+    @contextmanager
+    def logged(self) -> Iterator[None]:
+        """Bring what the package logs to stderr and into the file; an error that ends the block only into the file.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        logger, on_stderr = logging.getLogger(LOGGER), _OnStderr(_LEVELS[min(self.verbose, 2)], self.several)
+        handlers: list[logging.Handler] = [on_stderr]
+        if self.log_file is not None:
+            into_file = logging.FileHandler(self.log_file, encoding="utf-8")
+            into_file.setLevel(_LEVELS[max(min(self.verbose, 2), 1)])
+            into_file.setFormatter(logging.Formatter(_LINE, defaults={"shot": "-"}))
+            handlers.append(into_file)
+        before = logger.level
+        logger.setLevel(min(handler.level for handler in handlers))
+        for handler in handlers:
+            logger.addHandler(handler)
+        try:
+            yield
+        except PhysGraphError as error:
+            logger.removeHandler(on_stderr)
+            logger.error(str(error))
+            raise
+        finally:
+            logger.setLevel(before)
+            for handler in handlers:
+                logger.removeHandler(handler)
+                handler.close()
+
+    @contextmanager
+    def progress(self, label: str) -> Iterator[Callable[[int, int], None]]:
+        """A bar of finished frames, on a terminal alone, or lines of them."""
+        hidden = self.in_lines or self.verbose > 0 or not sys.stderr.isatty()
+        with click.progressbar(length=1, label=label, file=sys.stderr, hidden=hidden) as bar:
+
+            def show(done: int, total: int) -> None:
+                bar.length = total
+                bar.update(done - bar.pos)
+                if self.in_lines:
+                    tell(bar.pct, bar.eta, f"{done} of {total} frames")
+
+            yield show
+
+
+class _OnStderr(logging.Handler):
+    """Warnings and errors by their names, the rest as it is."""
+
+    def __init__(self, level: int, several: bool) -> None:
+        super().__init__(level)
+        self._several = several
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a record."""
+        kind = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        shot = getattr(record, "shot", "") if self._several else ""
+        click.echo(f"{kind}{shot}{': ' if shot else ''}{record.getMessage()}", err=True)
+
+
+def tell(part: float, seconds: float, what: str) -> None:
+    """One line of progress on stderr.
+
+    Args:
+        part: How much is done, 1 for all.
+        seconds: How long the rest may take [s].
+        what: What is done.
+    """
+    left = f"about {seconds / 60.0:.0f} min left" if seconds > 90.0 else f"about {seconds:.0f} s left"
+    click.echo(f"{part:4.0%}  {left:20s}  {what}", err=True)
+
+
+def outline(value: Any, indent: str = "") -> Iterator[str]:
+    """Lines of a report for reading: nested records indented, plain lists on one line."""
+    pairs = value.items() if isinstance(value, dict) else (("-", item) for item in value)
+    for key, item in pairs:
+        label = key if key == "-" else f"{key}:"
+        if isinstance(item, dict | list) and any(isinstance(part, dict | list | str) for part in item):
+            yield f"{indent}{label}"
+            yield from outline(item, indent + "  ")
+        else:
+            yield f"{indent}{label} {_in_words(item)}"
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, list) and len(value) > MOST_LISTED:
+        return f"{_in_words(value[:3])}, ..., {_in_words(value[-1])} ({len(value)} in all)"
+    if isinstance(value, list) and value:
+        return ", ".join(map(_in_words, value))
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "none" if value is None or value in ([], {}) else str(value)

@@ -1,0 +1,202 @@
+"""``refine``: one shot in this process, or several, each in a process of its own, with one summary."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ..errors import LayerError, PhysGraphError, UsageError
+from .options import (
+    farm_options,
+    file_options,
+    layer_options,
+    out_option,
+    run_options,
+    said_options,
+    scene_options,
+    solve_options,
+)
+from .printing import LOGGER, Saying
+from .show_file import values_for
+from .structure import GroupedCommand
+
+if TYPE_CHECKING:
+    from ..options import RefineOptions
+    from ..report import RefineReport
+    from ..summary import Row
+
+USD_SUFFIXES = (".usd", ".usda", ".usdc")
+NOT_OF_THE_CALL = {"shots", "out", "report", "root", "progress", "summary", "config", "verbose", "log_file"}
+"""Options of the command that `RefineOptions` has not, or has one for each shot."""
+
+Job = tuple[str, Path, "RefineOptions"]
+
+
+@click.command(cls=GroupedCommand)
+@click.argument("shots", nargs=-1, required=True, metavar="SHOT...", type=click.Path(dir_okay=False))
+@out_option("OUT", "Layer to write, or a folder.")
+@file_options
+@scene_options
+@solve_options
+@layer_options
+@run_options
+@farm_options
+@said_options
+@click.pass_context
+def refine(
+    ctx: click.Context, shots: tuple[str, ...], out: Path, *, summary: Path | None, dry_run: bool, **options: object
+) -> None:
+    """Refine the garments of each SHOT into a layer of its own and print the layers' paths.
+
+    Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
+    comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
+    """
+    from ..shot import check_jobs
+    from ..usd.atomic import termination_raises
+
+    jobs = _jobs(ctx, shots, out)
+    layers = [layer for _, layer, _ in jobs]
+    verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
+    saying = Saying(verbose, log_file, in_lines, several=len(jobs) > 1)
+    also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
+    if also:
+        check_jobs(jobs, also=also)
+    with termination_raises(), _folder_of(layers, out, dry_run=dry_run), saying.logged():
+        code = _refine_each(jobs, saying, summary=None if dry_run else summary)
+    sys.exit(code)
+
+
+def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
+    """Each shot with its layer and its options, those of its show's file among them."""
+    from ..options import RefineOptions
+
+    report, root = ctx.params["report"], ctx.params["root"]
+    layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
+    none = [None] * len(shots)
+    reports = none if report is None else _one_each(shots, report, "--report", suffix="", accepts=(".json",))
+    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda", accepts=USD_SUFFIXES)
+    jobs = []
+    for shot, layer, own_report, own_root in zip(shots, layers, reports, roots, strict=True):
+        values, sources = values_for(ctx, shot, ctx.command)
+        given = {name: value for name, value in values.items() if name not in NOT_OF_THE_CALL}
+        jobs.append((shot, layer, RefineOptions(**given, report=own_report, root=own_root, sources=sources)))
+    return jobs
+
+
+def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -> int:
+    """Refine the jobs and say of each what became of it; returns the exit code."""
+    from ..summary import check_summary, exit_code_of, row_of, table_of, write_summary
+
+    if summary is not None:
+        check_summary(summary, overwrite=jobs[0][2].overwrite)
+    rows: list[Row] = []
+    failed: list[PhysGraphError] = []
+    try:
+        for (shot, layer, _), done in zip(jobs, _results(jobs, saying), strict=True):
+            rows.append(row_of(shot, layer, done))
+            if isinstance(done, PhysGraphError):
+                failed.append(done)
+            else:
+                click.echo(done.to_json() if done.out is None else done.out)
+    finally:
+        rows += [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
+        if saying.several:
+            click.echo("\n".join(table_of(rows)), err=True)
+        if summary is not None:
+            write_summary(summary, rows)
+    if failed and not saying.several:
+        raise failed[0]
+    _say_failed(rows)
+    return exit_code_of(rows)
+
+
+def _say_failed(rows: Sequence[Row]) -> None:
+    """Say which shots failed and why."""
+    failed = [row for row in rows if row.error]
+    for row in failed:
+        logging.getLogger(LOGGER).error(row.error, extra={"shot": row.shot})
+    if failed:
+        click.echo(f"{len(failed)} of {len(rows)} shots failed", err=True)
+
+
+def _results(jobs: Sequence[Job], saying: Saying) -> Iterator[RefineReport | PhysGraphError]:
+    """What became of each job: one in this process, several in processes of their own."""
+    from ..shot import refine_shots
+
+    if len(jobs) == 1:
+        try:
+            yield _refine_shown(*jobs[0], saying=saying)
+        except PhysGraphError as error:
+            yield error
+        return
+    workers = max(options.workers for *_, options in jobs)
+    refine = partial(_refine_logged, saying=saying, alone=workers == 1)
+    yield from refine_shots(jobs, workers=workers, refine=refine)
+
+
+def _refine_logged(shot: str, layer: Path, options: RefineOptions, *, saying: Saying, alone: bool) -> RefineReport:
+    """Refine a shot in a process of its own, which logs for itself."""
+    with saying.logged():
+        return _refine_shown(shot, layer, options, saying=saying, alone=alone)
+
+
+def _refine_shown(
+    shot: str, layer: Path, options: RefineOptions, *, saying: Saying, alone: bool = True
+) -> RefineReport:
+    """Refine a shot and show how far it is where it is alone at work."""
+    from ..shot import refine_shot
+
+    with saying.progress(Path(shot).name) if alone else nullcontext() as progress:
+        return refine_shot(shot, layer, replace(options, progress=progress))
+
+
+def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...]) -> list[Path]:
+    """Name one output per shot: ``to`` itself when it is a file's name, else files in the folder ``to``."""
+    if to.suffix in accepts and not to.is_dir():
+        if len(shots) > 1:
+            raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
+        return [to]
+    if to.suffix and not to.is_dir():
+        known = ", ".join(accepts)
+        raise UsageError(f"{option} {to}: unknown suffix '{to.suffix}'; known: {known}; or make a folder of that name")
+    if not suffix and len(shots) == 1:
+        return [to]
+    files = [to / (Path(shot).stem + suffix) for shot in shots]
+    twice = sorted({str(file) for file in files if files.count(file) > 1})
+    if twice:
+        raise UsageError(f"{option} {to}: two shots would both be written to {twice[0]}; refine them one by one")
+    return files
+
+
+@contextmanager
+def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
+    """Make the folder that layers go into, unless ``out`` names a layer; it goes again where nothing came into it.
+
+    Finished frames that are left by an interruption are named.
+    """
+    from ..frames import frames_folder
+    from ..lock import is_held
+
+    made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
+    try:
+        try:
+            for folder in reversed(made):
+                folder.mkdir()
+        except OSError as error:
+            raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
+        yield
+    finally:
+        for kept in filter(Path.is_dir, map(frames_folder, layers)):
+            if not is_held(kept):
+                click.echo(f"finished frames are kept in {kept}; --resume goes on from them", err=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()

@@ -1,0 +1,75 @@
+"""What all commands share: exit codes, errors as one line on stderr, help in groups."""
+
+from __future__ import annotations
+
+import errno
+from typing import Any, Never
+
+import click
+
+from ..errors import PhysGraphError, UsageError
+
+DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
+EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview", "matplotlib": "chart", "plotly": "chart"}
+"""Which extra brings a module that only some commands need."""
+
+
+class Commands(click.Group):
+    """A group whose commands end with ``error: ...`` and the error's exit code instead of a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
+        from ..processes import memory_is_named
+
+        try:
+            with memory_is_named():
+                return super().invoke(ctx)
+        except PhysGraphError as error:
+            _leave(ctx, str(error), code_of(error))
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise
+            _leave(ctx, f"{error.filename or 'cannot read or write'}: {error.strerror}", FAILED)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing not in EXTRAS:
+                raise
+            _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
+
+
+def code_of(error: PhysGraphError) -> int:
+    """The exit code of a command that ends with an error."""
+    return WRONG_USAGE if isinstance(error, UsageError) else FAILED
+
+
+def _leave(ctx: click.Context, message: str, code: int) -> Never:
+    click.echo(f"error: {message}", err=True)
+    ctx.exit(code)
+
+
+class Option(click.Option):
+    """An option that the help shows under a heading.
+
+    Attributes:
+        heading: The heading.
+    """
+
+    def __init__(self, *args: Any, heading: str = "Options", **settings: Any) -> None:
+        """Declare it, as `click.Option` is declared."""
+        super().__init__(*args, **settings)
+        self.heading = heading
+
+
+class GroupedCommand(click.Command):
+    """A command whose help shows its options under their headings, in the order in which they are declared."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options into the help."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx) if isinstance(param, click.Option) else None
+            if record is not None:
+                groups.setdefault(param.heading if isinstance(param, Option) else "Options", []).append(record)
+        for heading in sorted(groups, key="Options".__eq__):  # what has no heading comes last
+            with formatter.section(heading):
+                formatter.write_dl(groups[heading])

@@ -1,0 +1,129 @@
+"""What became of several shots: one row each, as JSON and as a table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from .errors import PhysGraphError, UsageError
+from .report import DONE, FAILED, FORMAT, IN_PART, RefineReport
+from .usd.atomic import write_text
+from .version import __version__
+
+SCHEMA = Path(__file__).with_name("summary.schema.json")
+WRONG_USAGE = 2
+
+
+@dataclass(frozen=True)
+class Row:
+    """One shot.
+
+    Attributes:
+        shot: Input file.
+        layer: Output layer.
+        state: "done", "in part", "failed", "skipped" (the layer was there) or "not begun".
+        exit_code: Its own, or None where it was not begun.
+        frames: Time codes that were asked for.
+        failed_frames: Those without a sample.
+        seconds_a_frame: Wall time [s], or None without frames.
+        crossings: Edges through faces that are left, in all frames; None where none were looked for.
+        warnings: What the user should know.
+        error: What ended it, or "".
+    """
+
+    shot: str
+    layer: str
+    state: str = "not begun"
+    exit_code: int | None = None
+    frames: int = 0
+    failed_frames: tuple[str, ...] = ()
+    seconds_a_frame: float | None = None
+    crossings: int | None = None
+    warnings: tuple[str, ...] = ()
+    error: str = ""
+
+
+def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | None) -> Row:
+    """The row of a shot.
+
+    Args:
+        shot: Input file.
+        layer: Output layer.
+        done: Its report, the error that ended it, or None where it was not begun.
+    """
+    if done is None:
+        return Row(str(shot), str(layer))
+    if isinstance(done, PhysGraphError):
+        code = WRONG_USAGE if isinstance(done, UsageError) else FAILED
+        return Row(str(shot), str(layer), "failed", code, error=str(done))
+    frames = len(done.frames)
+    return Row(
+        str(shot),
+        str(layer),
+        "skipped" if done.skipped else {DONE: "done", IN_PART: "in part"}.get(done.exit_code, "failed"),
+        done.exit_code,
+        frames,
+        tuple(done.failed),
+        round(done.seconds["frames"] / frames, 4) if frames else None,
+        done.crossings,
+        tuple(done.warnings),
+    )
+
+
+def exit_code_of(rows: Sequence[Row]) -> int:
+    """The exit code of a batch: that of all its shots where they agree, else 3."""
+    codes = {row.exit_code for row in rows}
+    only = codes.pop() if len(codes) == 1 else None
+    return IN_PART if only is None else only
+
+
+def write_summary(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows as JSON, whole or not at all.
+
+    Raises:
+        LayerError: The file cannot be written.
+    """
+    plain: dict[str, Any] = {"format": FORMAT, "version": __version__, "exit_code": exit_code_of(rows)}
+    write_text(path, json.dumps(plain | {"shots": [asdict(row) for row in rows]}, indent=2) + "\n")
+
+
+def check_summary(path: Path, *, overwrite: bool) -> None:
+    """Refuse to write a summary over a file that is none.
+
+    Raises:
+        UsageError: The file exists, is no summary and may not be replaced.
+    """
+    if path.exists() and not (overwrite or _is_summary(path)):
+        raise UsageError(f"{path} exists and is no summary; choose another name or allow overwriting")
+
+
+def _is_summary(path: Path) -> bool:
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(plain, dict) and {"format", "shots"} <= plain.keys()
+
+
+def table_of(rows: Sequence[Row]) -> list[str]:
+    """Rows as lines of a table."""
+    head = ("shot", "state", "frames", "s a frame", "crossings", "warnings", "exit code")
+    cells = [head, *(_cells(row) for row in rows)]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(head))]
+    return [
+        "  ".join(cell.ljust(width) if column < 2 else cell.rjust(width) for column, (cell, width) in enumerate(pairs))
+        for pairs in (tuple(zip(line, widths, strict=True)) for line in cells)
+    ]
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    made = row.frames - len(row.failed_frames)
+    frames = "" if not row.frames else str(made) if made == row.frames else f"{made} of {row.frames}"
+    numbers = [
+        "" if row.seconds_a_frame is None else f"{row.seconds_a_frame:.2f}",
+        *("" if each is None else str(each) for each in (row.crossings, len(row.warnings), row.exit_code)),
+    ]
+    return (Path(row.shot).name, row.state, frames, *numbers)

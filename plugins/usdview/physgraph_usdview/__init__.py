@@ -1,0 +1,1 @@
+"""A usdview plug-in: a menu that refines the current frame and shows heat maps."""

@@ -1,0 +1,137 @@
+"""Shots and chunks on the workers of a Dask scheduler: the bytes of a local run, whatever becomes of a worker."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from shots import cloth_shot, command, faults, refine
+
+from physgraph_usd.errors import GarmentError, PhysGraphError, SolveError, UsageError
+from physgraph_usd.farm import connected
+
+distributed = pytest.importorskip("distributed", reason="needs Dask (extra farm)")
+TIMES = tuple(float(time) for time in range(1, 49))
+NOWHERE = "tcp://127.0.0.1:9"
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two worker processes of one thread each."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", host="127.0.0.1"
+    ) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return cloth_shot(tmp_path_factory.mktemp("farm") / "shot.usdc", times=TIMES)
+
+
+def layer_of(shot: Path, folder: Path, **options: Any) -> Path:
+    """Refine a shot into a folder of its own, since a record names its shot from there."""
+    folder.mkdir()
+    assert refine(shot, folder / "fine.usdc", **options).exit_code == 0
+    return folder / "fine.usdc"
+
+
+def fails(kind: str) -> int:
+    """What a task may do."""
+    if kind == "garment":
+        raise GarmentError("/World/cloth", "torn", time=5.0)
+    if kind == "bug":
+        raise ValueError("a bug")
+    if kind == "dies":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+@pytest.mark.slow
+def test_h34_a_worker_that_is_killed_changes_no_byte(cluster: Any, shot: Path, tmp_path: Path):
+    """A worker dies in the middle of its chunk; another one takes the chunk over."""
+    local = layer_of(shot, tmp_path / "local", workers=4)
+    killed: list[int] = []
+    told: list[tuple[int, int]] = []
+
+    def kill_one(done: int, total: int) -> None:
+        told.append((done, total))
+        if done == 3:
+            with distributed.Client(cluster.scheduler_address) as client:
+                killed.extend(client.run(os.getpid).values())
+            os.kill(killed[0], signal.SIGKILL)
+
+    farmed = layer_of(shot, tmp_path / "farm", workers=4, scheduler=cluster.scheduler_address, progress=kill_one)
+    assert killed
+    assert told == [(done, 48) for done in range(1, 49)]
+    assert farmed.read_bytes() == local.read_bytes()
+    assert faults(farmed, shot) == []
+    assert [file.name for file in farmed.parent.iterdir()] == ["fine.usdc"]
+
+
+@pytest.mark.slow
+def test_several_shots_each_in_chunks(cluster: Any, tmp_path: Path):
+    """By the command, from another folder than the workers', and a shot that is broken leaves the others alone."""
+    shots = [cloth_shot(tmp_path / f"{name}.usdc") for name in ("one", "two")]
+    (tmp_path / "broken.usdc").write_bytes(b"no stage")
+    names = [shot.name for shot in (*shots, tmp_path / "broken.usdc")]
+    line = ("refine", *names, "--level", "1", "--steps", "6", "--workers", "2")
+    done = command(*line, "-o", "out", "--scheduler", cluster.scheduler_address, cwd=tmp_path)
+    assert done.returncode == 3, done.stderr
+    assert "error: broken.usdc" in done.stderr
+    (tmp_path / "local").mkdir()
+    for shot in shots:
+        refine(shot, tmp_path / "local" / f"{shot.stem}.refined.usdc", workers=2)
+        made = tmp_path / "out" / f"{shot.stem}.refined.usdc"
+        assert made.read_bytes() == (tmp_path / "local" / made.name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "said"),
+    [
+        ("garment", GarmentError, "</World/cloth> at time code 5: torn"),
+        ("bug", PhysGraphError, "unexpected ValueError on a worker: a bug"),
+        pytest.param("dies", SolveError, "perhaps for lack of memory", marks=pytest.mark.slow),
+    ],
+)
+def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exception], said: str):
+    with connected(cluster.scheduler_address) as start:
+        with pytest.raises(error, match=said):
+            start(fails, kind).result()
+        assert start(fails, "").result() != os.getpid()
+
+
+def test_workers_of_another_version_are_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("physgraph_usd.farm.__version__", "0.0.0")
+    with connected(cluster.scheduler_address) as start, pytest.raises(UsageError, match=r"this machine 0\.0\.0"):
+        start(fails, "").result()
+
+
+def test_workers_of_several_threads_are_refused():
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0", host="127.0.0.1"
+        ) as two,
+        connected(two.scheduler_address) as start,
+    ):
+        with pytest.raises(UsageError, match="has 2 threads; start each with --nthreads 1"):
+            start(fails, "").result()
+
+
+def test_a_scheduler_that_is_not_there_is_named(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("physgraph_usd.farm.CONNECT_SECONDS", 0.2)
+    for address in (NOWHERE, "farm"):
+        with pytest.raises(UsageError, match=f"no Dask scheduler answers at {address}"):
+            refine(shot, tmp_path / "fine.usdc", scheduler=address)
+        assert not list(tmp_path.iterdir())
+
+
+def test_without_dask_the_extra_is_named(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(UsageError, match=r"pip install 'physgraph-usd\[farm\]'"):
+        refine(shot, tmp_path / "fine.usdc", scheduler=NOWHERE)

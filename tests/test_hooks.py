@@ -1,0 +1,210 @@
+"""The hooks of `plugins/`: each by its host's own library where there is one, else by a stage in place of the host."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pxr import Plug, Sdf, Usd, UsdGeom
+from shots import CLOTH, FAST, cloth_shot, faults, refine
+
+import physgraph_usd as pg
+
+PLUGINS = Path(__file__).resolve().parents[1] / "plugins"
+COARSE, FINE = 35, 117
+"""Points of the sheet, and at level 1."""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0))
+
+
+@pytest.fixture
+def stage(file: Path) -> Usd.Stage:
+    return Usd.Stage.Open(str(file))
+
+
+@pytest.fixture(autouse=True)
+def paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the docs put on PYTHONPATH."""
+    for folder in (PLUGINS, PLUGINS / "solaris", PLUGINS / "usdview"):
+        monkeypatch.syspath_prepend(str(folder))
+
+
+def count(stage: Usd.Stage, time: float = 2.0) -> int:
+    return len(UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(time))
+
+
+def tear(stage: Usd.Stage) -> None:
+    """Break the topology of the sheet."""
+    UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetFaceVertexIndicesAttr().Set([0, 1, 99])
+
+
+class TestPublishHook:
+    def test_writes_what_the_command_would(self, stage: Usd.Stage, file: Path, tmp_path: Path):
+        hook = importlib.import_module("publish_hook")
+        hook.publish(stage, tmp_path / "cloth.usdc", pg.RefineOptions(**FAST))
+        assert faults(tmp_path / "cloth.usdc", file) == []
+        refine(file, tmp_path / "command.usdc")
+        ours, theirs = (Sdf.Layer.FindOrOpen(str(tmp_path / name)) for name in ("cloth.usdc", "command.usdc"))
+        for time in (1.0, 2.0, 3.0):
+            one, other = (np.asarray(layer.QueryTimeSample(f"{CLOTH}.points", time)) for layer in (ours, theirs))
+            assert np.array_equal(one, other)
+
+    def test_publishes_nothing_where_a_frame_failed(self, stage: Usd.Stage, tmp_path: Path):
+        points = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr()
+        points.Set([(float("nan"), 0.0, 0.0)] * COARSE, 2.0)
+        hook = importlib.import_module("publish_hook")
+        with pytest.raises(pg.PhysGraphError, match="time code 2"):
+            hook.publish(stage, tmp_path / "cloth.usdc", pg.RefineOptions(**FAST))
+        assert not (tmp_path / "cloth.usdc").exists()
+
+
+class TestPyblish:
+    @pytest.fixture
+    def run(self, tmp_path: Path) -> Any:
+        """Publish with our plug-ins alone; the context, whose ``results`` say what became of each."""
+        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which hides our package tests")
+        util = importlib.import_module("pyblish.util")
+        api.deregister_all_plugins()
+        api.deregister_all_paths()
+        api.register_plugin_path(str(PLUGINS / "pyblish"))
+
+        def publish(**data: Any) -> Any:
+            context = api.Context()
+            context.data.update({"physgraphOptions": FAST} | data)
+            return util.publish(context)
+
+        yield publish
+        api.deregister_all_paths()
+
+    def test_h34_a_stage_is_collected_validated_and_extracted(self, run: Any, stage: Usd.Stage, file: Path):
+        context = run(usdStage=stage)
+        assert [str(result["error"]) for result in context.data["results"] if result["error"]] == []
+        (instance,) = context
+        assert instance.data["garments"] == [CLOTH]
+        (made,) = instance.data["files"]
+        assert faults(Path(made), file) == []
+
+    def test_a_file_serves_too(self, run: Any, file: Path):
+        (instance,) = run(currentFile=str(file))
+        assert len(instance.data["files"]) == 1
+
+    def test_a_garment_that_cannot_be_refined_fails_at_validation(self, run: Any, stage: Usd.Stage):
+        tear(stage)
+        context = run(usdStage=stage)
+        failed = [
+            (result["plugin"].__name__, str(result["error"])) for result in context.data["results"] if result["error"]
+        ]
+        assert [name for name, _ in failed] == ["ValidateGarments"]
+        assert CLOTH in failed[0][1]
+        assert not any("files" in instance.data for instance in context)
+
+    def test_a_stage_without_garments_has_no_instance(self, run: Any):
+        assert list(run(usdStage=Usd.Stage.CreateInMemory())) == []
+
+
+class TestSolaris:
+    """A LOP node in pxr: what comes in as a stage, and the layer that the node's edits go to."""
+
+    @pytest.fixture
+    def node(self, file: Path) -> Any:
+        incoming, edits = Usd.Stage.Open(str(file)), Sdf.Layer.CreateAnonymous("edits.usda")
+        edits.timeCodesPerSecond = incoming.GetTimeCodesPerSecond()
+        root = Sdf.Layer.CreateAnonymous("root.usda")
+        root.timeCodesPerSecond = incoming.GetTimeCodesPerSecond()
+        for below in (edits.identifier, str(file)):
+            root.subLayerPaths.append(below)
+        whole = Usd.Stage.Open(root)
+        whole.SetMetadata("metersPerUnit", UsdGeom.GetStageMetersPerUnit(incoming))
+        parms = {
+            "garments": SimpleNamespace(evalAsString=lambda: CLOTH),
+            "frames": SimpleNamespace(evalAsString=lambda: "2 3"),
+            "level": SimpleNamespace(evalAsInt=lambda: 1),
+        }
+        said: list[str] = []
+        return SimpleNamespace(
+            editableStage=lambda: whole, editableLayer=lambda: edits, parm=parms.get, addWarning=said.append, said=said
+        )
+
+    def test_the_nodes_layer_holds_the_refined_cloth(self, node: Any):
+        report = importlib.import_module("refine_lop").cook(node)
+        assert count(node.editableStage()) == FINE
+        assert [frame["time"] for frame in report.frames] == [2.0, 3.0]
+        assert node.said == report.warnings
+
+    def test_what_is_wrong_is_the_nodes_error(self, node: Any):
+        tear(node.editableStage())
+        with pytest.raises(pg.GarmentError, match=CLOTH):
+            importlib.import_module("refine_lop").cook(node)
+
+
+class TestUsdview:
+    @pytest.fixture
+    def api(self, stage: Usd.Stage) -> Any:
+        said: list[str] = []
+        return SimpleNamespace(stage=stage, frame=Usd.TimeCode(2.0), PrintStatus=said.append, said=said)
+
+    @pytest.fixture
+    def actions(self) -> Any:
+        return importlib.import_module("physgraph_usdview.actions").Actions()
+
+    def test_the_current_frame_is_refined_over_the_stage_and_taken_off_again(self, api: Any, actions: Any, file: Path):
+        before = file.read_bytes()
+        for _ in range(2):
+            actions.refine_frame(api)
+            assert count(api.stage) > FINE
+            assert len(api.stage.GetSessionLayer().subLayerPaths) == 1
+        actions.clear(api)
+        assert count(api.stage) == COARSE
+        assert not api.stage.GetSessionLayer().subLayerPaths
+        assert not api.stage.GetRootLayer().dirty
+        assert file.read_bytes() == before
+
+    @pytest.mark.parametrize("name", ["penetration", "crossing"])
+    def test_a_heat_map_colours_each_vertex(self, api: Any, actions: Any, name: str):
+        for _ in range(2):
+            actions.show_heat(api, name)
+        colour = UsdGeom.PrimvarsAPI(api.stage.GetPrimAtPath(CLOTH)).GetPrimvar("displayColor")
+        assert len(colour.Get(api.frame)) == count(api.stage)
+        assert len(api.stage.GetSessionLayer().subLayerPaths) == 2
+
+    def test_what_crosses_is_red(self, api: Any, actions: Any):
+        actions.refine_frame(api)
+        values = np.zeros(count(api.stage), np.float32)
+        values[3] = 1.0
+        api.stage.SetEditTarget(api.stage.GetSessionLayer())
+        primvar = UsdGeom.PrimvarsAPI(api.stage.GetPrimAtPath(CLOTH)).GetPrimvar("physgraph:crossing")
+        primvar.Set(values.tolist(), 2.0)
+        actions.show_heat(api, "crossing")
+        colours = np.asarray(UsdGeom.PrimvarsAPI(api.stage.GetPrimAtPath(CLOTH)).GetPrimvar("displayColor").Get(2.0))
+        assert colours[3, 0] > 0.8
+        assert colours[3, 1] < 0.2
+        assert np.ptp(np.delete(colours, 3, axis=0)) == 0.0
+
+    def test_what_is_wrong_is_in_the_status_line(self, api: Any, actions: Any):
+        tear(api.stage)
+        actions.refine_frame(api)
+        assert CLOTH in api.said[-1]
+        assert count(api.stage) == COARSE
+
+    def test_usd_finds_the_plug_in(self):
+        (found,) = Plug.Registry().RegisterPlugins(str(PLUGINS / "usdview")) or [
+            Plug.Registry().GetPluginWithName("physgraph_usdview")
+        ]
+        assert found.name == "physgraph_usdview"
+        assert "physgraph_usdview.container.PhysGraphContainer" in found.metadata["Types"]
+
+
+def test_versions_of_the_packages_are_the_packages():
+    read = runpy.run_path(str(PLUGINS / "rez" / "package.py"))
+    assert read["version"] == pg.__version__
+    assert read["name"] == pg.__name__
+    assert json.loads((PLUGINS / "usdview" / "plugInfo.json").read_text())["Plugins"][0]["Type"] == "python"

@@ -1,0 +1,48 @@
+"""Starting where POSIX is not: no module that only such systems have is needed, and no card either."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from shots import cloth_shot, command
+
+POSIX_ONLY = ("fcntl", "grp", "pwd", "resource", "termios")
+BLOCKED = f"""
+import sys, types
+# What others do on other systems is their business.
+import torch, warp, scipy.sparse.linalg, trimesh, click._termui_impl, pxr.Usd
+held = types.ModuleType("msvcrt")
+held.LK_NBLCK, held.locked = 2, []
+held.locking = lambda handle, mode, size: held.locked.append(handle)
+sys.modules.update(dict.fromkeys({POSIX_ONLY!r}), msvcrt=held)
+from physgraph_usd.cli import main
+try:
+    main()
+finally:
+    sys.stderr.write(f"locked {{len(held.locked)}} times\\n")
+"""
+
+
+def test_inspect_and_refine_start_without_posix(tmp_path: Path) -> None:
+    """The lock is Windows' own there, and the peak of memory is not told."""
+    shot, out, report = cloth_shot(tmp_path / "s.usda", times=(1.0, 2.0)), tmp_path / "o.usdc", tmp_path / "r.json"
+    line = [sys.executable, "-c", BLOCKED]
+    inspected = subprocess.run([*line, "inspect", str(shot)], capture_output=True, text=True, check=False)
+    assert inspected.returncode == 0, inspected.stderr
+    words = ["refine", shot, "-o", out, "--level", "0", "--report", report]
+    refined = subprocess.run([*line, *map(str, words)], capture_output=True, text=True, check=False)
+    assert refined.returncode == 0, refined.stderr
+    assert "locked 1 times" in refined.stderr
+    assert '"peak_memory_mb": null' in report.read_text(encoding="utf-8")
+
+
+def test_nothing_is_said_of_a_card_that_is_not_there(tmp_path: Path) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    done = command("refine", cloth_shot(tmp_path / "s.usda", times=(1.0,)), "-o", tmp_path / "o.usdc", "--level", "0")
+    assert (done.returncode, "CUDA" in done.stderr) == (0, False), done.stderr

@@ -1,0 +1,100 @@
+"""The report's JSON: its format, its schema, and entries of one shape."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from jsonschema import Draft202012Validator, ValidationError
+from shots import cloth_shot, refine
+
+from physgraph_usd import __version__, cli, summary
+from physgraph_usd.errors import PhysGraphError
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.report import FORMAT, SCHEMA
+from physgraph_usd.shot import refine_shot
+
+VALIDATOR = Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
+
+
+def checked(report: dict[str, Any]) -> dict[str, Any]:
+    VALIDATOR.validate(report)
+    assert (report["format"], report["version"]) == (FORMAT, __version__)
+    return report
+
+
+@pytest.mark.parametrize("name", [SCHEMA, summary.SCHEMA])
+def test_the_schemas_are_schemas(name: Path) -> None:
+    Draft202012Validator.check_schema(json.loads(name.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize(("name", "file"), [("report", SCHEMA), ("summary", summary.SCHEMA)])
+def test_the_command_prints_them(name: str, file: Path) -> None:
+    assert CliRunner().invoke(cli.main, ["report-schema", name]).stdout == file.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("torus", {"level": 0, "frames": (1.0, 4.0)}), ("layers", {"level": 0, "frames": (1.0, 3.0)}), ("frozen", {})],
+)
+def test_reports_of_samples_follow_it(
+    sample: Callable[[str], Path], tmp_path: Path, name: str, options: dict[str, Any]
+) -> None:
+    """Bodies, garments that touch, frames that are taken over."""
+    file = tmp_path / "report.json"
+    refine(sample(name), tmp_path / "fine.usdc", report=file, steps=2, **{"frames": (1.0, 3.0)} | options)
+    checked(json.loads(file.read_text(encoding="utf-8")))
+
+
+def test_frames_that_fail_have_the_shape_of_the_others(tmp_path: Path) -> None:
+    shot = cloth_shot(tmp_path / "s.usda", broken={3.0: float("nan"), 4.0: 1e-4})
+    report = checked(json.loads(refine(shot, tmp_path / "fine.usdc").to_json()))
+    assert len({tuple(sorted(frame)) for frame in report["frames"]}) == 1
+    entries = [entry for frame in report["frames"] for entry in frame["garments"]]
+    assert len({tuple(sorted(entry)) for entry in entries}) == 1
+    assert [bool(frame["error"]) for frame in report["frames"]] == [False, False, True, False, False, False]
+
+
+def test_a_dry_run_follows_it(tmp_path: Path) -> None:
+    shot = cloth_shot(tmp_path / "s.usda")
+    assert checked(json.loads(refine(shot, tmp_path / "fine.usdc", dry_run=True).to_json()))["out"] is None
+
+
+@pytest.mark.parametrize("options", [{"garments": ["/World/gone"]}, {"frames": (2.0, 2.0)}])
+def test_a_run_that_fails_writes_one(tmp_path: Path, options: dict[str, Any]) -> None:
+    """Without its garment, or without its only frame."""
+    shot, file = cloth_shot(tmp_path / "s.usda", broken={2.0: float("nan")}), tmp_path / "report.json"
+    with pytest.raises(PhysGraphError) as error:
+        refine(shot, tmp_path / "fine.usdc", report=file, **options)
+    report = checked(json.loads(file.read_text(encoding="utf-8")))
+    assert (report["error"], report["exit_code"], report["out"]) == (str(error.value), 1, None)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "s.usda"]
+    refine(shot, tmp_path / "fine.usdc", report=file, frames=(1.0, 1.0))
+    assert json.loads(file.read_text(encoding="utf-8"))["error"] == ""
+
+
+def test_a_report_of_a_run_that_ended_well_is_kept(tmp_path: Path) -> None:
+    shot, file = cloth_shot(tmp_path / "s.usda", times=(1.0,)), tmp_path / "report.json"
+    refine(shot, tmp_path / "fine.usdc", report=file)
+    before = file.read_bytes()
+    for resume, said in ((False, "exists"), (True, "gone")):
+        with pytest.raises(PhysGraphError, match=said):
+            refine(shot, tmp_path / "other.usdc", report=file, garments=["/World/gone"], resume=resume)
+        assert file.read_bytes() == before
+
+
+def test_values_are_told_with_where_they_are_from(tmp_path: Path) -> None:
+    shot = cloth_shot(tmp_path / "s.usda", times=(1.0,))
+    report = refine_shot(shot, tmp_path / "fine.usdc", RefineOptions(level=1, steps=3, sources={"steps": "show.toml"}))
+    assert report.option_sources.keys() == report.options.keys()
+    named = {name: report.option_sources[name] for name in ("level", "steps", "integrator")}
+    assert named == {"level": "given", "steps": "show.toml", "integrator": "default"}
+
+
+def test_the_schema_tells_a_report_that_is_none() -> None:
+    with pytest.raises(ValidationError):
+        VALIDATOR.validate({"format": FORMAT})

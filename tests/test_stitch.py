@@ -1,0 +1,300 @@
+"""Chunks of a shot, refined apart and stitched: the same cloth as in one run, and nothing missing, doubled or mixed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from cloth import rms
+from layers import open_over
+from pxr import Sdf, Usd, UsdGeom
+from shots import CLOTH, EDGE, cloth_shot, command, faults, fine, refine, sample_times
+from stages import add_sheet, new_stage, save, vec3
+
+from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageError
+from physgraph_usd.usd.chunk import read_chunk
+from physgraph_usd.usd.provenance import read_record
+from physgraph_usd.usd.stitch import SEAM_BOUND, stitch
+from physgraph_usd.usd.validate import validate_layer
+
+TIMES = tuple(float(time) for time in range(1, 49))
+SPANS = ((1.0, 12.0), (13.0, 24.0), (25.0, 36.0), (37.0, 48.0))
+
+
+def refine_chunks(
+    shot: Path, folder: Path, spans: Sequence[tuple[float, float]] = SPANS, *, run_up: int = 6, **options: Any
+) -> list[Path]:
+    """Refine parts of a shot, each by itself."""
+    chunks = [folder / f"chunk{first:g}.usdc" for first, _ in spans]
+    for span, chunk in zip(spans, chunks, strict=True):
+        assert refine(shot, chunk, frames=span, run_up=run_up, **options).exit_code == 0
+    return chunks
+
+
+class Runs(NamedTuple):
+    """48 frames of a sheet: as one run, with four workers, and as four chunks that were stitched."""
+
+    shot: Path
+    one: Path
+    workers: Path
+    chunks: list[Path]
+    joined: Path
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    folder = tmp_path_factory.mktemp("stitch")
+    shot = cloth_shot(folder / "shot.usdc", times=TIMES)
+    refine(shot, folder / "one.usdc")
+    refine(shot, folder / "workers.usdc", workers=4)
+    (folder / "parts").mkdir()
+    chunks = refine_chunks(shot, folder / "parts")
+    stitch(chunks[::-1], folder / "joined.usdc")
+    return Runs(shot, folder / "one.usdc", folder / "workers.usdc", chunks, folder / "joined.usdc")
+
+
+def points(layer: Path, time: float) -> np.ndarray:
+    return np.asarray(Sdf.Layer.FindOrOpen(str(layer)).QueryTimeSample(f"{CLOTH}.points", time))
+
+
+class TestOneLayer:
+    def test_h34_seams_move_less_than_a_twentieth_of_a_fine_edge(self, runs: Runs):
+        apart = [rms(fine(runs.shot, runs.one, t) - fine(runs.shot, runs.joined, t)) / (EDGE / 2) for t in TIMES]
+        assert max(apart[:12]) == 0.0
+        assert 0.0 < max(apart) < SEAM_BOUND, apart
+
+    def test_holds_the_chunks_positions_and_those_of_as_many_workers(self, runs: Runs):
+        assert sample_times(runs.joined) == TIMES
+        for span, chunk in zip(SPANS, runs.chunks, strict=True):
+            own = [time for time in TIMES if span[0] <= time <= span[1]]
+            assert sample_times(chunk) == tuple(own)
+            for time in own:
+                assert np.array_equal(points(chunk, time), points(runs.joined, time))
+                assert np.array_equal(points(runs.workers, time), points(runs.joined, time))
+
+    def test_is_valid_and_says_what_it_was_made_from(self, runs: Runs):
+        assert validate_layer(runs.joined) == []
+        record, one = (read_record(Sdf.Layer.FindOrOpen(str(layer))) for layer in (runs.joined, runs.one))
+        assert record is not None
+        assert one is not None
+        assert list(record.pop("chunks")) == ["1:12", "13:24", "25:36", "37:48"]
+        assert record["options"].pop("run_up") == 6
+        assert record == one
+
+    def test_a_chunk_by_itself_is_valid_and_told_to_be_one(self, runs: Runs):
+        (problem,) = validate_layer(runs.chunks[1])
+        assert problem.severity == "warning"
+        assert "is a chunk, with 12 of the shot's 48 frames" in problem.message
+
+    def test_the_command_says_how_far_seams_move(self, runs: Runs, tmp_path: Path):
+        done = command("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc")
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.strip() == str(tmp_path / "joined.usdc")
+        assert [line.partition(":")[0] for line in done.stderr.splitlines()] == [
+            "seam at 13",
+            "seam at 25",
+            "seam at 37",
+        ]
+        assert faults(tmp_path / "joined.usdc", runs.shot) == []
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("order", "said"),
+        [
+            ((0, 1, 3), "frames 25:36 are in no chunk"),
+            ((1, 3), "frames 1:12, 25:36 are in no chunk"),
+        ],
+    )
+    def test_a_missing_chunk_by_its_frames(self, runs: Runs, tmp_path: Path, order: tuple[int, ...], said: str):
+        with pytest.raises(UsageError, match=said) as caught:
+            stitch([runs.chunks[k] for k in order], tmp_path / "joined.usdc")
+        assert all(str(runs.chunks[k]) in str(caught.value) for k in order)
+        assert not list(tmp_path.iterdir())
+
+    def test_a_doubled_frame_with_both_files(self, runs: Runs, tmp_path: Path):
+        (twice,) = refine_chunks(runs.shot, tmp_path, [(11.0, 14.0)])
+        with pytest.raises(UsageError, match="frames 11:14 are in more than one chunk") as caught:
+            stitch([*runs.chunks, twice], tmp_path / "joined.usdc")
+        assert all(str(file) in str(caught.value) for file in (twice, *runs.chunks[:2]))
+
+    def test_other_options(self, runs: Runs, tmp_path: Path):
+        (other,) = refine_chunks(runs.shot, tmp_path, SPANS[3:], steps=5)
+        with pytest.raises(UsageError, match=r"were made with other --steps; refine one anew"):
+            stitch([*runs.chunks[:3], other], tmp_path / "joined.usdc")
+
+    def test_a_shot_that_was_edited_in_between(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc")
+        chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0)])
+        stage = Usd.Stage.Open(str(shot))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+        mesh.GetPointsAttr().Set(mesh.GetPointsAttr().Get(2.0), 3.0)
+        stage.Save()
+        chunks += refine_chunks(shot, tmp_path, [(4.0, 6.0)])
+        with pytest.raises(UsageError, match="were made with other files of the shot"):
+            stitch(chunks, tmp_path / "joined.usdc")
+
+    def test_a_layer_that_is_no_chunk(self, runs: Runs, tmp_path: Path):
+        with pytest.raises(LayerError, match=r"one\.usdc is no chunk of a shot; refine with --run-up"):
+            stitch([runs.one], tmp_path / "joined.usdc")
+
+    @pytest.mark.parametrize("chunk", [0, 3])
+    def test_to_write_over_a_chunk(self, runs: Runs, chunk: int):
+        before = runs.chunks[chunk].read_bytes()
+        with pytest.raises(UsageError, match="is part of the shot"):
+            stitch(runs.chunks, runs.chunks[chunk], overwrite=True)
+        assert runs.chunks[chunk].read_bytes() == before
+
+    def test_to_replace_a_file_unasked(self, runs: Runs):
+        with pytest.raises(UsageError, match="exists"):
+            stitch(runs.chunks, runs.joined)
+
+    def test_a_seam_that_moves_too_far(self, runs: Runs, tmp_path: Path):
+        with pytest.raises(LayerError, match=rf"seam at \d+: <{CLOTH}> moves .* fine edges RMS.*--seam-bound"):
+            stitch(runs.chunks, tmp_path / "joined.usdc", seam_bound=1e-4)
+        assert not list(tmp_path.iterdir())
+
+    def test_a_seam_of_which_nothing_is_known(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc")
+        chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0), (4.0, 6.0)], run_up=0)
+        with pytest.raises(LayerError, match="nothing tells how far the seam at 4 moves"):
+            stitch(chunks, tmp_path / "joined.usdc")
+        assert stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf")) == []
+        assert faults(tmp_path / "joined.usdc", shot) == []
+
+    def test_a_range_without_a_frame(self, tmp_path: Path):
+        with pytest.raises(
+            StageError, match=r"no sample of the shot lies in frames 7:9; its 6 samples run from 1 to 6"
+        ):
+            refine_chunks(cloth_shot(tmp_path / "shot.usdc"), tmp_path, [(7.0, 9.0)])
+
+
+def test_frames_that_failed_are_told_of_and_leave_their_seam_unknown(tmp_path: Path):
+    shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: float("nan")})
+    chunks = [tmp_path / "c1.usdc", tmp_path / "c2.usdc"]
+    codes = [
+        refine(shot, chunk, frames=span, run_up=2).exit_code
+        for chunk, span in zip(chunks, ((1.0, 3.0), (4.0, 6.0)), strict=True)
+    ]
+    assert codes == [3, 0]
+    with pytest.raises(LayerError, match="nothing tells how far the seam at 4 moves"):
+        stitch(chunks, tmp_path / "joined.usdc")
+    stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf"))
+    assert sample_times(tmp_path / "joined.usdc") == (1.0, 2.0, 4.0, 5.0, 6.0)
+    record = read_record(Sdf.Layer.FindOrOpen(str(tmp_path / "joined.usdc")))
+    assert record is not None
+    assert list(record["failed"]) == ["3"]
+
+
+def test_part_of_a_shot_is_stitched_where_it_is_asked_for(runs: Runs, tmp_path: Path):
+    with pytest.raises(UsageError, match=r"chunk37\.usdc holds the frames 37:48, of which some lie outside --frames"):
+        stitch(runs.chunks[1:], tmp_path / "joined.usdc", frames=(13.0, 36.0))
+    stitch(runs.chunks[1:3], tmp_path / "joined.usdc", frames=(13.0, 36.0))
+    (warning,) = validate_layer(tmp_path / "joined.usdc")
+    assert "24 of the shot's 48 frames" in warning.message
+    assert sample_times(tmp_path / "joined.usdc") == TIMES[12:36]
+
+
+def test_an_interrupted_chunk_goes_on_to_the_same_bytes_where_frames_stand_alone(tmp_path: Path):
+    """And keeps where its run-up ended, which it does not solve again."""
+    shot, out = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "chunk.usdc"
+    given: dict[str, Any] = {"frames": (4.0, 6.0), "run_up": 2}
+    refine(shot, tmp_path / "whole.usdc", **given)
+
+    def interrupt(done: int, _: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        refine(shot, out, progress=interrupt, **given)
+    refine(shot, out, resume=True, **given)
+    ended, whole = (read_chunk(Sdf.Layer.FindOrOpen(str(file))) for file in (out, tmp_path / "whole.usdc"))
+    assert ended is not None
+    assert whole is not None
+    assert ended.before == whole.before == 3.0
+    assert np.array_equal(ended.points[CLOTH], whole.points[CLOTH])
+
+
+@pytest.fixture
+def odd_shot(tmp_path: Path) -> Path:
+    """Sheets far apart: one that moves, one that halts, one with few samples, one with none; under a box of a model."""
+    stage = new_stage(tmp_path / "odd.usdc", metres=EDGE)
+    world = stage.GetPrimAtPath("/World")
+    hint = world.CreateAttribute("extentsHint", Sdf.ValueTypeNames.Float3Array)
+    hint.Set(vec3(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.1]])))
+    times = tuple(map(float, range(1, 9)))
+    sampled = {"moves": times, "halts": times, "seldom": (1.0, 4.0), "never": ()}
+    for number, (name, own) in enumerate(sampled.items()):
+        sheet = add_sheet(stage, f"/World/{name}", times=own)
+        UsdGeom.XformCommonAPI(sheet).SetTranslate((20.0 * number, 0.0, 0.0))
+    still = UsdGeom.Mesh(stage.GetPrimAtPath("/World/halts")).GetPointsAttr()
+    for time in times[1:-1]:
+        still.Set(still.Get(2.0), time)
+    return Path(save(stage))
+
+
+def same(one: object, other: object) -> bool:
+    """Whether two values are equal; between samples up to the rounding of USD's interpolation."""
+    if one == other or one is None or other is None:
+        return one == other
+    a, b = np.asarray(one), np.asarray(other)
+    return a.shape == b.shape and a.dtype.kind == "f" and bool(np.allclose(a, b, rtol=0.0, atol=1e-6))
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(
+    odd_shot: Path, tmp_path: Path, *, velocities: bool
+):
+    """Defaults, runs of equal frames, velocities at seams, boxes, heat maps; of garments in some chunks only, too."""
+    options: dict[str, Any] = {"temporal": "off", "velocities": velocities, "heat_map": True}
+    refine(odd_shot, tmp_path / "one.usdc", **options)
+    chunks = refine_chunks(odd_shot, tmp_path, [(1.0, 3.0), (4.0, 7.0), (8.0, 8.0)], **options)
+    assert stitch(chunks, tmp_path / "joined.usdc") == []
+    assert faults(tmp_path / "joined.usdc", odd_shot) == []
+    one, joined = (open_over(odd_shot, tmp_path / name) for name in ("one.usdc", "joined.usdc"))
+    compared = 0
+    for prim in one.Traverse():
+        for attribute in prim.GetAuthoredAttributes():
+            other = joined.GetAttributeAtPath(attribute.GetPath())
+            for code in [Usd.TimeCode.Default(), *map(Usd.TimeCode, np.arange(1.0, 8.5, 0.5))]:
+                assert same(attribute.Get(code), other.Get(code)), (attribute, code)
+            compared += 1
+    assert compared > 40
+    records = [read_record(Sdf.Layer.FindOrOpen(str(tmp_path / name))) or {} for name in ("one.usdc", "joined.usdc")]
+    assert sorted(records[0]["garments"]) == sorted(records[1]["garments"])
+
+
+class TestClips:
+    @pytest.mark.parametrize("name", ["clips.usda", "clips.usdc"])
+    def test_show_the_same_as_one_layer(self, runs: Runs, tmp_path: Path, name: str):
+        stitch(runs.chunks, tmp_path / name, clips=True)
+        made = {"clips.manifest.usda", "clips.topology.usdc", name}
+        assert {file.name for file in tmp_path.iterdir()} == made
+        joined, clips = (open_over(runs.shot, layer) for layer in (runs.joined, tmp_path / name))
+        compared = 0
+        for attribute in joined.GetPrimAtPath(CLOTH).GetAuthoredAttributes():
+            other = clips.GetAttributeAtPath(attribute.GetPath())
+            for code in [Usd.TimeCode.Default(), *map(Usd.TimeCode, np.arange(1.0, 48.5, 0.5))]:
+                assert attribute.Get(code) == other.Get(code), (attribute, code)
+            compared += 1
+        assert compared > 8
+        assert clips.GetAttributeAtPath(f"{CLOTH}.points").GetTimeSamples() == list(TIMES)
+
+    def test_of_garments_that_not_every_chunk_has(self, odd_shot: Path, tmp_path: Path):
+        chunks = refine_chunks(odd_shot, tmp_path, [(1.0, 3.0), (4.0, 7.0), (8.0, 8.0)], temporal="off")
+        stitch(chunks, tmp_path / "joined.usdc")
+        stitch(chunks, tmp_path / "clips.usda", clips=True)
+        joined, clips = (open_over(odd_shot, tmp_path / name) for name in ("joined.usdc", "clips.usda"))
+        for name in ("moves", "halts", "seldom", "never"):
+            for time in range(1, 9):
+                one, other = (UsdGeom.Mesh(s.GetPrimAtPath(f"/World/{name}")).GetPointsAttr() for s in (joined, clips))
+                assert one.Get(time) == other.Get(time), (name, time)
+
+    def test_refuse_what_a_layer_refuses_and_leave_nothing(self, runs: Runs, tmp_path: Path):
+        for chunks, bound in ((runs.chunks[:3], 1.0), (runs.chunks, 1e-4)):
+            with pytest.raises(PhysGraphError):
+                stitch(chunks, tmp_path / "clips.usda", clips=True, seam_bound=bound)
+        assert not list(tmp_path.iterdir())
