@@ -10,7 +10,7 @@ import errno
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
-EXTRAS = {"pxr": "usd", "embreex": "preview", "PIL": "preview", "matplotlib": "chart", "plotly": "chart"}
+EXTRAS = {
+    "pxr": "usd", "embreex": "preview", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune",
+}  # fmt: skip
 """Which extra brings a module that only some commands need."""
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
@@ -208,6 +210,25 @@ def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str
 
     given = {name: value for name, value in options.items() if value is not None}
     click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **given))
+
+
+@main.command()
+@shot_argument
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Layer to save into.  [default: SHOT.tuned.usda]")
+@garment_option
+@collider_option
+@click.option("--port", type=int, default=8080, help="Port on this machine; the next free one where it is taken.")
+@overwrite_option
+def tune(shot: str, *, port: int, **options: Any) -> None:
+    """Show SHOT in the browser, with sliders for each garment's values; Save writes them as tag does.
+
+    Prints the page's address, and serves it to this machine alone until it is interrupted.
+    """
+    from .tune.page import serve
+    from .tune.session import TuneSession
+
+    with closing(TuneSession(shot, **options)) as session:
+        serve(session, port=port, say=click.echo)
 
 
 @main.command()

@@ -1,10 +1,10 @@
 """A shot and the values that an artist tries on it; driven by the page, and without one.
 
-    session = TuneSession("shot.usda", out="shot.tuned.usda")
-    session.set_value("/World/Coat", "bendStiffness", 2e-5)
-    session.solve()    # Soon, from where the cloth was.
-    session.settle()   # As `refine` solves this frame: the positions that the saved layer gives.
-    session.save()
+session = TuneSession("shot.usda", out="shot.tuned.usda")
+session.set_value("/World/Coat", "bendStiffness", 2e-5)
+session.solve()    # Soon, from where the cloth was.
+session.settle()   # As `refine` solves this frame: the positions that the saved layer gives.
+session.save()
 """
 
 from __future__ import annotations
@@ -142,6 +142,15 @@ class TuneSession:
             raise UsageError(f"unknown preset '{preset}'; known presets: {', '.join(sorted(PRESETS))}")
         self._try(garment, fabric_values(PRESETS[preset]))
 
+    def set_as_authored(self, garment: str) -> None:
+        """Take a garment's values from the shot again; its level stays.
+
+        Raises:
+            UsageError: The garment is unknown.
+        """
+        kept = {name: value for name, value in self._values.get(garment, {}).items() if name not in TUNABLES}
+        self._read_with(garment, kept)
+
     def set_level(self, garment: str, level: int) -> None:
         """Try another number of subdivisions.
 
@@ -250,9 +259,13 @@ class TuneSession:
         return self.garments.index(garment)
 
     def _try(self, garment: str, values: Mapping[str, float]) -> None:
-        """Read the shot with values that a layer's floats can hold; what cannot be used changes nothing."""
-        self._index(garment)
+        """Read the shot with values more, rounded to floats that a layer can hold."""
         held = {name: float(np.float32(value)) for name, value in values.items()}
-        tried = {**self._values, garment: self._values.get(garment, {}) | held}
+        self._read_with(garment, self._values.get(garment, {}) | held)
+
+    def _read_with(self, garment: str, values: dict[str, float]) -> None:
+        """Read the shot with a garment's values; what cannot be used changes nothing."""
+        self._index(garment)
+        tried = {**self._values, garment: values}
         texts = [f"{path}.{GARMENT[name].name}={value!r}" for path, own in tried.items() for name, value in own.items()]
         self.shot, self._values, self._shown = self._opened.with_values(texts), tried, None

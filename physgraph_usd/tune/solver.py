@@ -15,6 +15,8 @@ from ..usd.reader import Shot
 
 BUDGET_MS = 1000.0
 """Milliseconds of a quick solve after which no step begins: with contact a large change asks for more."""
+FINER = 0.1
+"""Tolerance of a quick solve, over a run's: within that, cloth would not answer to a slider that is moved a little."""
 OFF = {"contact": "off", "self_contact": "off"}
 """Options of a run in which nothing touches."""
 
@@ -98,7 +100,8 @@ class FrameSolver:
             self._lead_in(shot, time)
         state = self._exact.solve(shot.frame(time), sampled_at(shot, time))
         if not cancelled():
-            soon = replace(self._settings, temporal="warm", budget_ms=BUDGET_MS)
+            finer = FINER * self._settings.tolerance
+            soon = replace(self._settings, temporal="warm", budget_ms=BUDGET_MS, tolerance=finer)
             self._quick, self.run = (self._exact.beside(soon), time), (*walked, time)
         return state
 

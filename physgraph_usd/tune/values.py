@@ -35,7 +35,7 @@ class Tunable:
 
     def said(self, value: float | None) -> str:
         """A value as the page writes it."""
-        return "not set" if value is None else f"{value * self.factor:.3g} {self.unit}".strip()
+        return "not set" if value is None else f"{float(f'{value * self.factor:.3g}'):,.8g} {self.unit}".strip()
 
     def place(self, value: float) -> float:
         """Where a value is on the slider, 0 to 1; values beyond its ends are at them."""

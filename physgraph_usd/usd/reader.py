@@ -293,7 +293,8 @@ def _read(
 ) -> list[GarmentReader]:
     """Bake the skinning of garments and bodies and read every garment that is not left out."""
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in prims}
-    frames = request.frames if request.rest_frame is None else None
+    # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
+    frames = None if request.frames is None or request.rest_frame is not None else (-math.inf, request.frames[1])
     notices += request.bake.add([*roots], frames, bodies=bodies)
     readers, every = [], []
     for path, held in roots.items():
