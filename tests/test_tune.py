@@ -54,13 +54,14 @@ def refined(session: TuneSession, shown: Shown | None) -> np.ndarray:
     """World points [m] that the page's command gives from the saved layer."""
     assert shown is not None
     assert shown.run is not None
-    words = shlex.split(session.command(shown.run))
+    words = shlex.split(shown.command)
     done = CliRunner().invoke(main, words[1:])
     assert done.exit_code == 0, done.output
     stage = Usd.Stage.CreateInMemory()
-    stage.GetRootLayer().subLayerPaths = [words[words.index("-o") + 1], str(session.out)]
+    stage.GetRootLayer().subLayerPaths.append(words[words.index("-o") + 1])
+    stage.GetRootLayer().subLayerPaths.append(str(session.out))
     prim = stage.GetPrimAtPath(session.garments[0])
-    own = np.asarray(UsdGeom.Mesh(prim).GetPointsAttr().Get(session.time), np.float64)
+    own = np.asarray(UsdGeom.Mesh(prim).GetPointsAttr().Get(session.time or 0.0), np.float64)
     matrix = session.shot.to_metres(0, session.time)
     return own @ matrix[:3, :3].T + matrix[:3, 3]
 
@@ -110,7 +111,10 @@ def test_a_part_of_the_frames_sees_the_body_of_the_whole_shot(tmp_path: Path):
     path = write_sample("tshirt", tmp_path)
     with closing(open_shot(path)) as whole, closing(open_shot(path, frames=(9.0, 9.0))) as part:
         for time in (3.0, 9.0):
-            assert part.frame(time).colliders[0].equals(whole.frame(time).colliders[0])
+            ours, theirs = part.frame(time).colliders[0], whole.frame(time).colliders[0]
+            assert ours is not None
+            assert theirs is not None
+            assert ours.equals(theirs)
 
 
 @pytest.mark.slow
@@ -182,7 +186,6 @@ def test_levels(session: TuneSession):
         session.set_level(CLOTH, level)
         shown = session.solve()
         vertices.append(len(points(shown)))
-        assert session.triangles(CLOTH, fine=True).max() == vertices[-1] - 1
         assert len(session.painted(CLOTH, "bendScale")) == vertices[-1]
     assert vertices[0] < vertices[1] < vertices[2]
 

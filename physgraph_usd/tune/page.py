@@ -77,9 +77,7 @@ class TunePage:
         settled = shown.run is not None
         said = "settled: as refine solves it" if settled else "quick: solved from where the cloth was"
         self._state.content = _badge(said, SETTLED if settled else MOVING)
-        self._command.content = (
-            _small(f"<code>{html.escape(self._session.command(shown.run))}</code>") if shown.run else ""
-        )
+        self._command.content = _small(f"<code>{html.escape(shown.command)}</code>")
         index = self._session.garments.index(self._garment)
         points = shown.points[index]
         count = 0 if points is None else len(points)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import viser
+from trimesh.exchange.gltf import export_glb
 
 from ..colliders.pose import MeshPose, Pose
 from ..scene import Frame
@@ -49,8 +50,8 @@ class Picture:
         self._apart = 0.62 * (float((points @ self._right).max() - (points @ self._right).min()) + 0.1 * self._size)
         self._handles: dict[str, tuple[object, Any]] = {}
         server.scene.set_up_direction(up)
-        eye = front + 0.12 * self._right + 0.16 * up
-        away = max(1.4 * self._size, 4.3 * self._apart)
+        eye = front + 0.16 * up
+        away = max(1.4 * self._size, 5.6 * self._apart)
         server.initial_camera.position = away * eye / np.linalg.norm(eye)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         server.initial_camera.fov = np.radians(38.0)
@@ -61,8 +62,10 @@ class Picture:
         beside = self.shows == BOTH
         parts = list(zip(self._session.garments, shown.frame.garments, shown.points, strict=True))
         for index, (garment, frame, points) in enumerate(parts):
-            fine = None if points is None else (points, self._session.triangles(garment, fine=True))
-            coarse = (frame.points, self._session.triangles(garment, fine=False)) if beside else None
+            cage, chain = self._session.shot.scene.garments[index], self._session.refinements[index]
+            split = cage.mesh.triangulate(cage.rest).triangles
+            coarse = (frame.points, split) if beside else None
+            fine = None if points is None else (points, chain[-1].mesh.triangulate(None).triangles if chain else split)
             colors = None if self.map == PLAIN else painted_colors(self._session.painted(garment, self.map), self.map)
             self._place(f"fine/{index}", fine, FINE, side=beside, colors=colors)
             self._place(f"coarse/{index}", coarse, COARSE, side=-beside, flat=True)
@@ -95,14 +98,14 @@ class Picture:
             given = {"color": color, "flat_shading": flat, "side": "double"}
             handle = self._scene.add_mesh_simple(name, points, mesh[1], **given)
         else:
-            drawn = trimesh.Trimesh(points, mesh[1], vertex_colors=colors, process=False)
-            handle = self._scene.add_mesh_trimesh(name, drawn)
+            handle = self._scene.add_glb(name, _colored(points, mesh[1], colors))
         self._handles[name] = key, handle
 
     def _light(self, frame: Frame, up: np.ndarray) -> None:
         """Floor, light and sky; nothing that viser would fetch."""
-        meshes = [mesh_of(pose)[0] for pose in frame.colliders if pose is not None and mesh_of(pose) is not None]
-        points = np.concatenate([*(each.points for each in frame.garments), *meshes])
+        found = (None if pose is None else mesh_of(pose) for pose in frame.colliders)
+        bodies = [mesh[0] for mesh in found if mesh is not None]
+        points = np.concatenate([*(each.points for each in frame.garments), *bodies])
         floor = float((points @ up).min() - self._centre @ up) - 0.02 * self._size
         self._scene.configure_environment_map(None)
         self._scene.add_light_hemisphere("sky", sky_color=(255, 255, 255), ground_color=(200, 196, 190), intensity=1.6)
@@ -133,6 +136,19 @@ def mesh_of(pose: Pose) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     points, triangles = tessellated(pose.kind, pose.size)
     return points @ pose.turn.T + pose.centre, triangles
+
+
+def _colored(points: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> bytes:
+    """A mesh with a colour at each vertex as GLB: matt, and seen from both sides."""
+
+    def matt(tree: dict[str, Any]) -> None:
+        tree["materials"] = [
+            {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}
+        ]
+        tree["meshes"][0]["primitives"][0]["material"] = 0
+
+    drawn = trimesh.Scene(trimesh.Trimesh(points, triangles, vertex_colors=colors, process=False))
+    return export_glb(drawn, include_normals=True, tree_postprocessor=matt)
 
 
 def painted_colors(values: np.ndarray, name: str) -> np.ndarray:

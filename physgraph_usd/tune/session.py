@@ -21,6 +21,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..fabric import PRESETS
+from ..mesh.subdivide import Refinement
 from ..resolution import choose_levels, sample_frames
 from ..scene import Frame, State
 from ..shot import prepare_device
@@ -43,6 +44,7 @@ class Shown:
         cpu_seconds: This process's own time for it.
         run: First and last time code of the run of ``refine`` that gives these positions; None where none does, because
             the cloth was solved from where it was.
+        command: That run, of the layer as it would be saved now; empty where there is none.
     """
 
     frame: Frame
@@ -51,6 +53,7 @@ class Shown:
     seconds: float
     cpu_seconds: float
     run: tuple[float | None, float | None] | None
+    command: str
 
 
 class TuneSession:
@@ -108,6 +111,11 @@ class TuneSession:
     def close(self) -> None:
         """Let go of the stage."""
         self._opened.close()
+
+    @property
+    def refinements(self) -> Sequence[Sequence[Refinement]]:
+        """The subdivisions of each garment, coarsest first."""
+        return self._solver.refinements
 
     @property
     def values(self) -> Mapping[str, Mapping[str, float]]:
@@ -218,24 +226,16 @@ class TuneSession:
             StageError: A garment lies in an instance.
             LayerError: It cannot be written.
         """
-        named = {"garments": self.garments, "colliders": self._named[1]}
-        written = tag(self._opened.path, self.out, **named, values=self._values, overwrite=self._overwrite)
+        written = tag(
+            self._opened.path,
+            self.out,
+            garments=self.garments,
+            colliders=self._named[1],
+            values=self._values,
+            overwrite=self._overwrite,
+        )
         self._overwrite = True  # It is this session's own from here on.
         return written
-
-    def command(self, run: tuple[float | None, float | None]) -> str:
-        """The command that refines the saved layer to a run's positions."""
-        words = ["physgraph-usd", "refine", str(self.out), "-o", str(self.out.with_suffix(".refined.usdc"))]
-        words += [] if run[0] is None or run[1] is None else ["--frames", f"{run[0]!r}:{run[1]!r}"]
-        for option, named in zip(("--garment", "--collider"), self._named, strict=True):
-            words += [word for each in named for word in (option, each)]
-        return join(words + ([] if self.contact else ["--contact", "off", "--self-contact", "off"]))
-
-    def triangles(self, garment: str, *, fine: bool) -> np.ndarray:
-        """Triangles of a garment's cage, or of its finest level, shape (T, 3)."""
-        index = self._index(garment)
-        own, chain = self.shot.scene.garments[index], self._solver.refinements[index]
-        return (chain[-1].mesh.triangulate(None) if fine and chain else own.mesh.triangulate(own.rest)).triangles
 
     def painted(self, garment: str, name: str) -> np.ndarray:
         """A painted map on a garment's finest vertices, shape (V,), by the schema's short name."""
@@ -250,7 +250,8 @@ class TuneSession:
         run = self._solver.run
         telemetry = tuple(dict(entry) for entry in state.telemetry)
         ends = (run[0], run[-1]) if run else None
-        self._shown = Shown(self.shot.frame(self.time), state.points, telemetry, *times, ends)
+        command = _command(self.out, run, self._named, contact=self.contact) if run else ""
+        self._shown = Shown(self.shot.frame(self.time), state.points, telemetry, *times, ends, command)
         return self._shown
 
     def _index(self, garment: str) -> int:
@@ -269,3 +270,14 @@ class TuneSession:
         tried = {**self._values, garment: values}
         texts = [f"{path}.{GARMENT[name].name}={value!r}" for path, own in tried.items() for name, value in own.items()]
         self.shot, self._values, self._shown = self._opened.with_values(texts), tried, None
+
+
+def _command(
+    out: Path, run: tuple[float | None, ...], named: tuple[Sequence[str], Sequence[str]], *, contact: bool
+) -> str:
+    """The command that refines a saved layer to the last frame of a run."""
+    words = ["physgraph-usd", "refine", str(out), "-o", str(out.with_suffix(".refined.usdc"))]
+    words += [] if run[0] is None else ["--frames", f"{run[0]!r}:{run[-1]!r}"]
+    for option, paths in zip(("--garment", "--collider"), named, strict=True):
+        words += [word for path in paths for word in (option, path)]
+    return join(words + ([] if contact else ["--contact", "off", "--self-contact", "off"]))

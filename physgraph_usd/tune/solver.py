@@ -5,20 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 from ..lead_in import cages_walked
 from ..options import RefineOptions
 from ..pipeline import Refiner
 from ..scene import State
 from ..shot import MOST_LANES, sampled_at
+from ..solve_settings import SolveSettings
 from ..usd.reader import Shot
 
 BUDGET_MS = 1000.0
 """Milliseconds of a quick solve after which no step begins: with contact a large change asks for more."""
 FINER = 0.1
 """Tolerance of a quick solve, over a run's: within that, cloth would not answer to a slider that is moved a little."""
-OFF = {"contact": "off", "self_contact": "off"}
-"""Options of a run in which nothing touches."""
 
 
 class FrameSolver:
@@ -44,7 +44,7 @@ class FrameSolver:
             GarmentError: A rest shape cannot be solved on.
         """
         self._times = shot.scene.times
-        self._settings = RefineOptions(**({} if contact else OFF)).solve_settings()
+        self._settings = _settings(contact=contact)
         self._lanes = min(MOST_LANES, os.cpu_count() or 1)
         self._exact = Refiner(shot.scene, self._settings, levels=levels, lanes=self._lanes)
         self._quick: tuple[Refiner, float | None] | None = None  # And the time code where it is.
@@ -53,7 +53,7 @@ class FrameSolver:
 
     def feel(self, *, contact: bool) -> None:
         """Let cloth feel bodies and cloth, or nothing, from here on; the next frame starts cold."""
-        self._settings = RefineOptions(**({} if contact else OFF)).solve_settings()
+        self._settings = _settings(contact=contact)
         self._quick, self.run = None, ()
 
     def solve_soon(self, shot: Shot, time: float | None) -> State:
@@ -114,4 +114,10 @@ class FrameSolver:
 
     def _follows(self, before: float | None, time: float | None) -> bool:
         """Whether a time code is the shot's next after another."""
-        return before is not None and (before, time) in zip(self._times, self._times[1:], strict=False)
+        return before is not None and time is not None and (before, time) in set(pairwise(self._times))
+
+
+def _settings(*, contact: bool) -> SolveSettings:
+    """How ``refine`` solves by default, or with ``--contact off --self-contact off``."""
+    options = RefineOptions() if contact else RefineOptions(contact="off", self_contact="off")
+    return options.solve_settings()
