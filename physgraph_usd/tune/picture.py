@@ -13,6 +13,7 @@ from ..colliders.pose import MeshPose, Pose
 from ..scene import Frame
 from ..usd.shapes import tessellated
 from .session import Shown, TuneSession
+from .values import painted_on
 
 COARSE, FINE, BODY, FLOOR, SKY = (201, 160, 110), (122, 150, 190), (150, 150, 150), (190, 192, 195), (226, 228, 231)
 """Colours, sRGB."""
@@ -60,13 +61,15 @@ class Picture:
     def draw(self, shown: Shown) -> None:
         """Draw a frame."""
         beside = self.shows == BOTH
-        parts = list(zip(self._session.garments, shown.frame.garments, shown.points, strict=True))
-        for index, (garment, frame, points) in enumerate(parts):
+        parts = zip(shown.frame.garments, shown.points, strict=True)
+        for index, (frame, points) in enumerate(parts):
             cage, chain = self._session.shot.scene.garments[index], self._session.refinements[index]
             split = cage.mesh.triangulate(cage.rest).triangles
             coarse = (frame.points, split) if beside else None
             fine = None if points is None else (points, chain[-1].mesh.triangulate(None).triangles if chain else split)
-            colors = None if self.map == PLAIN else painted_colors(self._session.painted(garment, self.map), self.map)
+            colors = None
+            if self.map != PLAIN:
+                colors = painted_colors(painted_on(cage, chain, self.map), self.map)
             self._place(f"fine/{index}", fine, FINE, side=beside, colors=colors)
             self._place(f"coarse/{index}", coarse, COARSE, side=-beside, flat=True)
         for index, pose in enumerate(shown.frame.colliders):

@@ -12,7 +12,6 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
 from shlex import join
 from typing import Any
@@ -29,7 +28,7 @@ from ..usd.reader import open_shot
 from ..usd.schema import AUTO_LEVEL, GARMENT
 from ..usd.tag import fabric_values, tag
 from .solver import FrameSolver
-from .values import PAINTED, TUNABLES
+from .values import TUNABLES
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +65,7 @@ class TuneSession:
         time: The one that is solved next.
         levels: Subdivisions of each garment.
         contact: Whether cloth feels bodies and cloth.
+        values: What `save` authors, by prim path and the schema's short names.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class TuneSession:
         self.levels = [choice.level for choice in choices]
         # A level that is chosen from the fabric would be chosen anew from what is tried.
         chosen = zip(scene.garments, self.levels, strict=True)
-        self._values = {g.path: {"refine:level": float(k)} for g, k in chosen if g.level == AUTO_LEVEL}
+        self.values = {g.path: {"refine:level": float(k)} for g, k in chosen if g.level == AUTO_LEVEL}
         self._solver = FrameSolver(self.shot, self.levels, contact=True)
         self._shown: Shown | None = None  # None once anything was set.
 
@@ -117,18 +117,9 @@ class TuneSession:
         """The subdivisions of each garment, coarsest first."""
         return self._solver.refinements
 
-    @property
-    def values(self) -> Mapping[str, Mapping[str, float]]:
-        """What `save` authors, by prim path and the schema's short names."""
-        return self._values
-
     def value(self, garment: str, name: str) -> float | None:
         """A tunable value of a garment in the frame, SI; None where nothing gives one."""
         return TUNABLES[name].read(self.shot.frame(self.time).garments[self._index(garment)])
-
-    def source(self, garment: str, name: str) -> str:
-        """What gives a value, as reports say it."""
-        return self.shot.sources[self._index(garment)].sources[name]
 
     def set_value(self, garment: str, name: str, value: float) -> None:
         """Try a value [SI], rounded as a layer holds it.
@@ -156,7 +147,7 @@ class TuneSession:
         Raises:
             UsageError: The garment is unknown.
         """
-        kept = {name: value for name, value in self._values.get(garment, {}).items() if name not in TUNABLES}
+        kept = {name: value for name, value in self.values.get(garment, {}).items() if name not in TUNABLES}
         self._read_with(garment, kept)
 
     def set_level(self, garment: str, level: int) -> None:
@@ -231,23 +222,16 @@ class TuneSession:
             self.out,
             garments=self.garments,
             colliders=self._named[1],
-            values=self._values,
+            values=self.values,
             overwrite=self._overwrite,
         )
         self._overwrite = True  # It is this session's own from here on.
         return written
 
-    def painted(self, garment: str, name: str) -> np.ndarray:
-        """A painted map on a garment's finest vertices, shape (V,), by the schema's short name."""
-        index = self._index(garment)
-        cage = PAINTED[name](self.shot.scene.garments[index])
-        return reduce(lambda values, step: np.asarray(step.linear @ values), self._solver.refinements[index], cage)
-
     def _show(self, solve: Callable[..., State]) -> Shown:
         began, spent = clock.perf_counter(), clock.process_time()
         state = solve(self.shot, self.time)
-        times = clock.perf_counter() - began, clock.process_time() - spent
-        run = self._solver.run
+        times, run = (clock.perf_counter() - began, clock.process_time() - spent), self._solver.run
         telemetry = tuple(dict(entry) for entry in state.telemetry)
         ends = (run[0], run[-1]) if run else None
         command = _command(self.out, run, self._named, contact=self.contact) if run else ""
@@ -262,14 +246,14 @@ class TuneSession:
     def _try(self, garment: str, values: Mapping[str, float]) -> None:
         """Read the shot with values more, rounded to floats that a layer can hold."""
         held = {name: float(np.float32(value)) for name, value in values.items()}
-        self._read_with(garment, self._values.get(garment, {}) | held)
+        self._read_with(garment, self.values.get(garment, {}) | held)
 
     def _read_with(self, garment: str, values: dict[str, float]) -> None:
         """Read the shot with a garment's values; what cannot be used changes nothing."""
         self._index(garment)
-        tried = {**self._values, garment: values}
+        tried = {**self.values, garment: values}
         texts = [f"{path}.{GARMENT[name].name}={value!r}" for path, own in tried.items() for name, value in own.items()]
-        self.shot, self._values, self._shown = self._opened.with_values(texts), tried, None
+        self.shot, self.values, self._shown = self._opened.with_values(texts), tried, None
 
 
 def _command(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
+from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame
 
 
@@ -73,3 +75,14 @@ PAINTED: dict[str, Callable[[Garment], np.ndarray]] = {
     "pin": lambda garment: garment.pin,
 }
 """How each painted map is found in a garment, by the schema's short name."""
+
+
+def painted_on(garment: Garment, refinements: Sequence[Refinement], name: str) -> np.ndarray:
+    """A painted map on a garment's finest vertices, shape (V,).
+
+    Args:
+        garment: The garment.
+        refinements: Its subdivisions, coarsest first.
+        name: The map's short name, a name of `PAINTED`.
+    """
+    return reduce(lambda values, step: np.asarray(step.linear @ values), refinements, PAINTED[name](garment))
