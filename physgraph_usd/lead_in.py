@@ -11,7 +11,36 @@ from typing import Any
 
 from .errors import SolveError, StageError
 from .pipeline import Refiner
-from .scene import Frame
+from .scene import Frame, Scene
+from .solve_settings import SolveSettings
+
+
+def cages_walked(
+    scene: Scene,
+    settings: SolveSettings,
+    frame_at: Callable[[float | None], Frame],
+    *,
+    times: Sequence[float],
+    device: str = "cpu",
+    lanes: int = 1,
+) -> tuple[Refiner, float] | None:
+    """Walk a scene's cages to the first frame of a run, where cloth walks and feels cloth.
+
+    Args:
+        scene: The scene.
+        settings: How the run is solved.
+        frame_at: Reads a time code.
+        times: The shot's time codes up to the run's first, in order.
+        device: Where the run is solved.
+        lanes: Most threads that a kernel uses on the CPU.
+
+    Returns:
+        As `lead_in`.
+    """
+    if len(times) < 2 or settings.temporal == "off" or settings.contact.cloth != "pairs":
+        return None
+    alone = [0] * len(scene.garments)
+    return lead_in(Refiner(scene, settings, levels=alone, device=device, lanes=lanes), frame_at, times)
 
 
 def lead_in(

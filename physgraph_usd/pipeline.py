@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import reduce
 from statistics import median
@@ -127,6 +128,15 @@ class Refiner:
         self._parts = Parts(self._scene.garments, together=settings.contact.cloth != "off")
         self._groups = {part: group.with_settings(settings) for part, group in self._groups.items()}
         self.forget()
+
+    def beside(self, settings: SolveSettings) -> Refiner:
+        """A refiner that goes on from this one's last frame in another way; levels, metrics and bodies are shared."""
+        other = copy(self)
+        other._settings, other._unsolved = settings, set(self._unsolved)
+        other._last, other._before = list(self._last), list(self._before)
+        other._parts = Parts(self._scene.garments, together=settings.contact.cloth != "off")
+        other._groups = {part: group.with_settings(settings) for part, group in self._groups.items()}
+        return other
 
     def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
         """Numbers of the garments that are solved together in a frame."""

@@ -20,7 +20,7 @@ from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageErr
 from .farm import connected, shots_at_once
 from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
-from .lead_in import lead_in
+from .lead_in import cages_walked
 from .mesh.lanes import start_warp
 from .options import RefineOptions, json_of
 from .page.report import write_folder
@@ -361,13 +361,9 @@ class _ShotSolver:
 
     def _lead_in(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
         """Begin in the middle of a shot, where its cage crosses, with the cage walked there from an earlier frame."""
-        settings = self._options.solve_settings()
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
-        if len(earlier) < 2 or settings.temporal == "off" or settings.contact.cloth != "pairs":
-            return
-        alone = [0] * len(shot.scene.garments)
-        cages = Refiner(shot.scene, settings, levels=alone, device=self._options.device, lanes=self._lanes)
-        found = lead_in(cages, shot.frame, earlier)
+        own = {"times": earlier, "device": self._options.device, "lanes": self._lanes}
+        found = cages_walked(shot.scene, self._options.solve_settings(), shot.frame, **own)
         if found is not None:
             refiner.begin_at(found[0], since=found[1])
 

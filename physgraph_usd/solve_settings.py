@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from .contact.settings import ContactSettings
@@ -46,6 +47,7 @@ class SolveSettings:
         potential: "continuum" or "paper".
         reset: When a frame starts cold.
         contact: How contact is solved.
+        cancelled: Asked before each step: whether nobody waits for the result any more; or None.
     """
 
     method: Method
@@ -57,6 +59,7 @@ class SolveSettings:
     potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
+    cancelled: Callable[[], bool] | None = None
 
     def budget(self, below: int, clock: float, *, more: int, warm: bool) -> Budget:
         """Steps and deadline of a level.
@@ -72,5 +75,6 @@ class SolveSettings:
             deadline = clock + 1e-3 * self.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
         if not below:
             rest, extra = (REST, 0) if warm else (1.0, EXTRA * more * self.steps)
-            return Budget(more * self.steps, self.tolerance, deadline, rest, extra)
-        return Budget(COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance, deadline)
+            return Budget(more * self.steps, self.tolerance, deadline, rest, extra, self.cancelled)
+        steps, tolerance = COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance
+        return Budget(steps, tolerance, deadline, cancelled=self.cancelled)

@@ -16,26 +16,50 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 @contextmanager
 def opened(file: Path) -> Iterator[Any]:
     """A page; what it asks the network for and every complaint in its console fail the test."""
+    said: list[str] = []
+    with _browser() as browser:
+        page = browser.new_page(viewport={"width": 1280, "height": 1000})
+        page.on("console", lambda message: said.append(message.text))
+        _watch(page, said, own=("file:", "data:", "blob:"))
+        page.goto(file.as_uri())
+        yield page
+    assert said == []
+
+
+@contextmanager
+def served(url: str) -> Iterator[Any]:
+    """A page of a server on this machine; errors, and what it asks other hosts for, fail the test."""
+    said: list[str] = []
+    with _browser() as browser:
+        page = browser.new_page(viewport={"width": 1440, "height": 900})
+        page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+        _watch(page, said, own=(url, "data:", "blob:"))
+        page.on("websocket", lambda asked: None if asked.url.startswith(f"ws{url[4:]}") else said.append(asked.url))
+        page.goto(url)
+        yield page
+    assert said == []
+
+
+@contextmanager
+def _browser() -> Iterator[Any]:
+    """A headless Chromium that draws without a graphics card."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="pages are driven with playwright")
     program = next((found for name in NAMES if (found := shutil.which(name))), None)
     if program is None:
         pytest.skip(f"no browser: none of {', '.join(NAMES)} is on the path")
-    said: list[str] = []
+    drawn = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with sync_api.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        browser = driver.chromium.launch(executable_path=program, args=drawn)
         try:
-            page = browser.new_page(viewport={"width": 1280, "height": 1000})
-            page.on("console", lambda message: said.append(message.text))
-            page.on("pageerror", lambda error: said.append(str(error)))
-            page.on(
-                "request",
-                lambda asked: None if asked.url.startswith(("file:", "data:", "blob:")) else said.append(asked.url),
-            )
-            page.goto(file.as_uri())
-            yield page
+            yield browser
         finally:
             browser.close()
-    assert said == []
+
+
+def _watch(page: Any, said: list[str], *, own: tuple[str, ...]) -> None:
+    """Note errors, and what is asked for elsewhere."""
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda asked: None if asked.url.startswith(own) else said.append(asked.url))
 
 
 def hover(page: Any, spot: Any) -> str:

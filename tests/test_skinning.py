@@ -80,13 +80,13 @@ def test_transforms_between_animation_samples_are_skinned_exactly_there(tmp_path
         np.testing.assert_allclose(points(shot, time), 0.01 * expected, atol=1e-6)
 
 
-def test_only_the_range_is_baked_and_other_meshes_are_not(tmp_path: Path) -> None:
+def test_nothing_after_the_range_is_baked_and_other_meshes_are_not(tmp_path: Path) -> None:
     stage = skinned_stage(tmp_path / "s.usda", tuple(map(float, range(1, 21))))
     bind_skin(add_sheet(stage, f"{ROOT}/body", times=(), tagged=False), ROOT, joints=JOINTS)
     shot = open_shot(save(stage), frames=(5.0, 7.0))
     assert shot.scene.times == (5.0, 6.0, 7.0)
     cloth, body = (UsdGeom.Mesh.Get(shot.stage, f"{ROOT}/{name}").GetPointsAttr() for name in ("cloth", "body"))
-    assert cloth.GetTimeSamples() == [5.0, 6.0, 7.0]
+    assert cloth.GetTimeSamples() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]  # A run may walk there from any before.
     assert body.GetTimeSamples() == []
     assert shot.stage.GetPrimAtPath(f"{ROOT}/body").IsActive()
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import click
 
 from ..version import __version__
-from .commands import chart, inspect, preview, report_schema, sample, schema_path, stitch, tag, train, validate
+from .commands import chart, inspect, preview, report_schema, sample, schema_path, stitch, tag, train, tune, validate
 from .refine import refine
 from .structure import Commands
 
@@ -20,5 +20,18 @@ def main() -> None:
     """Refine coarse animated garments in USD shots into fine cloth."""
 
 
-for command in (refine, stitch, inspect, tag, validate, sample, preview, chart, train, schema_path, report_schema):
+for command in (
+    refine,
+    stitch,
+    inspect,
+    tag,
+    tune,
+    validate,
+    sample,
+    preview,
+    chart,
+    train,
+    schema_path,
+    report_schema,
+):
     main.add_command(command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -90,6 +91,25 @@ def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str
 
     given = {name: value for name, value in options.items() if value is not None}
     click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **given))
+
+
+@click.command()
+@shot_argument
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Layer to save into.  [default: SHOT.tuned.usda]")
+@garment_option
+@collider_option
+@click.option("--port", type=int, default=8080, help="Port on this machine; the next free one where it is taken.")
+@overwrite_option
+def tune(shot: str, *, port: int, **options: Any) -> None:
+    """Show SHOT in the browser, with sliders for each garment's values; Save writes them as tag does.
+
+    Prints the page's address, and serves it to this machine alone until it is interrupted.
+    """
+    from ..tune.page import serve
+    from ..tune.session import TuneSession
+
+    with closing(TuneSession(shot, **options)) as session:
+        serve(session, port=port, say=click.echo)
 
 
 @click.command()

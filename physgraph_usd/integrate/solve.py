@@ -28,6 +28,7 @@ class Budget:
         deadline: `time.perf_counter` value after which no step begins, or None.
         rest: Tolerances under which no step is made from the start: what rests but for a little stays where it is.
         extra: Steps beyond those, while the remaining move is over `FAR` tolerances.
+        cancelled: Asked before each step: whether nobody waits for the result any more; or None.
     """
 
     steps: int
@@ -35,6 +36,12 @@ class Budget:
     deadline: float | None = None
     rest: float = 1.0
     extra: int = 0
+    cancelled: Callable[[], bool] | None = None
+
+    def is_spent(self) -> bool:
+        """Whether no step may begin any more, whatever the cloth's state."""
+        late = self.deadline is not None and time.perf_counter() >= self.deadline
+        return late or (self.cancelled is not None and self.cancelled())
 
     def is_far(self, remaining_move: float) -> bool:
         """Whether so much remaining move takes extra steps; never where the tolerance is 0."""
@@ -140,7 +147,7 @@ def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) ->
         steps >= budget.steps + budget.extra or not budget.is_far(_remaining_move(system, carry))
     ):
         return "steps"
-    if budget.deadline is not None and time.perf_counter() >= budget.deadline:
+    if budget.is_spent():
         return "budget"
     return ""
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
+from .materials import find_values
 from .placement import to_metres
 from .provenance import mute_refined, unsaved_layers
 from .rest import AUTO
@@ -143,6 +145,30 @@ class Shot:
         frame = Frame(time, tuple(garments), tuple(poses))
         refuse_far(self.scene, frame)
         return frame
+
+    def with_values(self, overrides: Sequence[str]) -> Shot:
+        """The same shot, its frames read with other ``--set`` values; what only opening reads stays as it is.
+
+        Args:
+            overrides: As `open_shot` takes them, in place of those that it was given.
+
+        Raises:
+            UsageError: When one cannot be read, or is for no garment.
+        """
+        asked = parse_overrides(overrides)
+        check_overrides(asked, [source.path for source in self.sources])
+        other = copy(self)
+        found = [
+            find_values(self.stage.GetPrimAtPath(source.path), self._request.units, asked) for source in self.sources
+        ]
+        other._readers = tuple(
+            replace(reader, values=values) for reader, values in zip(self._readers, found, strict=True)
+        )
+        other.sources = tuple(
+            replace(source, sources=source.sources | values.sources, animated=values.animated)
+            for source, values in zip(self.sources, found, strict=True)
+        )
+        return other
 
     def _tell(self, notices: Sequence[Notice]) -> None:
         """Add what was not said before to the warnings."""
@@ -279,7 +305,8 @@ def _read(
 ) -> list[GarmentReader]:
     """Bake the skinning of garments and bodies and read every garment that is not left out."""
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in prims}
-    frames = request.frames if request.rest_frame is None else None
+    # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
+    frames = None if request.frames is None or request.rest_frame is not None else (-math.inf, request.frames[1])
     notices += request.bake.add([*roots], frames, bodies=bodies)
     readers, every = [], []
     for path, held in roots.items():

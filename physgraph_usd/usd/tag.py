@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pxr import Sdf, Usd, UsdGeom
@@ -28,6 +28,7 @@ def tag(
     preset: str | None = None,
     layer: int | None = None,
     side: str | None = None,
+    values: Mapping[str, Mapping[str, float]] | None = None,
     asset_paths: str = "relative",
     overwrite: bool = False,
 ) -> Path:
@@ -41,6 +42,7 @@ def tag(
         preset: Name of a fabric whose values are authored on the garments, or None.
         layer: Place of the garments in the order of garments, lower is nearer to the body, or None.
         side: Where cloth belongs at the colliders, one of `SIDES`, or None.
+        values: Of each garment, by its prim path: values to author, by the schema's short names, after the preset's.
         asset_paths: "relative" or "absolute": how the layer names the shot.
         overwrite: Whether an existing file may be replaced.
 
@@ -72,10 +74,12 @@ def tag(
         _check_editable(prim)
     for prim in cloth:
         spec = _applied(root, prim, GARMENT_API)
-        if preset is not None:
-            _author_fabric(spec, PRESETS[preset])
-        if layer is not None:
-            _author(spec, GARMENT["contact:layer"], layer)
+        own = {} if preset is None else fabric_values(PRESETS[preset])
+        own |= {} if layer is None else {"contact:layer": layer}
+        for name, value in (own | dict((values or {}).get(str(prim.GetPath()), {}))).items():
+            _author(spec, GARMENT[name], round(value) if GARMENT[name].type == "int" else value)
+            if prim.GetAttribute(GARMENT[name].name).HasAuthoredConnections():  # They would go before the value.
+                spec.attributes[GARMENT[name].name].connectionPathList.ClearEditsAndMakeExplicit()
     for prim in solid:
         spec = _applied(root, prim, COLLIDER_API)
         if side is not None:
@@ -109,8 +113,8 @@ def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
     return spec
 
 
-def _author_fabric(spec: Sdf.PrimSpec, fabric: Fabric) -> None:
-    """Author a fabric's values on a garment."""
+def fabric_values(fabric: Fabric) -> dict[str, float]:
+    """What a fabric gives, by the schema's short names."""
     values = {
         "stretchStiffness": fabric.stretch,
         "shearStiffness": fabric.shear,
@@ -118,9 +122,7 @@ def _author_fabric(spec: Sdf.PrimSpec, fabric: Fabric) -> None:
         "density": fabric.density,
         "thickness": fabric.thickness,
     }
-    for name, value in values.items():
-        if value is not None:
-            _author(spec, GARMENT[name], value)
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _author(spec: Sdf.PrimSpec, row: Property, value: float | str) -> None:

@@ -1,0 +1,267 @@
+"""A shot and the values that an artist tries on it; driven by the page, and without one.
+
+session = TuneSession("shot.usda", out="shot.tuned.usda")
+session.set_value("/World/Coat", "bendStiffness", 2e-5)
+session.solve()    # Soon, from where the cloth was.
+session.settle()   # As `refine` solves this frame: the positions that the saved layer gives.
+session.save()
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from shlex import join
+from typing import Any
+
+import numpy as np
+
+from ..errors import UsageError
+from ..fabric import PRESETS
+from ..mesh.subdivide import Refinement
+from ..resolution import choose_levels, sample_frames
+from ..scene import Frame, State
+from ..shot import prepare_device
+from ..usd.reader import open_shot
+from ..usd.schema import AUTO_LEVEL, GARMENT
+from ..usd.tag import fabric_values, tag
+from .solver import FrameSolver
+from .values import TUNABLES
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A solved frame.
+
+    Attributes:
+        frame: What was solved: cages, values and bodies.
+        points: Fine positions of each garment [m], world space; None for one without a sample here.
+        telemetry: What the solver tells of each garment, as a report's frame does.
+        seconds: Wall time of reading and solving.
+        cpu_seconds: This process's own time for it.
+        run: First and last time code of the run of ``refine`` that gives these positions; None where none does, because
+            the cloth was solved from where it was.
+        command: That run, of the layer as it would be saved now; empty where there is none.
+    """
+
+    frame: Frame
+    points: tuple[np.ndarray | None, ...]
+    telemetry: tuple[dict[str, Any], ...]
+    seconds: float
+    cpu_seconds: float
+    run: tuple[float | None, float | None] | None
+    command: str
+
+
+class TuneSession:
+    """What is tried on a shot, and how it looks.
+
+    Attributes:
+        out: The layer that `save` writes.
+        garments: Prim paths of the garments.
+        times: The shot's time codes; (None,) where it has no samples.
+        time: The one that is solved next.
+        levels: Subdivisions of each garment.
+        contact: Whether cloth feels bodies and cloth.
+        values: What `save` authors, by prim path and the schema's short names.
+    """
+
+    def __init__(
+        self,
+        shot: str | Path,
+        *,
+        garments: Sequence[str] = (),
+        colliders: Sequence[str] = (),
+        out: str | Path | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Open a shot at its first frame.
+
+        Args:
+            shot: The shot file; never edited.
+            garments: Prim paths, names, globs or collections; empty finds applied schemas.
+            colliders: The same of bodies.
+            out: Layer to save into; ``<shot>.tuned.usda`` beside the shot when None.
+            overwrite: Whether a file there may be replaced.
+
+        Raises:
+            UsageError: The layer exists.
+            StageError: The shot cannot be read.
+        """
+        prepare_device("cpu")
+        self.out = Path(out) if out is not None else Path(shot).with_suffix(".tuned.usda")
+        if self.out.exists() and not overwrite:
+            raise UsageError(f"{self.out} exists; choose another name with -o, or allow overwriting")
+        self._overwrite, self._named = overwrite, (tuple(garments), tuple(colliders))
+        self.shot = self._opened = open_shot(shot, garments=garments, colliders=colliders)
+        scene = self.shot.scene
+        self.garments = tuple(garment.path for garment in scene.garments)
+        self.times: tuple[float | None, ...] = scene.times or (None,)
+        self.time, self.contact = self.times[0], True
+        choices = choose_levels(scene, sample_frames(scene, self.shot.frame))
+        self.levels = [choice.level for choice in choices]
+        # A level that is chosen from the fabric would be chosen anew from what is tried.
+        chosen = zip(scene.garments, self.levels, strict=True)
+        self.values = {g.path: {"refine:level": float(k)} for g, k in chosen if g.level == AUTO_LEVEL}
+        self._solver = FrameSolver(self.shot, self.levels, contact=True)
+        self._shown: Shown | None = None  # None once anything was set.
+
+    def close(self) -> None:
+        """Let go of the stage."""
+        self._opened.close()
+
+    @property
+    def refinements(self) -> Sequence[Sequence[Refinement]]:
+        """The subdivisions of each garment, coarsest first."""
+        return self._solver.refinements
+
+    def value(self, garment: str, name: str) -> float | None:
+        """A tunable value of a garment in the frame, SI; None where nothing gives one."""
+        return TUNABLES[name].read(self.shot.frame(self.time).garments[self._index(garment)])
+
+    def set_value(self, garment: str, name: str, value: float) -> None:
+        """Try a value [SI], rounded as a layer holds it.
+
+        Raises:
+            UsageError: The garment or the name is unknown, or the value is outside its limits.
+        """
+        if name not in TUNABLES:
+            raise UsageError(f"unknown value '{name}'; known values: {', '.join(TUNABLES)}")
+        self._try(garment, {name: value})
+
+    def set_preset(self, garment: str, preset: str) -> None:
+        """Try a fabric's values.
+
+        Raises:
+            UsageError: The garment or the fabric is unknown.
+        """
+        if preset not in PRESETS:
+            raise UsageError(f"unknown preset '{preset}'; known presets: {', '.join(sorted(PRESETS))}")
+        self._try(garment, fabric_values(PRESETS[preset]))
+
+    def set_as_authored(self, garment: str) -> None:
+        """Take a garment's values from the shot again; its level stays.
+
+        Raises:
+            UsageError: The garment is unknown.
+        """
+        kept = {name: value for name, value in self.values.get(garment, {}).items() if name not in TUNABLES}
+        self._read_with(garment, kept)
+
+    def set_level(self, garment: str, level: int) -> None:
+        """Try another number of subdivisions.
+
+        Raises:
+            UsageError: The garment is unknown, or the level is outside its limits.
+        """
+        index = self._index(garment)
+        if level < 0:
+            raise UsageError(f"level {level}: give 0 or more")
+        self._try(garment, {"refine:level": level})
+        self.levels[index] = level
+        self._solver = FrameSolver(self.shot, self.levels, contact=self.contact)
+
+    def set_contact(self, on: bool) -> None:
+        """Let cloth feel bodies and cloth, or nothing."""
+        self.contact, self._shown = on, None
+        self._solver.feel(contact=on)
+
+    def set_time(self, time: float | None) -> None:
+        """Go to a time code.
+
+        Raises:
+            UsageError: The shot has no sample there.
+        """
+        if time not in self.times:
+            raise UsageError(f"no sample at time code {time}; they run from {self.times[0]} to {self.times[-1]}")
+        self.time, self._shown = time, None
+
+    def solve(self) -> Shown:
+        """The frame with what is tried, soon: from where the cloth was, if that is this frame or the one before.
+
+        Raises:
+            SolveError: A term of the potential is not finite.
+            StageError: The frame cannot be read.
+        """
+        return self._shown or self._show(self._solver.solve_soon)
+
+    def settle(self, cancelled: Callable[[], bool] = lambda: False) -> Shown | None:
+        """The frame as ``refine`` gives it.
+
+        Args:
+            cancelled: Asked before each step: whether nobody waits for it any more.
+
+        Returns:
+            None where it was cancelled.
+
+        Raises:
+            SolveError: A term of the potential is not finite.
+            StageError: The frame cannot be read.
+        """
+        if self._shown is not None and self._shown.run is not None:
+            return self._shown
+        before = self._shown
+        shown = self._show(lambda shot, time: self._solver.solve_as_refine(shot, time, cancelled=cancelled))
+        if shown.run is None:
+            self._shown = before
+            return None
+        return shown
+
+    def save(self) -> Path:
+        """Write what is tried as a layer over the shot, as ``tag`` does; nothing else is ever written.
+
+        Raises:
+            UsageError: The layer's name is one of the shot's files, or its suffix is unknown.
+            StageError: A garment lies in an instance.
+            LayerError: It cannot be written.
+        """
+        written = tag(
+            self._opened.path,
+            self.out,
+            garments=self.garments,
+            colliders=self._named[1],
+            values=self.values,
+            overwrite=self._overwrite,
+        )
+        self._overwrite = True  # It is this session's own from here on.
+        return written
+
+    def _show(self, solve: Callable[..., State]) -> Shown:
+        began, spent = clock.perf_counter(), clock.process_time()
+        state = solve(self.shot, self.time)
+        times, run = (clock.perf_counter() - began, clock.process_time() - spent), self._solver.run
+        telemetry = tuple(dict(entry) for entry in state.telemetry)
+        ends = (run[0], run[-1]) if run else None
+        command = _command(self.out, run, self._named, contact=self.contact) if run else ""
+        self._shown = Shown(self.shot.frame(self.time), state.points, telemetry, *times, ends, command)
+        return self._shown
+
+    def _index(self, garment: str) -> int:
+        if garment not in self.garments:
+            raise UsageError(f"no garment <{garment}>; garments: {', '.join(self.garments)}")
+        return self.garments.index(garment)
+
+    def _try(self, garment: str, values: Mapping[str, float]) -> None:
+        """Read the shot with values more, rounded to floats that a layer can hold."""
+        held = {name: float(np.float32(value)) for name, value in values.items()}
+        self._read_with(garment, self.values.get(garment, {}) | held)
+
+    def _read_with(self, garment: str, values: dict[str, float]) -> None:
+        """Read the shot with a garment's values; what cannot be used changes nothing."""
+        self._index(garment)
+        tried = {**self.values, garment: values}
+        texts = [f"{path}.{GARMENT[name].name}={value!r}" for path, own in tried.items() for name, value in own.items()]
+        self.shot, self.values, self._shown = self._opened.with_values(texts), tried, None
+
+
+def _command(
+    out: Path, run: tuple[float | None, ...], named: tuple[Sequence[str], Sequence[str]], *, contact: bool
+) -> str:
+    """The command that refines a saved layer to the last frame of a run."""
+    words = ["physgraph-usd", "refine", str(out), "-o", str(out.with_suffix(".refined.usdc"))]
+    words += [] if run[0] is None else ["--frames", f"{run[0]!r}:{run[-1]!r}"]
+    for option, paths in zip(("--garment", "--collider"), named, strict=True):
+        words += [word for path in paths for word in (option, path)]
+    return join(words + ([] if contact else ["--contact", "off", "--self-contact", "off"]))

@@ -1,0 +1,308 @@
+"""Tuning: values tried on one frame, soon or as `refine` solves it, and saved as `tag` does."""
+
+from __future__ import annotations
+
+import io
+import shlex
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pxr", reason="shots are read with usd-core")
+
+from browser import served
+from click.testing import CliRunner
+from pxr import Sdf, Usd, UsdGeom
+from shots import CLOTH, cloth_shot
+
+from physgraph_usd.cli import main
+from physgraph_usd.errors import PhysGraphError, UsageError
+from physgraph_usd.fabric import PRESETS
+from physgraph_usd.samples import write_sample
+from physgraph_usd.tune.loop import SolveLoop
+from physgraph_usd.tune.session import Shown, TuneSession
+from physgraph_usd.tune.values import TUNABLES, painted_on
+from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.tag import tag
+
+STIFF = 3e-4
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    return cloth_shot(tmp_path / "sheet.usda", size=(8, 6))
+
+
+@pytest.fixture
+def session(shot: Path) -> Iterator[TuneSession]:
+    with closing(TuneSession(shot, garments=[CLOTH])) as made:
+        yield made
+
+
+def points(shown: Shown | None) -> np.ndarray:
+    assert shown is not None
+    assert shown.points[0] is not None
+    return shown.points[0]
+
+
+def refined(session: TuneSession, shown: Shown | None) -> np.ndarray:
+    """World points [m] that the page's command gives from the saved layer."""
+    assert shown is not None
+    assert shown.run is not None
+    words = shlex.split(shown.command)
+    done = CliRunner().invoke(main, words[1:])
+    assert done.exit_code == 0, done.output
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().subLayerPaths.append(words[words.index("-o") + 1])
+    stage.GetRootLayer().subLayerPaths.append(str(session.out))
+    prim = stage.GetPrimAtPath(session.garments[0])
+    own = np.asarray(UsdGeom.Mesh(prim).GetPointsAttr().Get(session.time or 0.0), np.float64)
+    matrix = session.shot.to_metres(0, session.time)
+    return own @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def test_a_value_is_solved_from_where_the_cloth_was(session: TuneSession):
+    before = session.solve()
+    session.set_value(CLOTH, "guide:stiffness", 100.0)
+    after = session.solve()
+    assert before.run == (1.0, 1.0)
+    assert after.run is None
+    assert after.telemetry[0]["start"] == "warm"
+    assert np.abs(points(after) - points(before)).max() > 1e-5
+    assert session.solve() is after
+
+
+def test_at_rest_it_is_what_the_saved_layer_gives(session: TuneSession):
+    session.set_time(3.0)
+    session.solve()
+    session.set_value(CLOTH, "bendStiffness", STIFF)
+    session.set_value(CLOTH, "guide:stiffness", 100.0)
+    quick = session.solve()
+    settled = session.settle()
+    session.save()
+    found = refined(session, settled)
+    assert np.abs(found - points(settled)).max() < 1e-7 < np.abs(points(quick) - points(settled)).max()
+
+
+def test_walking_on_is_the_run_that_refine_makes(session: TuneSession):
+    session.set_preset(CLOTH, "denim")
+    for time in (2.0, 3.0, 4.0):
+        session.set_time(time)
+        shown = session.solve()
+    assert shown.run == (2.0, 4.0)
+    session.save()
+    assert np.abs(refined(session, shown) - points(shown)).max() < 1e-7
+
+
+def test_what_follows_no_frame_begins_a_run(session: TuneSession):
+    session.solve()
+    for time, run in ((4.0, (4.0, 4.0)), (2.0, (2.0, 2.0)), (3.0, (2.0, 3.0))):
+        session.set_time(time)
+        assert session.solve().run == run
+
+
+def test_a_part_of_the_frames_sees_the_body_of_the_whole_shot(tmp_path: Path):
+    """A run that begins in the middle walks there from frames before, past a body that moves by its skeleton."""
+    path = write_sample("tshirt", tmp_path)
+    with closing(open_shot(path)) as whole, closing(open_shot(path, frames=(9.0, 9.0))) as part:
+        for time in (3.0, 9.0):
+            ours, theirs = part.frame(time).colliders[0], whole.frame(time).colliders[0]
+            assert ours is not None
+            assert theirs is not None
+            assert ours.equals(theirs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contact", [True, False])
+def test_with_bodies_too(tmp_path: Path, *, contact: bool):
+    with closing(TuneSession(write_sample("tshirt", tmp_path))) as session:
+        garment = session.garments[0]
+        session.set_level(garment, 1)
+        session.set_contact(contact)
+        session.set_time(session.times[8])
+        session.solve()
+        session.set_value(garment, "stretchStiffness", 200.0)
+        session.solve()
+        shown = session.settle()
+        session.save()
+        assert np.abs(refined(session, shown) - points(shown)).max() < 1e-7
+
+
+def test_a_settling_that_is_cancelled_leaves_the_cloth(session: TuneSession):
+    session.solve()
+    session.set_value(CLOTH, "bendStiffness", STIFF)
+    quick = session.solve()
+    steps = count()
+    assert session.settle(lambda: next(steps) >= 2) is None
+    assert session.solve() is quick
+    session.set_value(CLOTH, "bendStiffness", 1.5 * STIFF)
+    assert session.solve().telemetry[0]["start"] == "warm"
+    settled = session.settle()
+    session.save()
+    assert np.abs(refined(session, settled) - points(settled)).max() < 1e-7
+
+
+def test_save_writes_what_tag_writes(session: TuneSession, shot: Path, tmp_path: Path):
+    before = shot.read_bytes()
+    session.set_preset(CLOTH, "silk")
+    session.save()
+    tagged = tag(shot, tmp_path / "tagged.usda", garments=[CLOTH], preset="silk")
+    assert session.out.read_text() == tagged.read_text()
+    assert shot.read_bytes() == before
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["sheet.tuned.usda", "sheet.usda", "tagged.usda"]
+
+
+def test_only_its_own_file_is_replaced(session: TuneSession, shot: Path):
+    session.save()
+    session.set_value(CLOTH, "thickness", 0.002)
+    session.save()
+    assert "thickness = 0.002" in session.out.read_text()
+    with pytest.raises(UsageError, match="exists"):
+        TuneSession(shot, garments=[CLOTH])
+
+
+def test_a_value_is_rounded_as_a_layer_holds_it(session: TuneSession):
+    session.set_value(CLOTH, "bendStiffness", 1e-5)
+    assert session.value(CLOTH, "bendStiffness") == float(np.float32(1e-5)) != 1e-5
+
+
+def test_presets_and_what_was_authored(session: TuneSession):
+    authored = session.value(CLOTH, "bendStiffness")
+    session.set_preset(CLOTH, "denim")
+    assert session.value(CLOTH, "stretchStiffness") == pytest.approx(PRESETS["denim"].stretch)
+    session.set_as_authored(CLOTH)
+    assert session.value(CLOTH, "bendStiffness") == authored
+    assert not session.values[CLOTH]
+
+
+def test_levels(session: TuneSession):
+    vertices = []
+    for level in (0, 1, 2):
+        session.set_level(CLOTH, level)
+        shown = session.solve()
+        vertices.append(len(points(shown)))
+        painted = painted_on(session.shot.scene.garments[0], session.refinements[0], "bendScale")
+        assert painted == pytest.approx(np.ones(vertices[-1]))
+    assert vertices[0] < vertices[1] < vertices[2]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda own: own.set_value(CLOTH, "bend", 1.0), "known values: stretchStiffness"),
+        (lambda own: own.set_value("/World/x", "bendStiffness", 1.0), "no garment </World/x>"),
+        (lambda own: own.set_value(CLOTH, "density", -1.0), "density is -1"),
+        (lambda own: own.set_preset(CLOTH, "steel"), "known presets: cotton"),
+        (lambda own: own.set_level(CLOTH, 9), "refine:level is 9"),
+        (lambda own: own.set_level(CLOTH, -1), "0 or more"),
+        (lambda own: own.set_time(2.5), "no sample at time code 2.5"),
+    ],
+)
+def test_what_cannot_be_used_changes_nothing(session: TuneSession, change, said: str):
+    shown = session.solve()
+    with pytest.raises(UsageError, match=said):
+        change(session)
+    assert session.solve() is shown
+
+
+def test_a_tuned_value_goes_before_a_connection(session: TuneSession, shot: Path, tmp_path: Path):
+    stage = Usd.Stage.Open(str(shot))
+    name = "physgraph:material:bendStiffness"
+    stage.DefinePrim("/World/shared").CreateAttribute(name, Sdf.ValueTypeNames.Float).Set(1e-6)
+    attribute = stage.GetPrimAtPath(CLOTH).CreateAttribute(name, Sdf.ValueTypeNames.Float)
+    attribute.AddConnection(f"/World/shared.{name}")
+    stage.Export(str(tmp_path / "connected.usda"))
+    with closing(TuneSession(tmp_path / "connected.usda", garments=[CLOTH])) as tuned:
+        assert tuned.value(CLOTH, "bendStiffness") == pytest.approx(1e-6)
+        tuned.set_value(CLOTH, "bendStiffness", STIFF)
+        tuned.save()
+        with closing(TuneSession(tuned.out)) as again:
+            assert again.value(CLOTH, "bendStiffness") == tuned.value(CLOTH, "bendStiffness")
+
+
+@pytest.mark.parametrize("name", TUNABLES)
+def test_sliders_go_there_and_back(name: str):
+    tunable = TUNABLES[name]
+    for place in (0.0, 0.3, 1.0):
+        assert tunable.place(tunable.at(place)) == pytest.approx(place)
+    assert tunable.place(1e30) == 1.0
+
+
+class Log:
+    """What a loop tells; the first solve waits until it is let go."""
+
+    def __init__(self) -> None:
+        self.shown: list[Shown] = []
+        self.errors: list[str] = []
+        self.go, self.settled = threading.Event(), threading.Event()
+
+    def busy(self, what: str) -> None:
+        if "settling" not in what:
+            self.go.wait(20.0)
+
+    def show(self, shown: Shown) -> None:
+        self.shown.append(shown)
+        if len(self.shown) > 1 and shown.run is not None:
+            self.settled.set()
+
+    def fail(self, error: PhysGraphError) -> None:
+        self.errors.append(str(error))
+
+
+def test_changes_during_a_solve_are_solved_once_and_then_settled(session: TuneSession):
+    log = Log()
+    loop = SolveLoop(session, log, rest_seconds=0.05)
+    loop.ask(lambda own: own.set_value(CLOTH, "density", -1.0))
+    for k in range(10):
+        loop.ask(lambda own, k=k: own.set_value(CLOTH, "bendStiffness", STIFF * (k + 1)))
+    log.go.set()
+    assert log.settled.wait(30.0)
+    loop.close()
+    assert session.value(CLOTH, "bendStiffness") == pytest.approx(10 * STIFF)
+    assert [shown.run is None for shown in log.shown] in ([False, True, False], [True, False])
+    assert len(log.errors) == 1
+
+
+@pytest.mark.browser
+def test_the_page_in_a_browser(tmp_path: Path):
+    pytest.importorskip("viser", reason="the page is served with viser")
+    image = pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
+    from physgraph_usd.tune.page import TunePage
+
+    shot = cloth_shot(tmp_path / "sheet.usda", size=(8, 6))
+    session = TuneSession(shot, garments=[CLOTH])
+    page = TunePage(session, port=8200)
+    with closing(session), closing(page), served(page.url) as shown:
+
+        def picture() -> np.ndarray:
+            shown.wait_for_timeout(500)
+            whole = image.open(io.BytesIO(shown.screenshot()))
+            return np.asarray(whole.convert("RGB"), float)[250:, :1000]
+
+        settled = shown.get_by_text("settled: as refine solves it")
+        settled.wait_for(timeout=30000)
+        before, at_first = picture(), points(session.solve())
+        row = shown.locator(".value", has_text="Follow the animation")
+        slider = row.locator("xpath=../following-sibling::div[1]").get_by_role("slider")
+        box = slider.bounding_box()
+        shown.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        shown.mouse.down()
+        shown.mouse.move(box["x"] - 100, box["y"] + box["height"] / 2, steps=5)
+        shown.mouse.up()
+        shown.get_by_text("N/m³").first.wait_for()
+        shown.wait_for_function("!document.querySelector('#state').textContent.startsWith('settled')")
+        settled.wait_for(timeout=30000)
+        tuned = session.value(CLOTH, "guide:stiffness")
+        assert tuned is not None
+        assert tuned < 1500.0
+        assert np.abs(picture() - before).mean() > 0.1
+        assert np.abs(points(session.solve()) - at_first).max() > 1e-4
+        shown.get_by_role("button", name="Save layer").click()
+        shown.get_by_text("saved into").wait_for()
+        stage = Usd.Stage.Open(str(session.out))
+        assert stage.GetPrimAtPath(CLOTH).GetAttribute("physgraph:guide:stiffness").Get() == tuned
