@@ -1,6 +1,7 @@
 # make demo       refine a sample shot and say where the layer, the report and the picture are
 # make test       every check, and the fast tests
 # make test-all   every check, and all tests
+# make site       the documentation as a site, in build/site
 # make format     let ruff rewrite what it can
 # PYTHON=python3.12 picks the interpreter of the environment; JOBS=8 the number of test processes.
 
@@ -12,7 +13,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 DEMO := out/demo
 TESTS := $(BIN)/pytest -n $(JOBS)
 
-.PHONY: demo test test-all lint format clean
+.PHONY: demo site test test-all lint format clean
 
 demo: $(VENV)/.demo
 	@mkdir -p $(DEMO)
@@ -27,6 +28,9 @@ test: lint
 
 test-all: lint
 	$(TESTS)
+
+site: $(VENV)/.dev
+	$(BIN)/mkdocs build --strict
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check

@@ -203,3 +203,10 @@ class TestLogging:
         assert done.returncode == 3
         assert len(said) == len(set(said))
         assert sum("no sample is written at time code 2" in line for line in said) == 1
+
+
+def test_an_error_is_said_once(tmp_path: Path):
+    """In a process of its own: here pytest listens to what is logged."""
+    line = [sys.executable, "-m", "physgraph_usd", "refine", str(tmp_path / "none.usda"), "-o", str(tmp_path / "a.usdc")]
+    said = subprocess.run(line, capture_output=True, text=True, check=False).stderr
+    assert said.count("no such file") == 1, said

@@ -59,7 +59,8 @@ class Saying:
             yield
         except PhysGraphError as error:
             logger.removeHandler(on_stderr)
-            logger.error(str(error))
+            if logger.hasHandlers():  # Without any, logging itself would write to stderr.
+                logger.error(str(error))
             raise
         finally:
             logger.setLevel(before)

@@ -1,0 +1,93 @@
+"""The pages: the site builds without a warning, and every block of code runs or says why not."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from stages import GARMENT_API, add_sheet, new_stage, save
+
+ROOT = Path(__file__).resolve().parents[1]
+FOR_USERS = ("index", "attributes", "batch", "contact", "fabrics", "farm", "hooks", "layers", "tune")
+PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in FOR_USERS)]
+MOST_WORDS = 12_000
+BLOCK = re.compile(
+    r"(?:<!-- not run: (?P<why>[^>]+) -->\n)?^```(?P<kind>\w*)\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL
+)
+
+
+class Block(NamedTuple):
+    """A block of code: its language, none for commands, its text, and why it is not run, if so."""
+
+    kind: str
+    code: str
+    why: str | None
+
+
+def blocks(page: Path) -> list[Block]:
+    return [Block(found["kind"], found["code"], found["why"]) for found in BLOCK.finditer(page.read_text("utf-8"))]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, page: Path) -> Path:
+    """A place as the pages suppose one: shots of a coat, a folder for chunks, and the project's own folders."""
+    count = 48 if page.stem == "farm" else 4
+    stage = new_stage(tmp_path / "shot.usda", metres=0.05)
+    add_sheet(stage, "/World/Coat", times=tuple(map(float, range(1, count + 1))), size=(3, 2))
+    stage.GetPrimAtPath("/World/Coat").AddAppliedSchema(GARMENT_API)
+    shot = save(stage)
+    for name in ("seq", "c", "publish", "build"):
+        (tmp_path / name).mkdir()
+    for name in ("a", "b"):
+        shutil.copy(shot, tmp_path / "seq" / f"{name}.usda")
+    (tmp_path / "plugins").symlink_to(ROOT / "plugins")
+    return tmp_path
+
+
+def run(block: Block, folder: Path, before: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run a block in a folder; Python goes on from the blocks before it on its page."""
+    paths = [str(ROOT), str(ROOT / "plugins"), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    given = os.environ | {"PATH": path, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    line = ["bash", "-euc", block.code]
+    if block.kind == "python":
+        before.append(block.code)
+        line = [sys.executable, "-c", "\n".join(before)]
+    if block.kind == "toml":
+        (folder / "physgraph.toml").write_text(block.code, "utf-8")
+        line = [str(Path(sys.executable).with_name("physgraph-usd")), "inspect", "shot.usda"]
+    return subprocess.run(line, cwd=folder, env=given, capture_output=True, text=True, check=False, timeout=240)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_code_runs_or_says_why_not(page: Path, folder: Path):
+    before: list[str] = []
+    for block in blocks(page):
+        assert block.kind in ("", "sh", "python", "toml")
+        if block.why is None:
+            done = run(block, folder, before)
+            assert done.returncode == 0, f"{block.code}\n{done.stdout}\n{done.stderr}"
+
+
+def test_the_blocks_are_found():
+    assert len(blocks(ROOT / "README.md")) == 4
+    assert len(blocks(ROOT / "docs" / "farm.md")) == 3
+
+
+def test_pages_for_users_are_short():
+    assert sum(len(page.read_text("utf-8").split()) for page in PAGES) < MOST_WORDS
+
+
+def test_the_site_builds_without_a_warning(tmp_path: Path):
+    """Dead links, missing pictures and pages that are in no menu are warnings."""
+    line = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert "not included in the" not in done.stderr
+    assert (tmp_path / "site" / "index.html").is_file()
