@@ -207,6 +207,7 @@ class TestLogging:
 
 def test_an_error_is_said_once(tmp_path: Path):
     """In a process of its own: here pytest listens to what is logged."""
-    line = [sys.executable, "-m", "physgraph_usd", "refine", str(tmp_path / "none.usda"), "-o", str(tmp_path / "a.usdc")]
+    given = [str(tmp_path / "none.usda"), "-o", str(tmp_path / "a.usdc")]
+    line = [sys.executable, "-m", "physgraph_usd", "refine", *given]
     said = subprocess.run(line, capture_output=True, text=True, check=False).stderr
     assert said.count("no such file") == 1, said
