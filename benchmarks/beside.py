@@ -125,7 +125,7 @@ def walk_shot(*, sample: str, level: int, frames: int, out: str, shot: str | Non
                     "crossings": crossing_count(points, edges, triangles),
                     "inside": sum(each["inside"] + each.get("passing", 0) for each in bodies),
                     "energy": 1e3 * refiner.energy(frame, list(state.points)),
-                    "strain": max(each["strain"]["p99"] for each in entries),
+                    "strain": max((each["strain"]["p99"] for each in entries), default=0.0),
                 }
                 file.write(json.dumps(told) + "\n")
                 file.flush()
