@@ -20,7 +20,9 @@ SHOTS: dict[str, tuple[list[str], list[str], tuple[float, float]]] = {
     "12_variants/b_winding_flipped_unflagged.usdc": (["/shot/shirt"], ["/shot/body"], (6, 7)),
 }
 CAUGHT = {
-    "09_cesiumman_kilt/shot.usda": pytest.mark.xfail(reason="a hand sweeps through: one vertex stays 0.107 mm inside"),
+    "01_newton_shirt_dab_cm.usdc": pytest.mark.xfail(
+        reason="two of 22,312 vertices stay 8 mm inside the body, where cloth holds cloth"
+    ),
 }
 """Where cloth may not newly cross, and so cannot leave the body."""
 

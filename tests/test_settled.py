@@ -42,6 +42,12 @@ def shot(tmp_path: Path) -> Path:
     return cloth_shot(tmp_path / "shot.usdc", broken={3.0: 0.1})
 
 
+@pytest.fixture
+def gentle(tmp_path: Path) -> Path:
+    """One frame shrinks the sheet to half its size: far to go, but steps get there."""
+    return cloth_shot(tmp_path / "gentle.usdc", broken={3.0: 0.5})
+
+
 def test_a_warning_names_prim_time_code_and_figure(shot: Path, tmp_path: Path):
     report = refine(shot, tmp_path / "fine.usdc", steps=0)
     assert {entry["path"] for entry in report.unsettled} == {CLOTH}
@@ -52,15 +58,15 @@ def test_a_warning_names_prim_time_code_and_figure(shot: Path, tmp_path: Path):
     assert report.exit_code == 0
 
 
-def test_a_frame_that_settles_is_not_told_of(shot: Path, tmp_path: Path):
-    report = refine(shot, tmp_path / "fine.usdc", steps=96)
+def test_a_frame_that_settles_is_not_told_of(gentle: Path, tmp_path: Path):
+    report = refine(gentle, tmp_path / "fine.usdc", steps=96)
     assert report.unsettled == []
     assert not [each for each in report.warnings if "settle" in each]
 
 
 @pytest.mark.parametrize(("steps", "code"), [(0, 3), (96, 0)])
-def test_strict_counts_in_the_exit_code(shot: Path, tmp_path: Path, steps: int, code: int):
+def test_strict_counts_in_the_exit_code(gentle: Path, tmp_path: Path, steps: int, code: int):
     out = tmp_path / "fine.usdc"
-    done = command("refine", shot, "-o", out, "--level", 1, "--steps", steps, "--strict")
+    done = command("refine", gentle, "-o", out, "--level", 1, "--steps", steps, "--strict")
     assert (done.returncode, out.is_file()) == (code, True)
     assert ("did not settle" in done.stderr) == (code == 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -98,4 +99,4 @@ class Promise:
             x, met = moved.x, joined(met, moved.met)
             if not width and not bool(moved.short.any()):
                 break
-        return x
+        return aim if torch.equal(x, aim) else x
