@@ -39,6 +39,8 @@ class Refinement:
         folder = (blend.parent if bpy.data.is_saved else Path(bpy.app.tempdir)) / FOLDER
         folder.mkdir(exist_ok=True)
         self.files = files_of_run(folder, blend.stem or "untitled", [item.name for item in garments])
+        if settings.report:
+            self.files.report.mkdir()  # Where it is not there, the command takes ".report" for a kind of file.
         written = export(context, self.files.coarse, garments, colliders=bodies, frames=settings.frames)
         # Objects by number: undo makes new objects of the same numbers, and the artist may rename them meanwhile.
         self._paths = {item.session_uid: written.garments[item.name] for item in garments}
