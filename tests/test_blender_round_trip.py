@@ -98,7 +98,7 @@ def test_every_stiffness_is_what_it_was(untouched: tuple[Path, Path, dict[str, A
 
 def test_bodies_samples_and_words_are_kept(untouched: tuple[Path, Path, dict[str, Any]]) -> None:
     stage = Usd.Stage.Open(str(untouched[1]))
-    meshes = {prim.GetName(): prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)}
+    meshes = {prim.GetName(): prim for prim in stage.Traverse() if UsdGeom.Mesh(prim)}
     denim, body = meshes["Denim"], meshes["Body"]
     assert "PhysGraphColliderAPI" in body.GetPrimTypeInfo().GetAppliedAPISchemas()
     assert body.GetAttribute("physgraph:collider:offset").Get() == pytest.approx(0.004)
