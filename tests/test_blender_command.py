@@ -76,6 +76,16 @@ def test_the_command_understands_each_line(command: ModuleType, tmp_path: Path) 
         assert context.params["garments"] == ("/a",)
 
 
+def test_jersey_is_never_taken_in_silence(command: ModuleType) -> None:
+    lacking = {"Coat": ["stretchStiffness", "bendStiffness"], "Skirt": ["bendStiffness"]}
+    both = command.unsaid_warnings(command.Settings((1, 2)), lacking)
+    assert [("stretchStiffness" in said, "bendStiffness" in said) for said in both] == [(True, True), (False, True)]
+    assert "'Coat'" in both[0]
+    (left,) = command.unsaid_warnings(command.Settings((1, 2), bend=1e-5), lacking)
+    assert "stretchStiffness" in left
+    assert "bendStiffness" not in left
+
+
 def test_a_new_run_has_new_files(command: ModuleType, tmp_path: Path) -> None:
     first = command.files_of_run(tmp_path, "my shot", ["Coat ä", "Skirt/2"])
     assert first.layer.name == "my_shot-Coat_ä-Skirt_2.v001.refined.usdc"

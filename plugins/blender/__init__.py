@@ -2,24 +2,33 @@
 
 import bpy
 
-from . import panel, refine
+from . import kept, panel, refine
 
-CLASSES = (*refine.CLASSES, *panel.CLASSES)
+CLASSES = (*kept.CLASSES, *refine.CLASSES, *panel.CLASSES)
+KEEPERS = (bpy.types.Object, bpy.types.Material)
+"""Kinds of data that keep what a USD file said."""
 
 
 def register() -> None:
     """Tell Blender what there is."""
+    bpy.utils.expose_bundled_modules()  # Blender hands stages to hooks by its pxr, and ends where that is not there.
     for kind in CLASSES:
         bpy.utils.register_class(kind)
     bpy.types.Scene.physgraph = bpy.props.PointerProperty(type=panel.PhysGraphSettings)
     bpy.types.Object.physgraph_coarse = bpy.props.PointerProperty(
         type=bpy.types.Object, name="Coarse", description="The garment that this one was refined from"
     )
+    for kind in KEEPERS:
+        kind.physgraph_authored = bpy.props.StringProperty(
+            name="Authored", description="What a USD file said of the cloth", options={"HIDDEN"}
+        )
 
 
 def unregister() -> None:
     """Take it back."""
     refine.stop()
     del bpy.types.Object.physgraph_coarse, bpy.types.Scene.physgraph
+    for kind in KEEPERS:
+        del kind.physgraph_authored
     for kind in reversed(CLASSES):
         bpy.utils.unregister_class(kind)

@@ -120,6 +120,22 @@ def command_lines(
     return [*lines, [*refine, "--progress", "--no-keep-frames", *shlex.split(settings.more)]]
 
 
+def unsaid_warnings(settings: Settings, lacking: dict[str, list[str]]) -> list[str]:
+    """What to tell an artist who takes the fabric as it was authored, where it was not.
+
+    Args:
+        settings: What the panel says.
+        lacking: Names of the stiffnesses that nothing gives, by the garment's object.
+    """
+    on_panel = {"stretchStiffness": settings.stretch, "bendStiffness": settings.bend}
+    told = {item: [name for name in names if on_panel[name] is None] for item, names in lacking.items()}
+    return [
+        f"nothing gives the {' and '.join(names)} of '{item}': jersey's is taken; choose a fabric, or author it"
+        for item, names in told.items()
+        if names
+    ]
+
+
 def progress_in(text: str) -> tuple[float, str] | None:
     """The last line of progress in what a command said: the part that is done, and the rest of the line."""
     for line in reversed(text.splitlines()):

@@ -9,7 +9,7 @@ from .refine import PHYSGRAPH_OT_refine, now_running
 
 AS_AUTHORED = "AS_AUTHORED"
 FABRICS = [
-    (AS_AUTHORED, "As Authored", "What custom properties of the objects and materials say; jersey where they do not"),
+    (AS_AUTHORED, "As Authored", "What the USD file or custom properties of the objects and materials say"),
     *((name, name.capitalize(), f"The fabric {name}; docs/fabrics.md has its values") for name in PRESETS),
 ]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from .command import CommandError, Run, command_lines, files_of_run
+from .command import CommandError, Run, command_lines, files_of_run, unsaid_warnings
 from .shot import bring_back, export, selected_garments
 
 FOLDER = "physgraph"
@@ -39,10 +39,13 @@ class Refinement:
         folder = (blend.parent if bpy.data.is_saved else Path(bpy.app.tempdir)) / FOLDER
         folder.mkdir(exist_ok=True)
         self.files = files_of_run(folder, blend.stem or "untitled", [item.name for item in garments])
+        if settings.report:
+            self.files.report.mkdir()  # Where it is not there, the command takes ".report" for a kind of file.
         written = export(context, self.files.coarse, garments, colliders=bodies, frames=settings.frames)
         # Objects by number: undo makes new objects of the same numbers, and the artist may rename them meanwhile.
         self._paths = {item.session_uid: written.garments[item.name] for item in garments}
         self._reported = settings.report
+        self.unsaid = [] if settings.preset else unsaid_warnings(settings, written.lacking)
         command = context.preferences.addons[__package__].preferences.command
         lines = command_lines(
             bpy.path.abspath(command) if command.startswith("//") else command,
@@ -71,7 +74,7 @@ class Refinement:
             item.select_set(True)
         context.view_layer.objects.active = made[0]
         panel.last_report = str(self.files.report / "report.html") if self._reported else ""
-        warnings = self.run.warnings()
+        warnings = [*self.unsaid, *self.run.warnings()]
         if not bpy.data.is_saved:
             warnings.append(f"the .blend file is not saved; the cloth is in {self.files.layer} until Blender ends")
         return f"refined {', '.join(item.name for item in made)}", "\n".join(warnings)
@@ -125,6 +128,8 @@ class PHYSGRAPH_OT_refine(bpy.types.Operator):
             PHYSGRAPH_OT_refine._current = Refinement(context)
         except FAILURES as error:
             return self._fail(error)
+        for said in PHYSGRAPH_OT_refine._current.unsaid:
+            self.report({"WARNING"}, said)
         self._timer = context.window_manager.event_timer_add(POLL_SECONDS, window=context.window)
         return {"RUNNING_MODAL"}
 

@@ -9,18 +9,20 @@ from typing import NamedTuple
 
 import bpy
 
+from .kept import DATA_NAME, OBJECT_NAME, give_back, lacking
+
 COLLECTION = "PhysGraph"
 CACHE = "PhysGraph"
 """Name of the modifier that plays the refined points."""
 SUBDIVIDING = {"SUBSURF", "MULTIRES"}
-OBJECT_NAME, DATA_NAME = "userProperties:blender:object_name", "userProperties:blender:data_name"
 
 
 class Exported(NamedTuple):
-    """Prim paths of the exported meshes by the names of their objects."""
+    """Prim paths of the exported meshes, and the stiffnesses of garments that nothing gives, by objects' names."""
 
     garments: dict[str, str]
     colliders: dict[str, str]
+    lacking: dict[str, list[str]]
 
 
 def coarse_of(item: bpy.types.Object) -> bpy.types.Object:
@@ -76,11 +78,12 @@ def export(
             merge_parent_xform=False,
         )
     units = context.scene.unit_settings
-    paths = _finish_export(file, units.scale_length if units.system != "NONE" else 1.0)
+    paths, unsaid = _finish_export(file, units.scale_length if units.system != "NONE" else 1.0)
     missing = [item.name for item in (*garments, *colliders) if item.name not in paths]
     if missing:
         raise ValueError(f"Blender exported no mesh for {', '.join(missing)}; is there a face in it?")
-    return Exported({g.name: paths[g.name] for g in garments}, {c.name: paths[c.name] for c in colliders})
+    own = {garment.name: unsaid[garment.name] for garment in garments if unsaid[garment.name]}
+    return Exported({g.name: paths[g.name] for g in garments}, {c.name: paths[c.name] for c in colliders}, own)
 
 
 def bring_back(
@@ -157,16 +160,22 @@ def _not_subdivided(garments: list[bpy.types.Object]) -> Iterator[None]:
             modifier.show_viewport = True
 
 
-def _finish_export(file: Path, metres: float) -> dict[str, str]:
-    """Say how long the scene's unit is, which Blender does not; returns the mesh's path by its object's name."""
-    bpy.utils.expose_bundled_modules()
+def _finish_export(file: Path, metres: float) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Say how long the scene's unit is, which Blender does not.
+
+    Returns:
+        The mesh's path, and which stiffnesses nothing gives it, by its object's name.
+    """
     from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.Open(str(file))
     UsdGeom.SetStageMetersPerUnit(stage, metres)
+    give_back(stage)
     stage.GetRootLayer().Save()
-    meshes = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
-    return {mesh.GetParent().GetAttribute(OBJECT_NAME).Get(): str(mesh.GetPath()) for mesh in meshes}
+    meshes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    names = [mesh.GetParent().GetAttribute(OBJECT_NAME).Get() for mesh in meshes]
+    paths = {name: str(mesh.GetPath()) for name, mesh in zip(names, meshes, strict=True)}
+    return paths, {name: lacking(mesh) for name, mesh in zip(names, meshes, strict=True)}
 
 
 def _refined_object(context: bpy.types.Context, coarse: bpy.types.Object) -> bpy.types.Object:
@@ -192,7 +201,7 @@ def _take_import(fine: bpy.types.Object, root: Path, path: str) -> None:
         prim_path_mask=path,
         import_materials=False,
         set_frame_range=False,
-        property_import_mode="NONE",
+        **{"property_import_mode" if bpy.app.version >= (5, 0) else "attr_import_mode": "NONE"},
         create_world_material=False,
         relative_path=bpy.data.is_saved,
     )
