@@ -1,10 +1,10 @@
-"""The films of docs/gallery.md: Loop subdivision of a sample's cage beside the refined cloth.
+"""The films of docs/gallery.md: smooth subdivision of a sample's cage beside the refined cloth.
 
     python -m benchmarks.films docs/films [NAME...]
 
-Refines some frames of a sample at level 2 and writes NAME.mp4, a loop, and NAME.jpg, one of its frames. Prints the
-median time a frame, and the edges through faces of cloth and of bodies in all frames of both sides, counted by
-`benchmarks.crossing_count`. Takes the program ffmpeg with libx264.
+Refines some frames of a sample at level 2 and writes NAME.mp4, a loop, and NAME.jpg, one of its frames. Prints how
+many frames did not settle, the median time a frame, and the edges through faces of cloth and of bodies in all frames of
+both sides, counted by `benchmarks.crossing_count`. Takes the program ffmpeg with libx264.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from physgraph_usd.usd.meshes import DrawnMesh, DrawnStage
 
 LEVEL, PANEL, RATE, QUALITY = 2, (480, 540), 12, "25"
 """Subdivisions, one side's size [pixels], frames a second, and x264's rate factor."""
-TITLES = ("Cage, Loop subdivision", "Refined")
+LOOP, QUADS = "Cage, Loop subdivision", "Cage, Catmull-Clark subdivision"
+"""Titles of the left side: `mesh/subdivide.py` has one rule of both, which is the pure one among one kind of face."""
 
 
 @dataclass(frozen=True)
@@ -44,18 +45,20 @@ class Shown:
         frames: First and last time code.
         camera: Azimuth and elevation [degrees].
         still: Time code of the picture that stands for the film.
+        title: Of the left side.
     """
 
     frames: tuple[float, float]
     camera: tuple[float, float]
     still: float
+    title: str = LOOP
 
 
 SHOWN = {
     "sleeve": Shown((1.0, 24.0), (25.0, 10.0), 22.0),
     "skirt": Shown((1.0, 32.0), (25.0, 6.0), 24.0),
-    "flag": Shown((1.0, 30.0), (25.0, 10.0), 24.0),
-    "block": Shown((1.0, 24.0), (40.0, 22.0), 16.0),
+    "flag": Shown((1.0, 30.0), (25.0, 10.0), 24.0, QUADS),
+    "block": Shown((1.0, 24.0), (40.0, 22.0), 16.0, QUADS),
 }
 """The films by sample."""
 
@@ -83,7 +86,8 @@ def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
     sides = list(zip(times, smooth(name, fine, times), (fine.meshes(time) for time in times), strict=True))
     counts = [sum(crossings(each[side], garments) for each in sides) for side in (1, 2)]
     seconds = statistics.median(sum(each["garments"][0]["milliseconds"].values()) for each in report.frames) / 1e3
-    say(f"{name}: {len(times)} frames, {seconds:.2f} s a frame, crossings {counts[0]:,} -> {counts[1]:,}")
+    said = f"{len(times)} frames, {len(report.unsettled)} not settled, {seconds:.2f} s a frame"
+    say(f"{name}: {said}, crossings {counts[0]:,} -> {counts[1]:,}")
     drawn = {time: Image.fromarray(pixels) for time, pixels in pictures(sides, shown)}
     drawn[shown.still].save(out.with_suffix(".jpg"), quality=85)
     encode(list(drawn.values()), out)
@@ -126,7 +130,7 @@ def pictures(sides: Sequence[tuple[float, Side, Side]], shown: Shown) -> Iterato
     for time, *both in sides:
         sheet = Image.new("RGB", (2 * PANEL[0], PANEL[1]))
         pen = ImageDraw.Draw(sheet)
-        for place, (title, side) in enumerate(zip(TITLES, both, strict=True)):
+        for place, (title, side) in enumerate(zip((shown.title, "Refined"), both, strict=True)):
             surfaces = [surface_of(mesh, lined=False) for mesh in side]
             pixels = draw(surfaces, view, size=PANEL, floor=floor)
             sheet.paste(Image.fromarray(pixels), (place * PANEL[0], 0))
