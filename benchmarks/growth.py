@@ -5,8 +5,9 @@
 Two tables, unguarded descents of garments at their finest level; medians over the shots, and the worst after so many
 steps. The first has two starts that differ by a billionth of an edge, in float64: the root mean square of their
 difference over that of the noise. The second has the same start in float32 and in float64: the root mean square of
-their difference in edges (S33 of docs/stability.md on real garments). A difference grows where cloth buckles, whatever
-the method: two folds that could go either way are told apart by less and less. What a method adds to that is its own.
+their difference in edges (S33 of docs/notes/stability.md on real garments). A difference grows where cloth buckles,
+whatever the method: two folds that could go either way are told apart by less and less. What a method adds to that is
+its own.
 """
 
 from __future__ import annotations

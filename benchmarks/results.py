@@ -1,6 +1,8 @@
-"""The paper's results, each with its command, its figure and ours: writes docs/results.md.
+"""The paper's results, each with its command, its figure and ours: writes docs/results.md and docs/notes/results.md.
 
     python -m benchmarks.results [--short] [-o docs/results.md] [--only NAME] [--fresh]
+
+The first has every figure with its target; the second, in the folder notes beside it, also what was done, and tables.
 
 Each part is measured by a command of its own, which stands beside its figures. What was measured lies in a journal, a
 part the moment it is known: a run that was stopped goes on where it was, while the code is the same. The short form
@@ -67,6 +69,7 @@ nothing was aimed at.
 
 **{met} of {counted} figures with a target meet it.** Weights of the learned integrators: {weights}.
 """
+IN_FULL = "What stands in for the paper's data, and the tables behind: [in full](notes/results.md).\n"
 
 
 class Journal:
@@ -112,8 +115,8 @@ def run(parts: Sequence[Part], journal: Journal, *, short: bool) -> dict[str, di
     return journal.read()
 
 
-def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool) -> str:
-    """The page in Markdown."""
+def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool, whole: bool = True) -> str:
+    """The page in Markdown; whole has what was done and tables too, and lies in a folder below the other."""
     shown = [(part, known[part.name]) for part in parts if part.name in known]
     rows = [row for _, each in shown for row in Found.of(each["found"]).rows if row.met is not None]
     seconds = sum(each["seconds"] for _, each in shown)
@@ -128,22 +131,26 @@ def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool
         counted=len(rows),
         weights=", ".join(hashes()) or "none",
     )
-    return "\n".join([head, *(line for part, each in shown for line in section(part, each, short=short))])
+    sections = (line for part, each in shown for line in section(part, each, short=short, whole=whole))
+    return "\n".join([head, *([] if whole else [IN_FULL]), *sections])
 
 
-def section(part: Part, known: dict[str, Any], *, short: bool) -> Iterator[str]:
-    """The lines of a part: its heading, its command, what the command's file says, its rows and notes."""
+def section(part: Part, known: dict[str, Any], *, short: bool, whole: bool = True) -> Iterator[str]:
+    """The lines of a part: its heading, its command and rows; whole: what the command's file says, and notes."""
     found = Found.of(known["found"])
     yield f"## {part.title}\n"
     yield f"`python -m {part.command}{'' if short else ' --long'}` ({known['seconds']:.0f} s)\n"
-    yield from about(part)
+    if whole:
+        yield from about(part)
     yield from HEAD
     yield from (row.line() for row in found.rows)
     yield ""
+    if not whole:
+        return
     for note in found.notes:
         yield f"{note}\n"
     if found.picture:
-        yield f"![{part.title}]({found.picture})\n"
+        yield f"![{part.title}](../{found.picture})\n"
 
 
 def about(part: Part) -> Iterator[str]:
@@ -181,8 +188,11 @@ def main(short: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:
     journal = Journal(CACHE / f"results.{form}.jsonl", key, fresh=fresh)
     with torch.no_grad():
         known = run([part for part in PARTS if not only or part.name in only], journal, short=short)
-    out.write_text(page(PARTS, known, short=short), encoding="utf-8")
-    click.echo(out)
+    notes = out.parent / "notes" / out.name
+    notes.parent.mkdir(parents=True, exist_ok=True)
+    for file, whole in ((out, False), (notes, True)):
+        file.write_text(page(PARTS, known, short=short, whole=whole), encoding="utf-8")
+        click.echo(file)
 
 
 if __name__ == "__main__":

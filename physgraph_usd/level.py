@@ -26,7 +26,7 @@ HINGE_SHAPE_LIMIT = 10.0
 
 QUAD_SPRING = (0.75, 1.5)
 """Factors of the springs along a quad's sides and diagonal: with them squares whose diagonals alternate, as subdivision
-splits them, are isotropic with nu = 1/3; without, Y varies from 0.75 to 1.2 with direction (docs/calibration.md)."""
+splits them, are isotropic with nu = 1/3; else Y varies from 0.75 to 1.2 with direction (docs/notes/calibration.md)."""
 
 QUAD_HINGE = (1.28, 0.64)
 """The same for hinges: D is then 1 in all directions instead of 0.86 to 1.36."""

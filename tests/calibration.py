@@ -1,6 +1,6 @@
-"""Writes docs/calibration.md: what the forces' constants turn out to be on each kind of mesh.
+"""Writes docs/notes/calibration.md: what the forces' constants turn out to be on each kind of mesh.
 
-Run ``python tests/calibration.py docs/calibration.md`` in an environment where the package is installed; it takes
+Run ``python tests/calibration.py docs/notes/calibration.md`` in an environment where the package is installed; it takes
 about half a minute on two cores.
 """
 
@@ -136,7 +136,7 @@ def chain_table() -> list[str]:
 PAGE = """# Calibration
 
 What a sheet of cloth shows to an experiment, over what was asked for, on four kinds of mesh. Written by
-`python tests/calibration.py docs/calibration.md`; `tests/stability/test_forces_analytic.py` holds the figures in
+`python tests/calibration.py docs/notes/calibration.md`; `tests/stability/test_forces_analytic.py` holds the figures in
 bounds.
 
 The meshes: equilateral triangles; Delaunay triangles of a jittered lattice (quality over 0.4); squares as our

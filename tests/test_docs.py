@@ -13,10 +13,18 @@ from typing import NamedTuple
 import pytest
 from stages import GARMENT_API, add_sheet, new_stage, save
 
+from physgraph_usd.cli import main
+
 ROOT = Path(__file__).resolve().parents[1]
-FOR_USERS = ("index", "attributes", "batch", "contact", "fabrics", "farm", "hooks", "layers", "tune")
+FOR_USERS = (
+    "index", "attributes", "batch", "contact", "fabrics", "farm", "gallery", "hooks", "layers", "symptoms", "trouble",
+    "tune",
+)  # fmt: skip
+FOR_RESEARCHERS = ("chart", "collisions", "frames", "learned", "solver")
 PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in FOR_USERS)]
 MOST_WORDS = 12_000
+MOST_WORDS_OF_README, MOST_WORDS_OF_A_PAGE = 1_200, 2_000
+MOST_BYTES_OF_A_FILM, MOST_BYTES_OF_FILMS = 600_000, 3_000_000
 BLOCK = re.compile(
     r"(?:<!-- not run: (?P<why>[^>]+) -->\n)?^```(?P<kind>\w*)\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL
 )
@@ -82,6 +90,36 @@ def test_the_blocks_are_found():
 
 def test_pages_for_users_are_short():
     assert sum(len(page.read_text("utf-8").split()) for page in PAGES) < MOST_WORDS
+
+
+def test_every_page_is_read_in_ten_minutes():
+    for name in (*FOR_USERS, *FOR_RESEARCHERS):
+        assert len((ROOT / "docs" / f"{name}.md").read_text("utf-8").split()) <= MOST_WORDS_OF_A_PAGE, name
+    assert len((ROOT / "README.md").read_text("utf-8").split()) <= MOST_WORDS_OF_README
+
+
+@pytest.mark.parametrize("name", ["symptoms", "trouble"])
+def test_advice_names_what_there_is(name: str):
+    """Every option in code marks is one of the commands', every attribute one of the schemas'."""
+    said = " ".join(re.findall(r"`([^`\n]+)`", (ROOT / "docs" / f"{name}.md").read_text("utf-8")))
+    known = [each for command in main.commands.values() for each in command.params]
+    options = {option for each in known for option in (*each.opts, *each.secondary_opts)}
+    attributes = (ROOT / "docs" / "attributes.md").read_text("utf-8")
+    assert set(re.findall(r"(?<!\S)--[a-z-]+", said)) <= options
+    asked = re.findall(r"(?:primvars:)?physgraph:[\w:]+", said)
+    asked += [f"physgraph:material:{short}" for short in re.findall(r"--set (\w+)=", said)]
+    assert asked or name != "symptoms"
+    for attribute in asked:
+        assert f"| `{attribute}` |" in attributes
+
+
+def test_the_gallery_has_its_films_and_they_are_short():
+    page = (ROOT / "docs" / "gallery.md").read_text("utf-8")
+    films = {ROOT / "docs" / name for name in re.findall(r'(?:src|poster)="([^"]+)"', page)}
+    assert len(films) >= 6
+    sizes = {film: film.stat().st_size for film in films}
+    assert max(sizes.values()) <= MOST_BYTES_OF_A_FILM
+    assert sum(sizes.values()) <= MOST_BYTES_OF_FILMS
 
 
 def test_the_site_builds_without_a_warning(tmp_path: Path):

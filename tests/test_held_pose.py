@@ -1,4 +1,4 @@
-"""Poses that are held: cloth comes to rest, but for what `docs/contact.md` says does not."""
+"""Poses that are held: cloth comes to rest, but for what `docs/notes/contact.md` says does not."""
 
 from __future__ import annotations
 

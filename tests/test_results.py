@@ -87,7 +87,12 @@ def test_the_page_counts_what_is_met_and_shows_what_is_missed(tmp_path: Path):
     assert "## Title of one" in text
     assert "`python -m benchmarks.two`" in text
     assert "| what of two | 2 | at most 3 | 1 | **missed** |" in text
+    assert "note of two" in text
     assert "--long" in page(made, known, short=False)
+    brief = page(made, known, short=True, whole=False)
+    assert "| what of two | 2 | at most 3 | 1 | **missed** |" in brief
+    assert "note of two" not in brief
+    assert "notes/results.md" in brief
 
 
 def test_every_part_has_its_name_and_command_once():

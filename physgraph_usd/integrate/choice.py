@@ -2,13 +2,13 @@
 
 Coarse levels are cheap and carry folds far, but each has a start of its own. Under one subdivision lies one coarse
 level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where cloth lies near
-cloth: who lies above whom is settled at the cage. `python -m benchmarks.front` measures it, and docs/chart.md has the
-table. What starts from the last frame's detail starts at the finest level in any case.
+cloth: who lies above whom is settled at the cage. `python -m benchmarks.front` measures it; docs/notes/chart.md has
+the table. What starts from the last frame's detail starts at the finest level in any case.
 
 On CUDA a coarse level's steps take as long as the finest's, so a cold frame goes there only where the cage is far from
 rest: folded, or pressed on by bodies, it is what coarse levels carry far (`--device cuda`).
 
-On CUDA the network's step costs less than quasi-Newton's and goes further (docs/learned.md, `python -m
+On CUDA the network's step costs less than quasi-Newton's and goes further (docs/notes/learned.md, `python -m
 benchmarks.learned --device cuda`). On the CPU it costs more, and pays where a cold frame goes through two coarse levels
 or more and the cage does not cross itself. Elsewhere, where cloth presses on cloth, the guard rejects most of its
 steps, and quasi-Newton makes them.
