@@ -80,7 +80,7 @@ def _errors(module: Any, name: str, problems: Iterable[Problem], site: Callable[
 
 def refined(prim: Usd.Prim) -> Fine | None:
     """A mesh that a refined layer of its stage names, or None."""
-    if not prim.IsA(UsdGeom.Mesh):
+    if not UsdGeom.Mesh(prim):
         return None
     path = prim.GetPath()
     for layer in prim.GetStage().GetLayerStack(includeSessionLayers=False):
