@@ -150,6 +150,15 @@ def test_a_thickness_that_fits_nothing_is_refused_by_name(tmp_path: Path, values
         values(stage)
 
 
+@pytest.mark.parametrize(("kind", "value"), [("float", 0.001), ("string[]", ["thin"]), ("float[]", [np.nan])])
+def test_a_thickness_of_another_type_is_refused_by_name(tmp_path: Path, kind: str, value: object) -> None:
+    stage = cloth(tmp_path)
+    author(stage.GetPrimAtPath(CLOTH), "physics:thicknesses", value, kind=kind)
+    author(stage.GetPrimAtPath(CLOTH), "physics:thicknesses:elementType", "constant", kind="token")
+    with pytest.raises(SchemaError, match=rf"<{CLOTH}>\.physics:thicknesses"):
+        values(stage)
+
+
 def test_a_ratio_out_of_range_is_refused_by_name(tmp_path: Path) -> None:
     stage = cloth(tmp_path)
     on_material(stage, youngsModulus=YOUNGS, poissonsRatio=1.0)

@@ -122,7 +122,7 @@ def read_thickness(prim: Usd.Prim, materials: Sequence[Usd.Prim], row: Property,
         SchemaError: When the array does not fit its elementType, or holds what is no thickness.
     """
     on_mesh = authored(prim, THICKNESSES)
-    if on_mesh is not None and len(on_mesh.Get(Usd.TimeCode.EarliestTime()) or ()):
+    if on_mesh is not None and np.size(on_mesh.Get(Usd.TimeCode.EarliestTime())):
         return _on_mesh(prim, on_mesh, row, units=units)
     for material in materials:
         old = authored(material, OLD_THICKNESS)
@@ -165,12 +165,15 @@ def _from_youngs(material: Usd.Prim, row: Property, thickness: Found | Derived, 
 def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: Units) -> Thickness:
     """Thickness from the array on a mesh."""
     code, where = Usd.TimeCode.EarliestTime(), source_name(attribute)
-    values = np.asarray(attribute.Get(code), np.float64)
+    values = np.asarray(attribute.Get(code))
+    if values.ndim != 1 or not np.issubdtype(values.dtype, np.number):
+        raise SchemaError(f"{where} is {attribute.GetTypeName()}; author float[]")
+    values = values.astype(np.float64)
     counts, indices = (np.asarray(a.Get(code)) for a in _topology(prim))
     count = len(UsdGeom.Mesh(prim).GetPointsAttr().Get(code) or ())
-    element = prim.GetAttribute(f"{THICKNESSES}:elementType").Get() or ""
-    expected = {"constant": 1, "face": len(counts), "point": count}.get(element)
-    if values.ndim != 1 or len(values) != expected:
+    element = prim.GetAttribute(f"{THICKNESSES}:elementType").Get()
+    expected = {"constant": 1, "face": len(counts), "point": count}.get(str(element))
+    if len(values) != expected:
         said = f"{len(values)} values, and {THICKNESSES}:elementType is {element!r}, which takes {expected or 'none'}"
         raise SchemaError(f"{where} has {said}; author constant (one), face or point")
     for index in (int(values.argmin()), int(values.argmax())):
