@@ -126,10 +126,24 @@ def test_a_rest_shape_of_another_size_is_told(tmp_path: Path) -> None:
     assert any("times as long as the animation's" in notice.message for notice in open_shot(save(stage)).warnings)
 
 
-@pytest.mark.parametrize(("value", "bent"), [("restShapeDefault", True), ("flatDefault", False), (None, False)])
-def test_hinges_rest_flat_or_bent(tmp_path: Path, value: str | None, bent: bool) -> None:
+@pytest.mark.parametrize(
+    ("value", "bent", "renamed"),
+    [
+        ("restShape", True, None),
+        ("flat", False, None),
+        ("restShapeDefault", True, "restShape"),
+        ("flatDefault", False, "flat"),
+        (None, False, None),
+    ],
+)
+def test_hinges_rest_flat_or_bent(tmp_path: Path, value: str | None, bent: bool, renamed: str | None) -> None:
     stage = new_stage(tmp_path / "s.usda")
     mesh = add_sheet(stage)
     if value:
         author(mesh.GetPrim(), "physics:restBendAnglesDefault", value, kind="token")
-    assert open_shot(save(stage)).scene.garments[0].bent_rest == bent
+    shot = open_shot(save(stage))
+    assert shot.scene.garments[0].bent_rest == bent
+    told = [notice for notice in shot.warnings if "restBendAnglesDefault" in notice.message]
+    assert [(notice.path, f"author {renamed!r}" in notice.message) for notice in told] == (
+        [(str(mesh.GetPath()), True)] if renamed else []
+    )

@@ -15,6 +15,7 @@ from ..mesh.fit import median_shape
 from ..mesh.topology import PolygonMesh, edges_of
 from ..scene import Garment, GarmentFrame
 from .cage import read_cage
+from .deformable import rest_angle_notices
 from .lookup import Override, find_value
 from .materials import Values, find_values
 from .painted import read_painted
@@ -122,7 +123,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     points = PointReader(prim, times[0] if times else None)
     cage = read_cage(prim, points.count, times)
     edges = cage.mesh.half_edges.edges
-    notices = [*cage.notices, *check_placement(prim, request.units.metres, times)]
+    notices = [*cage.notices, *rest_angle_notices(prim), *check_placement(prim, request.units.metres, times)]
     matrix = to_metres(prim, request.units.metres, first)
     start = place(points.read(first, edges)[0], matrix)
     if request.rest_frame is None:
@@ -141,7 +142,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         bent_rest=rests_bent(prim),
         self_contact=own,
         layer=layer,
-        **_painted(prim, points.count, notices),
+        **_painted(prim, points.count, notices, values=values),
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
     named = {"contact:selfCollision": own_source, "contact:layer": layer_source, "rest": rest.source}
@@ -155,7 +156,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
         subsets=_subsets(prim, cage.kept_faces),
     )
-    return GarmentReader(garment, source, values, points, edges, notices + _range_notices(source))
+    return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices, *_range_notices(source)])
 
 
 def _rest_asked(
@@ -225,14 +226,16 @@ def _feels_itself(prim: Usd.Prim, request: Request) -> tuple[bool, str]:
     return bool(found.at(None)), found.source
 
 
-def _painted(prim: Usd.Prim, count: int, notices: list[Notice]) -> dict[str, Any]:
-    """The painted arrays of a garment by field name; adds to the notices."""
+def _painted(prim: Usd.Prim, count: int, notices: list[Notice], *, values: Values) -> dict[str, Any]:
+    """The painted arrays of a garment by field name, with the thickness's share; adds to the notices."""
     names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
     names |= {"detail_scale": "detailScale", "pin": "pin"}
     arrays = {}
     for name, short in names.items():
         arrays[name], odd = read_painted(prim, short, count)
         notices.extend(odd)
+    arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
+    arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
     return arrays
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
@@ -54,6 +54,10 @@ def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:
     for path in found:
         if path.IsPrimVariantSelectionPath():
             yield _error("authors inside a variant of an asset", str(path))
+
+
+RULES: tuple[Callable[[Sdf.Layer], Iterator[Problem]], ...] = (record, time_scale, whole_range, self_contained)
+"""Rules for a refined layer by itself."""
 
 
 def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:

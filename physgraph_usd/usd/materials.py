@@ -1,9 +1,7 @@
 """A garment's fabric at a time, and who gave each value.
 
-After the ``physgraph:material:`` values of the bound materials come those of the deformable-body proposal for
-UsdPhysics (``physics:surfaceStretchStiffness`` and its relatives), which are in stage units. With m = metersPerUnit and
-M = kilogramsPerUnit, their SI values are: stretch and shear M v [N/m], bending M m^2 v [N m], volumetric density
-M/m^3 v [kg/m^3], thickness m v [m].
+After ``--set``, the garment, its ancestors and the ``physgraph:material:`` values of the bound materials come those of
+the deformable-body proposal for UsdPhysics, which `deformable` reads; the table's fallbacks come last.
 """
 
 from __future__ import annotations
@@ -11,22 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 
 from ..fabric import Fabric
-from .lookup import Found, Override, authored, bound_materials, find_value, read_number, source_name
-from .schema import GARMENT, Property
-from .stage import Units
+from .deformable import STIFFNESSES, Derived, density, read_thickness, stiffness
+from .lookup import Found, Override, bound_materials, find_value
+from .schema import GARMENT
+from .stage import Notice, Units
 
-PROPOSAL = {
-    "stretchStiffness": "physics:surfaceStretchStiffness",
-    "shearStiffness": "physics:surfaceShearStiffness",
-    "bendStiffness": "physics:surfaceBendStiffness",
-    "density": "physics:density",
-    "thickness": "physics:surfaceThickness",
-}
-"""Attributes of the UsdPhysics proposal by the short names of ours."""
-_FRAME_VALUES = (*PROPOSAL, "guide:stiffness", "refine:detail", "contact:offset")
+_FRAME_VALUES = (*STIFFNESSES, "density", "thickness", "guide:stiffness", "refine:detail", "contact:offset")
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +28,14 @@ class Values:
     Attributes:
         found: Source of each value, by short name.
         volumetric: Whether the density is per volume, to be multiplied by the thickness.
+        thickness: Thickness at each point over the mean, shape (V,), where stiffnesses follow it; else None.
+        notices: What was odd.
     """
 
-    found: dict[str, Found]
+    found: dict[str, Found | Derived]
     volumetric: bool
+    thickness: np.ndarray | None = None
+    notices: tuple[Notice, ...] = ()
 
     @property
     def sources(self) -> dict[str, str]:
@@ -63,6 +59,16 @@ class Values:
         density *= thickness if self.volumetric else 1.0
         return Fabric(stretch, bend, density, thickness, self.found["shearStiffness"].at(time))
 
+    def thickness_scale(self, name: str) -> np.ndarray | float:
+        """Factor of a stiffness at each point where it follows the thickness there, shape (V,), else 1.
+
+        The painted multiplier of stretching is shear's too: it follows the thickness where both do.
+        """
+        names = ("bendStiffness",) if name == "bendStiffness" else ("stretchStiffness", "shearStiffness")
+        if self.thickness is None or not all(isinstance(self.found[each], Derived) for each in names):
+            return 1.0
+        return self.thickness ** (3 if name == "bendStiffness" else 1)
+
     def number(self, name: str, time: float | None) -> float:
         """Any other value at a time code, by short name."""
         return float(self.found[name].at(time) or 0.0)
@@ -71,23 +77,23 @@ class Values:
 def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> Values:
     """Find the source of every fabric value, the guide's stiffness and the detail's gain."""
     materials = bound_materials(prim)
-    found = {name: find_value(prim, GARMENT[name], overrides) for name in _FRAME_VALUES}
-    given = {
-        name: _from_proposal(materials, GARMENT[name], units) for name in PROPOSAL if found[name].source == "fallback"
-    }
-    proposed = {name: value for name, value in given.items() if value is not None}
-    return Values(found | proposed, volumetric="density" in proposed)
-
-
-def _from_proposal(materials: Sequence[Usd.Prim], row: Property, units: Units) -> Found | None:
-    """Take a value from a material of the UsdPhysics proposal; there zero means that it is not given."""
-    metres, kilograms = units.metres, units.kilograms
-    scale = {"bendStiffness": kilograms * metres**2, "density": kilograms / metres**3, "thickness": metres}
-    for material in materials:
-        attribute = authored(material, PROPOSAL[row.short])
-        if attribute is not None and read_number(attribute, None) > 0:
-            return Found(row, source_name(attribute), attribute, None, scale.get(row.short, kilograms))
-    return None
+    found: dict[str, Found | Derived] = {name: find_value(prim, GARMENT[name], overrides) for name in _FRAME_VALUES}
+    open_rows = [name for name in _FRAME_VALUES if found[name].source == "fallback"]
+    thick = read_thickness(prim, materials, GARMENT["thickness"], units=units) if "thickness" in open_rows else None
+    if thick is not None:
+        found["thickness"] = thick.found
+    for name in STIFFNESSES:
+        given = stiffness(materials, GARMENT[name], found["thickness"], units=units) if name in open_rows else None
+        found[name] = given or found[name]
+    volume = density(materials, GARMENT["density"], units) if "density" in open_rows else None
+    if volume is not None:
+        found["density"] = volume
+    return Values(
+        found,
+        volumetric=volume is not None,
+        thickness=thick.relative if thick else None,
+        notices=thick.notices if thick else (),
+    )
 
 
 def is_collision_prim(prim: Usd.Prim) -> bool:

@@ -23,7 +23,7 @@ from .stage import Notice
 AUTO = "auto"
 """In place of a time code: a rest shape fitted to the animation."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
-_BENT = "restShapeDefault"
+_BENT = ("restShape", "restShapeDefault")
 _TINY = 1e-9
 _MOST_SCALED = 2.0
 
@@ -116,9 +116,9 @@ def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray)
 
 
 def rests_bent(prim: Usd.Prim) -> bool:
-    """Whether hinges rest at the rest shape's angles: ``physics:restBendAnglesDefault`` is ``restShapeDefault``."""
+    """Whether hinges rest at the rest shape's angles: ``physics:restBendAnglesDefault`` is ``restShape``."""
     attribute = nearest(prim, "physics:restBendAnglesDefault")
-    return attribute is not None and attribute.Get() == _BENT
+    return attribute is not None and attribute.Get() in _BENT
 
 
 def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 
 from pxr import Usd
 
+from .deformable import ON_MATERIAL
 from .heat import HEAT, PREFIX
 from .lookup import USER_PROPERTIES, bound_materials, connected, with_ancestors
-from .materials import PROPOSAL
 from .schema import MATERIAL, PROPERTIES, nearest_property
 from .stage import Notice
 
@@ -41,7 +41,7 @@ def _unread_on(prim: Usd.Prim, *, material: bool) -> Iterator[Notice]:
     for authored in prim.GetAuthoredProperties():
         name = authored.GetName().removeprefix(USER_PROPERTIES)
         fault = _fault(name, material=material) if name.startswith(_OURS) else ""
-        if not fault and name in {*_NAMES, *PROPOSAL.values()}:
+        if not fault and name in {*_NAMES, *ON_MATERIAL}:
             fault = _connection_fault(prim.GetAttribute(authored.GetName()))
         if fault:
             yield Notice(str(prim.GetPath()), None, f"{authored.GetName()} {fault}")

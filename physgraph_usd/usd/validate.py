@@ -15,6 +15,7 @@ from . import layer_rules
 from .provenance import read_record, recorded_shot
 from .rules import RULES, Fine, Problem, subsets
 from .stage import USD_ERRORS, check_there, is_there, pxr_errors, reason_of
+from .validators import PLUGIN
 from .variants import same_variants
 from .view import StageView
 
@@ -61,11 +62,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
     Returns:
         Problems in the order of the rules.
     """
-    problems = [
-        replace(problem, rule=rule.__name__)
-        for rule in (layer_rules.record, layer_rules.time_scale, layer_rules.whole_range, layer_rules.self_contained)
-        for problem in rule(layer)
-    ]
+    problems = [replace(problem, rule=rule.__name__) for rule in layer_rules.RULES for problem in rule(layer)]
     if shot is None:
         return problems
     paths = _garments(layer)
@@ -189,7 +186,8 @@ def _findings(
     Some builds of USD lack the libraries of validators, or what those read: each one runs by itself.
     """
     registry, found, failed = module.ValidationRegistry(), [{} for _ in stages], []
-    for name in sorted(metadata.name for metadata in registry.GetAllValidatorMetadata()):
+    names = (str(metadata.name) for metadata in registry.GetAllValidatorMetadata())
+    for name in sorted(name for name in names if not name.startswith(f"{PLUGIN}:")):  # Ours have run.
         try:
             context = module.ValidationContext([registry.GetOrLoadValidatorByName(name)])
             own = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]

@@ -15,6 +15,7 @@ from .mutant import Draft, Kind
 _SINGLE = [row.name for row in PROPERTIES if row.type != "rel" and not row.interpolation]
 _PAINTED = [row.name for row in PROPERTIES if row.interpolation]
 _PROPOSAL = ("surfaceStretchStiffness", "surfaceShearStiffness", "surfaceBendStiffness", "density", "surfaceThickness")
+_PROPOSAL += ("youngsModulus", "poissonsRatio")
 _INTERPOLATIONS = ("constant", "uniform", "vertex", "varying", "faceVarying", "", "nonsense")
 
 
