@@ -1,4 +1,4 @@
-"""Without the wheels that Linux on ARM has none of, the same cloth comes out."""
+"""Without cholespy, of which Linux on ARM has no wheel, the same cloth comes out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WITHOUT = """
 import sys
 class Missing:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("cholespy", "embreex"):
+        if name.partition(".")[0] == "cholespy":
             raise ModuleNotFoundError(f"no {name}", name=name)
 sys.meta_path.insert(0, Missing())
 from physgraph_usd.cli import main
