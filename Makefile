@@ -57,4 +57,5 @@ $(VENV)/.demo: pyproject.toml $(VENV)/.python
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.python
 	$(PIP) -e '.[dev]'
+	$(PIP) --upgrade --no-deps --target $(VENV)/pyblish 'pyblish-base>=1.8,<2'
 	@touch $@ $(VENV)/.demo

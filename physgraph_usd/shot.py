@@ -20,6 +20,7 @@ from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageErr
 from .farm import connected, shots_at_once
 from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
+from .integrate.metric import FACTOR
 from .lead_in import cages_walked
 from .mesh.lanes import start_warp
 from .options import RefineOptions, json_of
@@ -45,6 +46,7 @@ except ImportError:  # Windows has none.
     resource = None
 MOST_LANES = 4
 """Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
+SLOWER = "cholespy is not installed: matrices are factorised by scipy, which is slower"
 DEFAULTS = RefineOptions()
 Outcomes = Generator[Outcome, None, None]
 
@@ -135,7 +137,7 @@ def _run(
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
                 raise large
-            report.warn(*warnings)
+            report.warn(*warnings, *([] if FACTOR == "cholespy" else [SLOWER]))
             yield opened, report
     except PhysGraphError as error:
         report.error = str(error)

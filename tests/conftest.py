@@ -15,6 +15,8 @@ import torch
 from hypothesis import settings
 from shapes import check_shapes
 
+from physgraph_usd.mesh.lanes import start_warp
+
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 20
 
@@ -24,6 +26,12 @@ settings.load_profile("repeatable")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     # A shell's background jobs ignore it, and hand that on to the processes that tests interrupt.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warp() -> None:
+    """Start Warp, which a test of kernels alone would find asleep."""
+    start_warp()
 
 
 @pytest.fixture(autouse=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import runpy
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,8 @@ from shots import CLOTH, FAST, cloth_shot, faults, refine
 import physgraph_usd as pg
 
 PLUGINS = Path(__file__).resolve().parents[1] / "plugins"
+PYBLISH = Path(sys.prefix) / "pyblish"
+"""Where `make` installs pyblish-base: beside its own, it brings a package `tests` that would hide ours."""
 COARSE, FINE = 35, 117
 """Points of the sheet, and at level 1."""
 
@@ -69,9 +72,10 @@ class TestPublishHook:
 
 class TestPyblish:
     @pytest.fixture
-    def run(self, tmp_path: Path) -> Any:
+    def run(self, monkeypatch: pytest.MonkeyPatch) -> Any:
         """Publish with our plug-ins alone; the context, whose ``results`` say what became of each."""
-        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which hides our package tests")
+        monkeypatch.setattr(sys, "path", [*sys.path, str(PYBLISH)])
+        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which make test installs")
         util = importlib.import_module("pyblish.util")
         api.deregister_all_plugins()
         api.deregister_all_paths()

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import ipctk
 import numpy as np
 import pytest
 import torch
@@ -20,6 +19,7 @@ from physgraph_usd.contact.safe_move import Moved, safe_move
 from physgraph_usd.level import Level, build_levels
 from physgraph_usd.mesh.topology import PolygonMesh
 
+ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
 EDGE = 0.02
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 Wish = Callable[[np.ndarray, np.random.Generator], np.ndarray]

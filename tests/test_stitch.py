@@ -283,6 +283,19 @@ class TestClips:
         assert compared > 8
         assert clips.GetAttributeAtPath(f"{CLOTH}.points").GetTimeSamples() == list(TIMES)
 
+    def test_validate_checks_what_the_clips_play(self, runs: Runs, tmp_path: Path):
+        copies = [tmp_path / chunk.name for chunk in runs.chunks]
+        for chunk, copy in zip(runs.chunks, copies, strict=True):
+            Sdf.Layer.FindOrOpen(str(chunk)).Export(str(copy))
+        stitch(copies, tmp_path / "clips.usda", clips=True)
+        assert faults(tmp_path / "clips.usda", runs.shot) == []
+        broken = Sdf.Layer.FindOrOpen(str(copies[2]))
+        points = broken.QueryTimeSample(f"{CLOTH}.points", 30.0)
+        broken.SetTimeSample(f"{CLOTH}.points", 30.0, list(points)[:-1])
+        broken.Save()
+        found = validate_layer(tmp_path / "clips.usda", runs.shot)
+        assert {(each.rule, each.time) for each in found if each.severity == "error"} >= {("points", 30.0)}
+
     def test_of_garments_that_not_every_chunk_has(self, odd_shot: Path, tmp_path: Path):
         chunks = refine_chunks(odd_shot, tmp_path, [(1.0, 3.0), (4.0, 7.0), (8.0, 8.0)], temporal="off")
         stitch(chunks, tmp_path / "joined.usdc")

@@ -9,7 +9,20 @@ from __future__ import annotations
 import click
 
 from ..version import __version__
-from .commands import chart, inspect, preview, report_schema, sample, schema_path, stitch, tag, train, tune, validate
+from .commands import (
+    chart,
+    inspect,
+    preview,
+    report_schema,
+    sample,
+    schema_path,
+    stitch,
+    tag,
+    train,
+    tune,
+    validate,
+    warm_up,
+)
 from .refine import refine
 from .structure import Commands
 
@@ -33,5 +46,6 @@ for command in (
     train,
     schema_path,
     report_schema,
+    warm_up,
 ):
     main.add_command(command)

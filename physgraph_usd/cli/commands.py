@@ -201,6 +201,20 @@ def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
     click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))
 
 
+@click.command("warm-up")
+@click.option("--device", default="cpu", metavar="cpu|cuda", help="Where to compute.")
+def warm_up(device: str) -> None:
+    """Compile all kernels ahead of the first refine, as for an image of a farm's machines.
+
+    They are kept in the folder that WARP_CACHE_PATH names, by default in the user's cache.
+    """
+    from ..mesh.lanes import compile_kernels
+    from ..shot import prepare_device
+
+    prepare_device(device)
+    compile_kernels(device)
+
+
 @click.command("report-schema")
 @click.argument("name", type=click.Choice(["report", "summary"]), default="report")
 def report_schema(name: str) -> None:

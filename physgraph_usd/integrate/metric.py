@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Bool, Float
+from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..mesh.stencil import add_at
 from .base import Solver
 from .multifrontal import DissectedSolver, Elimination
 
+try:
+    import cholespy
+except ImportError:  # Linux on ARM has no wheel.
+    cholespy = None
+
+FACTOR = "scipy" if cholespy is None else "cholespy"
+"""Whose factors are used on the CPU."""
 REGULARISATION = 1e-7
 """Added to the diagonal, relative to its mean: keeps loose parts without a guide definite."""
 
@@ -176,17 +184,29 @@ class HostFactors:
         """The solve of scale * couplings + diagonal."""
         if not len(diagonal):
             return torch.empty_like
-        coo = sp.coo_matrix(scale * self._couplings + sp.diags(diagonal.numpy()))
-        kind = CholeskySolverD if self._dtype == torch.float64 else CholeskySolverF
-        rows, columns = (torch.as_tensor(of.astype(np.int32)) for of in (coo.row, coo.col))
-        solver = kind(len(diagonal), rows, columns, torch.as_tensor(coo.data), MatrixType.COO)
+        matrix = sp.coo_matrix(scale * self._couplings + sp.diags(diagonal.numpy()))
+        return _of_scipy(matrix) if cholespy is None else _of_cholespy(cholespy, matrix, self._dtype)
 
-        def solve(force: Tensor) -> Tensor:
-            out = torch.empty_like(force)
-            solver.solve(force.contiguous(), out)
-            return out
 
-        return solve
+def _of_cholespy(module: Any, matrix: sp.coo_matrix, dtype: torch.dtype) -> Solver:
+    """The solve by a Cholesky factor."""
+    kind = module.CholeskySolverD if dtype == torch.float64 else module.CholeskySolverF
+    rows, columns = (torch.as_tensor(of.astype(np.int32)) for of in (matrix.row, matrix.col))
+    solver = kind(matrix.shape[0], rows, columns, torch.as_tensor(matrix.data), module.MatrixType.COO)
+
+    def solve(force: Tensor) -> Tensor:
+        out = torch.empty_like(force)
+        solver.solve(force.contiguous(), out)
+        return out
+
+    return solve
+
+
+def _of_scipy(matrix: sp.coo_matrix) -> Solver:
+    """The solve by an LU factor without pivoting, which a positive definite matrix does not need."""
+    options = {"SymmetricMode": True}
+    factor = splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return lambda force: torch.as_tensor(factor.solve(force.double().numpy()), dtype=force.dtype)
 
 
 class DeviceFactors:

@@ -35,6 +35,12 @@ def start_warp() -> None:
         wp.init()
 
 
+def compile_kernels(device: str) -> None:
+    """Compile all kernels of modules that are imported; Warp keeps them for every later process."""
+    start_warp()
+    wp.force_load(device)
+
+
 @contextmanager
 def _stderr_to_nowhere() -> Iterator[None]:
     """Keep off the terminal what C code prints; does nothing in a program that has no standard error."""

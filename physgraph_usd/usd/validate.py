@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdUtils
 
 from ..errors import LayerError
 from . import layer_rules
@@ -42,6 +42,7 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
     lost = isinstance(below, str) and shot is None and not is_there(below)
     view = None if lost else _view(below)
     with pxr_errors(f"cannot read {layer} over {below}", LayerError):
+        opened = _played(opened)
         problems = check_layer(opened, view)
         if lost:
             said = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
@@ -132,6 +133,21 @@ def _open(path: str | Path) -> Sdf.Layer:
     if not layer:
         raise LayerError(f"cannot read {path}")
     return layer
+
+
+def _played(layer: Sdf.Layer) -> Sdf.Layer:
+    """A layer that `stitch --clips` wrote, with what its clips play as samples of its own; any other as it is."""
+    stage = Usd.Stage.Open(layer) if "chunks" in (read_record(layer) or {}) and layer.subLayerPaths else None
+    moving = [prim for prim in stage.TraverseAll() if prim.HasAuthoredMetadata("clips")] if stage else []
+    if stage is None or not moving:
+        return layer
+    whole = UsdUtils.FlattenLayerStack(stage)
+    for prim in moving:
+        whole.GetPrimAtPath(prim.GetPath()).ClearInfo("clips")
+        for attribute in prim.GetAuthoredAttributes():
+            for time in attribute.GetTimeSamples():
+                whole.SetTimeSample(attribute.GetPath(), time, attribute.Get(time))
+    return whole
 
 
 def _view(shot: str | Path | Usd.Stage | None) -> StageView | None:

@@ -1,0 +1,25 @@
+"""Kernels are compiled once, ahead of the first run."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from shots import cloth_shot, command
+
+
+@pytest.mark.slow
+def test_after_warm_up_the_first_refine_compiles_nothing(tmp_path: Path) -> None:
+    cache, shot = tmp_path / "cache", cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0))
+    there = os.environ | {"WARP_CACHE_PATH": str(cache)}
+
+    def files() -> set[Path]:
+        return {file for file in cache.rglob("*") if file.is_file()}
+
+    assert command("warm-up", env=there).returncode == 0
+    compiled = files()
+    assert len(compiled) > 10
+    done = command("refine", shot, "-o", tmp_path / "out.usdc", "--level", "1", env=there)
+    assert done.returncode == 0, done.stderr
+    assert files() == compiled
