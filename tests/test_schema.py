@@ -105,10 +105,10 @@ def test_an_editor_shows_what_refining_takes_or_nothing(prims: dict[str, Usd.Pri
 @pytest.mark.parametrize("row", [row for row in PROPERTIES if row.soft])
 def test_limits_reach_usd_where_it_knows_them(prims: dict[str, Usd.Prim], row: Property) -> None:
     attribute = prims[row.schema].GetAttribute(row.name)
-    hard_limits = getattr(attribute, "GetHardLimits", None)
-    if hard_limits is None:
+    hard_limits, soft_limits = (getattr(attribute, name, None) for name in ("GetHardLimits", "GetSoftLimits"))
+    if hard_limits is None or soft_limits is None:
         pytest.skip("limits are native from USD 25.11")
-    for limits, ends in ((hard_limits(), (row.minimum, row.maximum)), (attribute.GetSoftLimits(), row.soft)):
+    for limits, ends in ((hard_limits(), (row.minimum, row.maximum)), (soft_limits(), row.soft or ())):
         written = {"minimum": limits.GetMinimum(), "maximum": limits.GetMaximum()}
         for value, end in zip(written.values(), ends, strict=True):
             own = list(value) if row.interpolation else value
