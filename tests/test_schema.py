@@ -27,6 +27,7 @@ from physgraph_usd.usd.schema import (
     schema_path,
 )
 from physgraph_usd.usd.schema_files import attribute_table, schema_files
+from physgraph_usd.usd.tag import fabric_values
 
 TYPES = {GARMENT_API: UsdGeom.Mesh, COLLIDER_API: UsdGeom.Sphere, MATERIAL_API: UsdShade.Material}
 
@@ -68,6 +69,7 @@ def test_every_row_is_what_the_registered_schema_says(prims: dict[str, Usd.Prim]
     assert not attribute.HasAuthoredValue()
     if row.interpolation:
         assert UsdGeom.Primvar(attribute).GetInterpolation() == row.interpolation
+    assert (attribute.GetDisplayName(), attribute.GetDisplayGroup()) == (row.label, row.group)
     said = attribute.GetDocumentation()
     assert ("Where nothing gives it" in said) == (row.fallback is not None)
 
@@ -100,15 +102,37 @@ def test_an_editor_shows_what_refining_takes_or_nothing(prims: dict[str, Usd.Pri
         assert shown is not None or "cloth" not in givers, row.name
 
 
-@pytest.mark.parametrize("row", [row for row in PROPERTIES if row.minimum is not None and not row.interpolation])
+@pytest.mark.parametrize("row", [row for row in PROPERTIES if row.soft])
 def test_limits_reach_usd_where_it_knows_them(prims: dict[str, Usd.Prim], row: Property) -> None:
     attribute = prims[row.schema].GetAttribute(row.name)
-    hard_limits = getattr(attribute, "GetHardLimits", None)
-    if hard_limits is None:
+    hard_limits, soft_limits = (getattr(attribute, name, None) for name in ("GetHardLimits", "GetSoftLimits"))
+    if hard_limits is None or soft_limits is None:
         pytest.skip("limits are native from USD 25.11")
-    limits = hard_limits()
-    assert limits.GetMinimum() == pytest.approx(row.minimum)
-    assert limits.GetMaximum() == (None if row.maximum is None else pytest.approx(row.maximum))
+    for limits, ends in ((hard_limits(), (row.minimum, row.maximum)), (soft_limits(), row.soft or ())):
+        written = {"minimum": limits.GetMinimum(), "maximum": limits.GetMaximum()}
+        for value, end in zip(written.values(), ends, strict=True):
+            own = list(value) if row.interpolation else value
+            assert own == (None if end is None else pytest.approx([end] if row.interpolation else end))
+        assert limits.Validate({key: value for key, value in written.items() if value is not None})
+
+
+@pytest.mark.parametrize("row", PROPERTIES, ids=lambda row: f"{row.schema}.{row.name}")
+def test_every_number_has_a_range_for_sliders_inside_its_limits(row: Property) -> None:
+    assert row.label
+    assert row.group
+    assert (row.soft is None) == (row.type in {"bool", "rel", "token"})
+    if row.soft is not None:
+        low, high = row.soft
+        assert low < high
+        assert row.minimum is None or low >= row.minimum
+        assert row.maximum is None or high <= row.maximum
+
+
+def test_presets_lie_within_soft_limits() -> None:
+    for fabric in PRESETS.values():
+        for name, value in fabric_values(fabric).items():
+            low, high = GARMENT[name].soft or (0.0, 0.0)
+            assert low <= value <= high, name
 
 
 def test_schemas_apply_only_where_they_belong(prims: dict[str, Usd.Prim]) -> None:

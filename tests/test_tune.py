@@ -287,7 +287,7 @@ def test_the_page_in_a_browser(tmp_path: Path):
         settled = shown.get_by_text("settled: as refine solves it")
         settled.wait_for(timeout=30000)
         before, at_first = picture(), points(session.solve())
-        row = shown.locator(".value", has_text="Follow the animation")
+        row = shown.locator(".value", has_text="Guide Stiffness")
         slider = row.locator("xpath=../following-sibling::div[1]").get_by_role("slider")
         box = slider.bounding_box()
         shown.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)

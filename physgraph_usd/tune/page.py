@@ -16,7 +16,7 @@ import viser
 
 from ..errors import PhysGraphError
 from ..fabric import PRESETS
-from ..usd.schema import GARMENT
+from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
 from .figures import figures
 from .loop import SolveLoop
 from .picture import PLAIN, SHOWS, Picture
@@ -33,8 +33,6 @@ div:has(> .value) + div .mantine-NumberInput-root, div:has(> .value) + div .mant
 div:has(> .value) + div > .mantine-Flex-root > div:first-child {display: none}
 </style>"""
 """Under a value written out a slider fills its row: its own number is a place on a logarithmic scale."""
-MOST_SUBDIVISIONS = 4
-"""Levels offered; the schema's most makes a thousand faces of one."""
 
 
 class TunePage:
@@ -99,10 +97,9 @@ class TunePage:
         gui.add_html(STYLE)
         self._state = gui.add_html(_badge("opening …", WORKING))
         self._build_view()
-        with gui.add_folder("Fabric"):
-            self._build_values()
-        with gui.add_folder("Solve"):
-            self._build_solve()
+        for group in dict.fromkeys(tunable.group for tunable in TUNABLES.values()):
+            with gui.add_folder(group):
+                self._build_group(group)
         with gui.add_folder("Figures"):
             self._figures = gui.add_html("")
         save = gui.add_button("Save layer", hint="Writes the values as a layer, as physgraph-usd tag does.")
@@ -127,12 +124,18 @@ class TunePage:
         colors = gui.add_dropdown("Painted map", (PLAIN, *PAINTED), initial_value=PLAIN)
         colors.on_update(lambda event: self._ask(event, lambda _: setattr(self._picture, "map", colors.value)))
 
-    def _build_values(self) -> None:
-        """The fabric's presets, and a slider for each value."""
+    def _build_group(self, group: str) -> None:
+        """A slider for each value of a display group, after what else belongs there."""
         gui = self._server.gui
-        self._preset = gui.add_dropdown("Preset", (AS_AUTHORED, OWN, *sorted(PRESETS)), initial_value=AS_AUTHORED)
-        self._preset.on_update(lambda event: self._ask(event, self._set_preset))
-        for tunable in TUNABLES.values():
+        if group == FABRIC:
+            self._preset = gui.add_dropdown("Preset", (AS_AUTHORED, OWN, *sorted(PRESETS)), initial_value=AS_AUTHORED)
+            self._preset.on_update(lambda event: self._ask(event, self._set_preset))
+        elif group == REFINEMENT:
+            self._build_level()
+        elif group == CONTACT:
+            contact = gui.add_checkbox("Contact", True, hint="With bodies and of cloth with cloth.")
+            contact.on_update(lambda event: self._ask(event, lambda own: own.set_contact(contact.value)))
+        for tunable in (each for each in TUNABLES.values() if each.group == group):
             text = gui.add_html("")
             hint = f"{GARMENT[tunable.name].name}: {GARMENT[tunable.name].doc}"
             slider = gui.add_slider(" ", 0.0, 1.0, FINEST, 0.5, hint=hint)
@@ -140,13 +143,12 @@ class TunePage:
             self._sliders[tunable.name] = text, slider
             self._write_value(tunable, text, slider)
 
-    def _build_solve(self) -> None:
-        """Level and contact."""
-        gui, session = self._server.gui, self._session
-        level = gui.add_slider("Subdivisions", 0, MOST_SUBDIVISIONS, 1, min(session.levels[0], MOST_SUBDIVISIONS))
+    def _build_level(self) -> None:
+        row, level_now = GARMENT["refine:level"], self._session.levels[0]
+        hint = f"{row.name}: {row.doc}"
+        most = max(row.soft or (0, level_now))
+        level = self._server.gui.add_slider(row.label, 0, int(most), 1, min(level_now, int(most)), hint=hint)
         level.on_update(lambda event: self._ask(event, lambda own: own.set_level(self._garment, int(level.value))))
-        contact = gui.add_checkbox("Contact", True, hint="With bodies and of cloth with cloth.")
-        contact.on_update(lambda event: self._ask(event, lambda own: own.set_contact(contact.value)))
 
     def _choose(self, garment: str) -> None:
         self._garment, self._follow = garment, True
@@ -176,7 +178,7 @@ class TunePage:
         value = self._session.value(self._garment, tunable.name)
         text.content = _row(tunable.label, tunable.said(value))
         if slider is not None:
-            slider.value = tunable.place(value if value is not None else tunable.low)
+            slider.value = tunable.place(value if value is not None else tunable.ends[0])
 
     def _save(self, session: TuneSession) -> None:
         written = session.save()

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame
+from ..usd.schema import GARMENT
 
 
 @dataclass(frozen=True)
@@ -18,22 +19,32 @@ class Tunable:
 
     Attributes:
         name: The schema's short name.
-        label: What artists call it.
         unit: Unit shown.
         factor: Times the SI value, it is the number shown.
-        low, high: The slider's ends, SI.
         read: Finds the value [SI] in a frame; None where nothing gives one.
         decades: Whether the slider is logarithmic.
     """
 
     name: str
-    label: str
     unit: str
     factor: float
-    low: float
-    high: float
     read: Callable[[GarmentFrame], float | None]
     decades: bool = True
+
+    @property
+    def label(self) -> str:
+        """The schema's display name."""
+        return GARMENT[self.name].label
+
+    @property
+    def group(self) -> str:
+        """The schema's display group."""
+        return GARMENT[self.name].group
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The slider's ends, SI: the schema's soft limits."""
+        return GARMENT[self.name].soft or (0.0, 1.0)
 
     def said(self, value: float | None) -> str:
         """A value as the page writes it."""
@@ -41,28 +52,27 @@ class Tunable:
 
     def place(self, value: float) -> float:
         """Where a value is on the slider, 0 to 1; values beyond its ends are at them."""
-        ends = self.low, self.high, value
-        low, high, at = np.log10(np.maximum(ends, 1e-12)) if self.decades else ends
+        numbers = (*self.ends, value)
+        low, high, at = np.log10(np.maximum(numbers, 1e-12)) if self.decades else numbers
         return float(np.clip((at - low) / (high - low), 0.0, 1.0))
 
     def at(self, place: float) -> float:
         """The value [SI] at a place on the slider."""
-        if self.decades:
-            return self.low * (self.high / self.low) ** place
-        return self.low + (self.high - self.low) * place
+        low, high = self.ends
+        return low * (high / low) ** place if self.decades else low + (high - low) * place
 
 
 TUNABLES: dict[str, Tunable] = {
     each.name: each
     for each in (
-        Tunable("stretchStiffness", "Stretch", "N/m", 1.0, 1.0, 1e4, lambda f: f.fabric.stretch),
-        Tunable("shearStiffness", "Shear", "N/m", 1.0, 0.1, 1e4, lambda f: f.fabric.shear),
-        Tunable("bendStiffness", "Bending", "µN·m", 1e6, 1e-7, 1e-2, lambda f: f.fabric.bend),
-        Tunable("density", "Density", "g/m²", 1e3, 0.01, 2.0, lambda f: f.fabric.density),
-        Tunable("thickness", "Thickness", "mm", 1e3, 1e-4, 1e-2, lambda f: f.fabric.thickness),
-        Tunable("guide:stiffness", "Follow the animation", "N/m³", 1.0, 10.0, 1e6, lambda f: f.guide),
-        Tunable("refine:detail", "Detail", "", 1.0, 0.0, 2.0, lambda f: f.detail, decades=False),
-        Tunable("contact:offset", "Distance from bodies", "mm", 1e3, 1e-4, 3e-2, lambda f: f.offset),
+        Tunable("stretchStiffness", "N/m", 1.0, lambda f: f.fabric.stretch),
+        Tunable("shearStiffness", "N/m", 1.0, lambda f: f.fabric.shear),
+        Tunable("bendStiffness", "µN·m", 1e6, lambda f: f.fabric.bend),
+        Tunable("density", "g/m²", 1e3, lambda f: f.fabric.density),
+        Tunable("thickness", "mm", 1e3, lambda f: f.fabric.thickness),
+        Tunable("guide:stiffness", "N/m³", 1.0, lambda f: f.guide),
+        Tunable("refine:detail", "", 1.0, lambda f: f.detail, decades=False),
+        Tunable("contact:offset", "mm", 1e3, lambda f: f.offset),
     )
 }
 """Every value that can be tuned, by the schema's short name, in the page's order."""

@@ -25,6 +25,7 @@ from .apart import read_apart
 from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
+from .limits import beyond_limits_of_all
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .materials import find_values
 from .placement import to_metres
@@ -230,6 +231,7 @@ def open_shot(
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
         notices += unread([*prims, *found])
+        notices += [Notice(path, None, said) for path, said in dict.fromkeys(beyond_limits_of_all(prims, found))]
         units, odd = read_units(stage)
         assumed = root_metadata(stage, "metersPerUnit") is None
         prims = [

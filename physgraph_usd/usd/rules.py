@@ -14,6 +14,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ..mesh.topology import PolygonMesh
 from .heat import HEAT, PREFIX
+from .limits import beyond_limits
 from .normals import VertexNormals
 from .overs import EMPTIED
 from .primvars import STALE
@@ -311,6 +312,12 @@ def skinning(fine: Fine) -> Iterator[Problem]:
             yield fine.problem(name, "still holds influences; the mesh would be skinned twice")
 
 
+def limits(fine: Fine) -> Iterator[Problem]:
+    """The garment's values are inside their limits; told only, for the cloth is solved already."""
+    for attribute, said, _ in beyond_limits(fine.prim):
+        yield Problem("warning", str(attribute.GetPath()), None, said, "")
+
+
 RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
     opinions_together,
     topology,
@@ -323,4 +330,5 @@ RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
     leftovers,
     velocities,
     skinning,
+    limits,
 )

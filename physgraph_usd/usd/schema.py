@@ -1,7 +1,8 @@
 """The codeless schemas: one table of every attribute, and where their files are.
 
 Everything reads attributes by the names in this table, so it also works where the schemas are not registered.
-``schemas/`` is written from it by ``python -m physgraph_usd.usd.schema_files``. pxr is imported only to register.
+``schemas/physgraph_usd_schemas/`` is written from it by ``python -m physgraph_usd.usd.schema_files``. pxr is imported
+only to register.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ AUTO_LEVEL = -1
 
 SI = " SI, whatever the stage's metersPerUnit."
 """End of the doc of every property that has a unit."""
+REFINEMENT, FABRIC, CONTACT, PAINTED, COLLISION = "Refinement", "Fabric", "Contact", "Painted Maps", "Collider"
+"""Display groups."""
 _JERSEY = PRESETS["jersey"]
 
 
@@ -43,6 +46,10 @@ class Property:
         maximum: Greatest value allowed, or None. The stiffest preset is some hundred times the softest; paint may go a
             hundred times farther.
         doc: What it is, for the schema's documentation.
+        label: Display name.
+        group: Display group.
+        soft: Ends of the range in which artists work, for sliders; None for what is no number. A value beyond them is
+            taken, with a warning.
         uniform: Whether it cannot be animated.
         interpolation: Of a primvar, else "".
         tokens: Words that a token may be.
@@ -56,6 +63,9 @@ class Property:
     minimum: float | None
     maximum: float | None
     doc: str
+    label: str
+    group: str
+    soft: tuple[float, float] | None = None
     uniform: bool = False
     interpolation: str = ""
     tokens: tuple[str, ...] = ()
@@ -73,75 +83,115 @@ def _short(name: str) -> str:
 def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     """Rows of the fabric values; what a material leaves out is the garment's to take from elsewhere."""
 
-    def row(name: str, fallback: float | None, unit: str, minimum: float, doc: str) -> Property:
-        return Property(
-            schema, MATERIAL + name, "float", fallback if fallbacks else None, unit, minimum, None, doc + SI
-        )
+    def row(
+        name: str, label: str, fallback: float | None, *, unit: str, least: float, soft: tuple[float, float], doc: str
+    ) -> Property:
+        taken = fallback if fallbacks else None
+        return Property(schema, MATERIAL + name, "float", taken, unit, least, None, doc + SI, label, FABRIC, soft)
 
     return (
-        row("stretchStiffness", _JERSEY.stretch, "N/m", 1e-3, "In-plane stiffness E h: Young's modulus of the sheet."),
-        row("shearStiffness", None, "N/m", 0.0, "Shear stiffness G h; authoring it selects the triangle membrane."),
-        row("bendStiffness", _JERSEY.bend, "N m", 0.0, "Bending stiffness E h^3 / 12 (1 - nu^2)."),
-        row("density", _JERSEY.density, "kg/m^2", 1e-4, "Mass per area."),
-        row("thickness", _JERSEY.thickness, "m", 1e-6, "Thickness of the cloth."),
+        row(
+            "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, unit="N/m", least=1e-3, soft=(1.0, 1e4),
+            doc="In-plane stiffness E h: Young's modulus of the sheet.",
+        ),
+        row(
+            "shearStiffness", "Shear Stiffness", None, unit="N/m", least=0.0, soft=(0.1, 1e4),
+            doc="Shear stiffness G h; authoring it selects the triangle membrane.",
+        ),
+        row(
+            "bendStiffness", "Bending Stiffness", _JERSEY.bend, unit="N m", least=0.0, soft=(1e-7, 1e-2),
+            doc="Bending stiffness E h^3 / 12 (1 - nu^2).",
+        ),
+        row(
+            "density", "Density", _JERSEY.density, unit="kg/m^2", least=1e-4, soft=(0.01, 2.0), doc="Mass per area.",
+        ),
+        row(
+            "thickness", "Thickness", _JERSEY.thickness, unit="m", least=1e-6, soft=(1e-4, 1e-2),
+            doc="Thickness of the cloth.",
+        ),
+    )  # fmt: skip
+
+
+def _scale(name: str, label: str, fallback: float, *, most: float, soft: float, doc: str) -> Property:
+    """Row of a painted map, whose values artists choose from 0 to ``soft``."""
+    full = f"primvars:{NAMESPACE}{name}"
+    return Property(
+        GARMENT_API, full, "float[]", fallback, "", 0.0, most, doc, label, PAINTED, (0.0, soft), interpolation="vertex"
     )
 
 
-def _scale(name: str, fallback: float, maximum: float, doc: str) -> Property:
-    full = f"primvars:{NAMESPACE}{name}"
-    return Property(GARMENT_API, full, "float[]", fallback, "", 0.0, maximum, doc, interpolation="vertex")
-
-
 PROPERTIES: tuple[Property, ...] = (
-    Property(GARMENT_API, "physgraph:enabled", "bool", True, "", None, None, "Whether to refine this garment.", True),
+    Property(
+        GARMENT_API, "physgraph:enabled", "bool", True, "", None, None, "Whether to refine this garment.",
+        "Refine", REFINEMENT, uniform=True,
+    ),
     Property(
         GARMENT_API, "physgraph:refine:level", "int", 2, "", -1, 5,
-        "Number of subdivisions; -1 chooses it from the buckling wavelength.", True,
+        "Number of subdivisions; -1 chooses it from the buckling wavelength.",
+        "Subdivisions", REFINEMENT, (-1, 4), uniform=True,
     ),
-    Property(GARMENT_API, "physgraph:refine:detail", "float", 1.0, "", 0.0, 2.0, "Gain of the added detail."),
+    Property(
+        GARMENT_API, "physgraph:refine:detail", "float", 1.0, "", 0.0, 2.0, "Gain of the added detail.",
+        "Detail", REFINEMENT, (0.0, 2.0),
+    ),
     *_material(GARMENT_API, fallbacks=True),
     Property(
         GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, None,
         "How firmly the mean of the fine cloth follows the coarse animation." + SI,
+        "Guide Stiffness", REFINEMENT, (10.0, 1e6),
     ),
     Property(
         GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, None,
-        "Distance kept from colliders." + SI,
+        "Distance kept from colliders." + SI, "Contact Offset", CONTACT, (1e-4, 3e-2),
     ),
     Property(
         GARMENT_API, "physgraph:contact:selfCollision", "bool", True, "", None, None,
-        "Whether the garment collides with itself.", True,
+        "Whether the garment collides with itself.", "Self-Collision", CONTACT, uniform=True,
     ),
     Property(
         GARMENT_API, "physgraph:contact:layer", "int", None, "", None, None,
-        "Order among garments: lower is nearer to the body; garments with equal or no layer are not ordered.", True,
+        "Order among garments: lower is nearer to the body; garments with equal or no layer are not ordered.",
+        "Layer", CONTACT, (-10, 10), uniform=True,
     ),
     Property(
         GARMENT_API, "physgraph:colliders", "rel", None, "", None, None,
-        "Colliders of this garment; empty means every collider prim on the stage.",
+        "Colliders of this garment; empty means every collider prim on the stage.", "Colliders", CONTACT,
     ),
     Property(
         GARMENT_API, "physgraph:contact:exclude", "rel", None, "", None, None,
         "Colliders and garments that this garment never touches: prims, prims above them, or collections.",
+        "Excluded Prims", CONTACT,
     ),
-    _scale("stretchScale", 1.0, 1e4, "Painted multiplier of the stretch stiffness; vertex or constant."),
-    _scale("bendScale", 1.0, 1e4, "Painted multiplier of the bending stiffness; vertex or constant."),
-    _scale("detailScale", 1.0, 10.0, "Painted multiplier of the added detail; vertex or constant."),
-    _scale("guideScale", 1.0, 1e4, "Painted multiplier of the guide stiffness; vertex or constant."),
-    _scale("pin", 0.0, 1.0, "1 where the fine cloth follows the coarse cloth exactly."),
+    _scale(
+        "stretchScale", "Stretch Stiffness Scale", 1.0, most=1e4, soft=10.0,
+        doc="Painted multiplier of the stretch stiffness; vertex or constant.",
+    ),
+    _scale(
+        "bendScale", "Bending Stiffness Scale", 1.0, most=1e4, soft=10.0,
+        doc="Painted multiplier of the bending stiffness; vertex or constant.",
+    ),
+    _scale(
+        "detailScale", "Detail Scale", 1.0, most=10.0, soft=2.0,
+        doc="Painted multiplier of the added detail; vertex or constant.",
+    ),
+    _scale(
+        "guideScale", "Guide Stiffness Scale", 1.0, most=1e4, soft=10.0,
+        doc="Painted multiplier of the guide stiffness; vertex or constant.",
+    ),
+    _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 where the fine cloth follows the coarse cloth exactly."),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
-        "Whether garments collide with this prim.", True,
+        "Whether garments collide with this prim.", "Collide", COLLISION, uniform=True,
     ),
     Property(
         COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None,
-        "Distance kept from this collider, added to the garment's." + SI,
+        "Distance kept from this collider, added to the garment's." + SI, "Collider Offset", COLLISION, (0.0, 3e-2),
     ),
     Property(
         COLLIDER_API, "physgraph:collider:side", "token", "auto", "", None, None,
         "Where cloth belongs: auto, outside closed parts and where the coarse cloth is at open ones; winding, outside "
         "by the winding number; start, where the coarse cloth is; front or back, that side of the faces of open parts.",
-        True, tokens=SIDES,
+        "Side", COLLISION, uniform=True, tokens=SIDES,
     ),
     *_material(MATERIAL_API, fallbacks=False),
 )  # fmt: skip
@@ -183,7 +233,7 @@ def schema_path() -> Path:
     """Folder that holds plugInfo.json, for PXR_PLUGINPATH_NAME: in the installed package or beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "schemas"
-    return inside if (inside / "plugInfo.json").exists() else package.parent / "schemas"
+    return inside if (inside / "plugInfo.json").exists() else package.parent / "schemas" / "physgraph_usd_schemas"
 
 
 def register() -> None:

@@ -1,4 +1,4 @@
-"""Writes the files in ``schemas/`` from the table in ``schema.py``.
+"""Writes the files in ``schemas/physgraph_usd_schemas/`` from the table in ``schema.py``.
 
     python -m physgraph_usd.usd.schema_files [FOLDER]
 
@@ -11,7 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-from .schema import COLLIDER_API, GARMENT_API, MATERIAL_API, PROPERTIES, SI, Property, schema_path
+from .schema import COLLIDER_API, GARMENT_API, MATERIAL, MATERIAL_API, PROPERTIES, SI, Property, schema_path
 
 APPLIES_TO = {GARMENT_API: ["Mesh"], COLLIDER_API: ["Mesh", "Gprim"], MATERIAL_API: ["Material"]}
 """Prim types that each schema can be applied to."""
@@ -49,29 +49,33 @@ def _otherwise(row: Property) -> str:
 
 
 def _limits(row: Property) -> str:
-    """The values allowed, in usda."""
+    """The values allowed, and those that artists work with, in usda."""
     if row.tokens:
         return f"        allowedTokens = [{', '.join(_number(row, token) for token in row.tokens)}]\n"
-    bounds = {"minimum": row.minimum, "maximum": row.maximum}
-    kind = row.type.removesuffix("[]")
+    hard = _range(row, "hard", row.minimum, row.maximum)
+    soft = _range(row, "soft", *(row.soft or (None, None)))
+    return f"        limits = {{\n{hard}{soft}        }}\n" if hard or soft else ""
+
+
+def _range(row: Property, name: str, low: float | None, high: float | None) -> str:
+    """One dictionary of limits in usda; of an array they are arrays of one value each, as its type is."""
+    ends = {key: _number(row, value) for key, value in (("minimum", low), ("maximum", high)) if value is not None}
     lines = [
-        f"                {kind} {key} = {_number(row, value)}\n" for key, value in bounds.items() if value is not None
+        f"                {row.type} {key} = {f'[{end}]' if row.interpolation else end}\n" for key, end in ends.items()
     ]
-    inner = "".join(lines)
-    return (
-        f"        limits = {{\n            dictionary hard = {{\n{inner}            }}\n        }}\n" if lines else ""
-    )
+    return f"            dictionary {name} = {{\n{''.join(lines)}            }}\n" if lines else ""
 
 
 def _property(row: Property) -> str:
     """One property in usda, without a fallback: an editor would show it although something else gives the value."""
     otherwise = f" Where nothing gives it: {_otherwise(row)}." if _otherwise(row) else ""
     doc = f'        doc = "{row.doc}{f" [{row.unit}]" if row.unit else ""}{otherwise}"\n'
+    shown = f'        displayGroup = "{row.group}"\n        displayName = "{row.label}"\n'
     if row.type == "rel":
-        return f"    rel {row.name} (\n{doc}    )\n"
+        return f"    rel {row.name} (\n{shown}{doc}    )\n"
     kind = f"{'uniform ' if row.uniform else ''}{row.type}"
-    extra = f'        interpolation = "{row.interpolation}"\n' if row.interpolation else _limits(row)
-    return f"    {kind} {row.name} (\n{doc}{extra}    )\n"
+    painted = f'        interpolation = "{row.interpolation}"\n' if row.interpolation else ""
+    return f"    {kind} {row.name} (\n{shown}{doc}{painted}{_limits(row)}    )\n"
 
 
 def _class(schema: str, *, generated: bool) -> str:
@@ -85,7 +89,7 @@ def _class(schema: str, *, generated: bool) -> str:
 
 
 def schema_files() -> dict[str, str]:
-    """Text of every file in ``schemas/``, by file name."""
+    """Text of every schema file, by file name."""
     generated = "".join(_class(schema, generated=True) for schema in APPLIES_TO)
     source = "".join(_class(schema, generated=False) for schema in APPLIES_TO)
     kinds = {
@@ -109,27 +113,37 @@ def schema_files() -> dict[str, str]:
 
 def attribute_table() -> str:
     """Every property of the schemas as the table of docs/attributes.md."""
-    lines = ["| attribute | type | where nothing gives it | unit, limits | |", "|---|---|---|---|---|"]
-    for schema in APPLIES_TO:
-        lines.append(f"| **{schema}** | | | | |")
+    lines = [
+        "| attribute | display name | type | where nothing gives it | unit, limits | soft limits | |",
+        "|---" * 7 + "|",
+    ]
+    for schema in (GARMENT_API, COLLIDER_API):
+        lines.append(f"| **{schema}** | | | | | | |")
         lines += [_table_row(row) for row in PROPERTIES if row.schema == schema]
+    lines.append(f"| **{MATERIAL_API}** | | | | | | The `{MATERIAL}` values above, without a fallback. |")
     return "\n".join(lines) + "\n"
 
 
 def _table_row(row: Property) -> str:
     """One property as a line of Markdown."""
     kind = f"uniform {row.type}" if row.uniform else row.type
-    low, high = ("" if value is None else _number(row, value) for value in (row.minimum, row.maximum))
-    limits = f"{low} .. {high}".strip() if low or high else ", ".join(row.tokens)
-    unit = ", ".join(part for part in (row.unit, limits) if part)
-    return f"| `{row.name}` | {kind} | {_otherwise(row)} | {unit} | {row.doc.removesuffix(SI)} |"
+    unit = ", ".join(part for part in (row.unit, _ends(row, row.minimum, row.maximum) or ", ".join(row.tokens)) if part)
+    soft = _ends(row, *(row.soft or (None, None)))
+    said = row.doc.removesuffix(SI)
+    return f"| `{row.name}` | {row.label} | {kind} | {_otherwise(row)} | {unit} | {soft} | {said} |"
+
+
+def _ends(row: Property, low: float | None, high: float | None) -> str:
+    """A range in words, "" when it has no end."""
+    ends = ["" if value is None else _number(row, value) for value in (low, high)]
+    return " .. ".join(ends).strip() if any(ends) else ""
 
 
 def main(folder: Path | None = None) -> None:
     """Write the files.
 
     Args:
-        folder: Where to write; ``schemas/`` when None.
+        folder: Where to write; where `schema_path` finds them when None.
     """
     for name, text in schema_files().items():
         ((folder or schema_path()) / name).write_text(text, encoding="utf-8")

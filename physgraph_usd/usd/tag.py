@@ -7,12 +7,13 @@ from pathlib import Path
 
 from pxr import Sdf, Usd, UsdGeom
 
-from ..errors import StageError, UsageError
+from ..errors import SchemaError, StageError, UsageError
 from ..fabric import PRESETS, Fabric
 from ..sides import SIDES
 from .atomic import ASSET_PATHS, prepare_target
 from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .find import find_colliders, find_garments
+from .lookup import check_limits
 from .provenance import asset_path, export_layer
 from .schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, Property
 from .stage import open_stage
@@ -62,6 +63,7 @@ def tag(
     _check_word("asset path", asset_paths, ASSET_PATHS)
     if (layer is not None and not garments) or (side is not None and not colliders):
         raise UsageError("a layer is for garments and a side for colliders; name one")
+    _check_values(values or {}, layer)
     target = Path(out)
     check_suffix("the layer", target, LAYER_SUFFIXES)
     check_targets([("the layer", target)], files_of(shot))
@@ -91,6 +93,16 @@ def _check_word(what: str, word: str | None, known: Sequence[str]) -> None:
     """Refuse a word that is none of those known."""
     if word is not None and word not in known:
         raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(known)}")
+
+
+def _check_values(values: Mapping[str, Mapping[str, float]], layer: int | None) -> None:
+    """Refuse a value that refining would refuse."""
+    given = [(path, name, value) for path, own in values.items() for name, value in own.items()]
+    try:
+        for path, name, value in given + ([] if layer is None else [("/", "contact:layer", layer)]):
+            check_limits(GARMENT[name], value, f"<{path}>")
+    except SchemaError as error:
+        raise UsageError(str(error)) from error
 
 
 def _check_editable(prim: Usd.Prim) -> None:
