@@ -3,7 +3,9 @@
 A stiffness is the material's own (``physics:surfaceStretchStiffness`` and its relatives), or follows from Young's
 modulus E, Poisson's ratio nu and the thickness h of the mesh:
 
-    stretch = E h / (1 - nu^2),   shear = E h / (2 (1 + nu)),   bend = E h^3 / (12 (1 - nu^2))
+    stretch = E h,   shear = E h / (2 (1 + nu)),   bend = E h^3 / (12 (1 - nu^2))
+
+The proposal writes stretch = E h / (1 - nu^2), the stiffness of a strip whose width is held; ours is that of a free one.
 
 It follows from them where the material authors E or nu, or has ``PhysicsSurfaceDeformableMaterialAPI``; what is missing
 is then the proposal's fallback: 1e6 Pa, 0.3, 1 mm, 1000 kg/m^3. -inf means that a value is not given, and so does a
@@ -154,8 +156,9 @@ def _from_youngs(material: Usd.Prim, row: Property, thickness: Found | Derived, 
         sheet = youngs * float(thickness.at(time) or 0.0)
         if row.short == "shearStiffness":
             return sheet / (2 * (1 + nu))
-        bend = float(thickness.at(time) or 0.0) ** 2 / 12 if row.short == "bendStiffness" else 1.0
-        return sheet * bend / (1 - nu**2)
+        if row.short == "bendStiffness":
+            return sheet * float(thickness.at(time) or 0.0) ** 2 / (12 * (1 - nu**2))
+        return sheet
 
     source = source_name(own) if own is not None else f"<{material.GetPath()}>: fallback of {YOUNGS}, 1e6 Pa"
     animated = thickness.animated or any(each.ValueMightBeTimeVarying() for each in (own, ratio) if each is not None)
