@@ -5,7 +5,7 @@ modulus E, Poisson's ratio nu and the thickness h of the mesh:
 
     stretch = E h,   shear = E h / (2 (1 + nu)),   bend = E h^3 / (12 (1 - nu^2))
 
-The proposal writes stretch = E h / (1 - nu^2), the stiffness of a strip whose width is held; ours is that of a free one.
+The proposal writes stretch = E h / (1 - nu^2), of a strip whose width is held; ours is that of a free one.
 
 It follows from them where the material authors E or nu, or has ``PhysicsSurfaceDeformableMaterialAPI``; what is missing
 is then the proposal's fallback: 1e6 Pa, 0.3, 1 mm, 1000 kg/m^3. -inf means that a value is not given, and so does a
