@@ -24,12 +24,12 @@ pytestmark = NEEDS_BLENDER
 
 
 def make_shot(path: Path) -> Path:
-    """Coats whose values come from the prim, an ancestor, a material and one of the purpose physics; a body."""
+    """Coats whose values come from the prim, an ancestor, a material and two of the purpose physics; a body."""
     stage = new_stage(path, metres=0.01)
     UsdPhysics.SetStageKilogramsPerUnit(stage, 0.001)
-    for name in ("Denim", "Silk"):
+    for name in ("Denim", "Silk", "Voile"):
         add_sheet(stage, f"/World/{name}Rig/{name}").GetPrim().AddAppliedSchema("PhysGraphGarmentAPI")
-    denim, silk = (stage.GetPrimAtPath(f"/World/{name}Rig/{name}") for name in ("Denim", "Silk"))
+    denim, silk, voile = (stage.GetPrimAtPath(f"/World/{name}Rig/{name}") for name in ("Denim", "Silk", "Voile"))
     author(denim, MATERIAL + "bendStiffness", PRESETS["denim"].bend)
     author(denim, "physgraph:refine:level", 1, kind="int")
     author(denim, "physgraph:contact:selfCollision", False, kind="bool")
@@ -45,6 +45,10 @@ def make_shot(path: Path) -> Path:
     for name, value in (values | {"density": 83.0 * 1e-6 / 1e-3}).items():
         author(cloth.GetPrim(), f"physics:{name}", value)
     UsdShade.MaterialBindingAPI.Apply(silk).Bind(cloth, materialPurpose="physics")
+    namesake = UsdShade.Material.Define(stage, "/World/VoileRig/Looks/Cloth")
+    author(namesake.GetPrim(), "physics:surfaceStretchStiffness", 40.0 / 1e-3)
+    author(namesake.GetPrim(), "physics:surfaceBendStiffness", 0.4e-6 / (1e-3 * 1e-4))
+    UsdShade.MaterialBindingAPI.Apply(voile).Bind(namesake, materialPurpose="physics")
     body = UsdGeom.Mesh.Define(stage, "/World/Body")
     body.CreatePointsAttr([(0, 0, -90), (100, 0, -90), (0, 100, -90)])
     body.CreateFaceVertexCountsAttr([3])
@@ -85,14 +89,15 @@ def untouched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, dic
 
 def test_every_stiffness_is_what_it_was(untouched: tuple[Path, Path, dict[str, Any]]) -> None:
     before, after = garments(untouched[0]), garments(untouched[1])
-    assert set(before) == set(after) == {"Denim", "Silk"}, "found by their schema, on the export too"
+    assert set(before) == set(after) == {"Denim", "Silk", "Voile"}, "found by their schema, on the export too"
     for name, garment in before.items():
         values = {key: value for key, value in garment["fabric"].items() if value is not None}
         assert {key: after[name]["fabric"][key] for key in values} == pytest.approx(values, rel=1e-5)
         fallbacks = {key for key, source in garment["sources"].items() if source == "fallback"}
         assert {key for key, source in after[name]["sources"].items() if source == "fallback"} == fallbacks
         assert after[name]["level"] == garment["level"]
-    assert after["Silk"]["fabric"]["bend"] == pytest.approx(1.5e-6)
+    bends = [after[name]["fabric"]["bend"] for name in ("Silk", "Voile")]
+    assert bends == pytest.approx([1.5e-6, 0.4e-6]), "of two materials of one name"
     assert after["Denim"]["sources"]["stretchStiffness"].endswith(f"{MATERIAL}stretchStiffness")
 
 

@@ -7,6 +7,7 @@ and words are custom properties besides, which the artist may edit or delete.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 
 import bpy
@@ -216,12 +217,17 @@ def _scaled(value, factor: float):
 
 
 def _bind(relationship, target) -> None:
-    """Define the kept material of the purpose physics beside Blender's own, and bind it."""
+    """Define the kept material of the purpose physics beside Blender's own, and bind it.
+
+    Materials of one name may come from several places or files: each has its own values in its name, as a checksum.
+    """
     from pxr import UsdShade
 
     stage, material = target.GetStage(), relationship.GetStage().GetPrimAtPath(relationship.GetTargets()[0])
     root = stage.GetDefaultPrim().GetPath() if stage.GetDefaultPrim() else "/"
-    copy = UsdShade.Material.Define(stage, f"{str(root).rstrip('/')}/_physics_materials/{material.GetName()}")
+    said = sorted(f"{found.GetName()} {found.Get()}" for found in material.GetAuthoredAttributes())
+    name = f"{material.GetName()}_{zlib.crc32(' '.join(said).encode()):08x}"
+    copy = UsdShade.Material.Define(stage, f"{str(root).rstrip('/')}/_physics_materials/{name}")
     for name in material.GetPrimTypeInfo().GetAppliedAPISchemas():
         copy.GetPrim().AddAppliedSchema(name)
     for attribute in material.GetAuthoredAttributes():
