@@ -22,7 +22,7 @@ from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
 from .integrate.metric import FACTOR
 from .lead_in import cages_walked
-from .mesh.lanes import start_warp
+from .mesh.lanes import kernels_are_kept, start_warp
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
@@ -152,6 +152,8 @@ def _run(
 def _refine(opened: Shot, out: Path | None, options: RefineOptions, report: RefineReport) -> Layer | None:
     """Solve and write all frames; returns the layer where it is in memory."""
     began = clock.perf_counter()
+    if not kernels_are_kept():
+        LOG.info("kernels are compiled, once on this machine: some 15 s; physgraph-usd warm-up does it ahead")
     solver = _ShotSolver(opened.path, [garment["level"] for garment in report.garments], options)
     solver.adopt(opened)
     layer = _write_layer(opened, solver, out, options, report=report)

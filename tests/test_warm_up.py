@@ -17,9 +17,12 @@ def test_after_warm_up_the_first_refine_compiles_nothing(tmp_path: Path) -> None
     def files() -> set[Path]:
         return {file for file in cache.rglob("*") if file.is_file()}
 
+    told = command("refine", shot, "-o", tmp_path / "cold.usdc", "--level", "1", "-v", env=there)
+    assert "kernels are compiled" in told.stderr
     assert command("warm-up", env=there).returncode == 0
     compiled = files()
     assert len(compiled) > 10
-    done = command("refine", shot, "-o", tmp_path / "out.usdc", "--level", "1", env=there)
+    done = command("refine", shot, "-o", tmp_path / "out.usdc", "--level", "1", "-v", env=there)
     assert done.returncode == 0, done.stderr
+    assert "kernels are compiled" not in done.stderr
     assert files() == compiled

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from itertools import pairwise
+from pathlib import Path
 
 import torch
 import warp as wp
@@ -39,6 +40,13 @@ def compile_kernels(device: str) -> None:
     """Compile all kernels of modules that are imported; Warp keeps them for every later process."""
     start_warp()
     wp.force_load(device)
+
+
+def kernels_are_kept() -> bool:
+    """Whether some of our kernels were compiled for this user and version of Warp before."""
+    start_warp()
+    package = __name__.split(".", maxsplit=1)[0]
+    return any(Path(wp.config.kernel_cache_dir).glob(f"wp_{package}*"))
 
 
 @contextmanager
