@@ -46,7 +46,7 @@ def kernels_are_kept() -> bool:
     """Whether some of our kernels were compiled for this user and version of Warp before."""
     start_warp()
     package = __name__.split(".", maxsplit=1)[0]
-    return any(Path(wp.config.kernel_cache_dir).glob(f"wp_{package}*"))
+    return any(Path(wp.config.kernel_cache_dir or "").glob(f"wp_{package}*"))
 
 
 @contextmanager
