@@ -75,6 +75,7 @@ class TestPyblish:
     def run(self, monkeypatch: pytest.MonkeyPatch) -> Any:
         """Publish with our plug-ins alone; the context, whose ``results`` say what became of each."""
         monkeypatch.setattr(sys, "path", [*sys.path, str(PYBLISH)])
+        monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])  # It leaves an importer there that warns of others.
         api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which make test installs")
         util = importlib.import_module("pyblish.util")
         api.deregister_all_plugins()
