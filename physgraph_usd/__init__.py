@@ -27,12 +27,12 @@ if TYPE_CHECKING:
         UsageError,
     )
     from .fabric import PRESETS, Fabric
+    from .joined import stitch
     from .options import RefineOptions
     from .report import RefineReport
     from .shot import inspect_shot, refine_shot, refine_shots, refine_stage
     from .usd.reader import Shot, open_shot
     from .usd.schema import schema_path
-    from .usd.stitch import stitch
     from .usd.tag import tag
     from .usd.validate import validate_layer
 
@@ -76,7 +76,7 @@ _ROOMS = {
     "shot": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
     "usd.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
-    "usd.stitch": ("stitch",),
+    "joined": ("stitch",),
     "usd.tag": ("tag",),
     "usd.validate": ("validate_layer",),
 }

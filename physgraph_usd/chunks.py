@@ -1,25 +1,27 @@
 """Solves a shot's time codes, in this process or in several, and hands the states back in order.
 
 Each process opens the shot for itself and begins a few frames before its chunk (the run-up), so that warm starts have
-settled when the chunk begins. Results go through files, so memory does not grow with the frames and what is finished
+settled when the chunk begins; over these frames, which two processes solve, `joined` goes from one result to the
+other. Results go through files, so memory does not grow with the frames and what is finished
 outlives an interruption; frames that an earlier run finished are not solved again.
 """
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
 from .errors import SolveError
-from .frames import FrameFolder, Outcome
+from .frames import FrameFolder, Lead, Outcome
 from .processes import POLL_SECONDS, Call, memory_is_named
 
 RUN_UP = 6
-"""Frames solved before a chunk and thrown away, when frames depend on one another."""
+"""Frames solved before a chunk, when frames depend on one another."""
 
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 """Solves time codes in order; must be picklable to run in several processes."""
@@ -61,6 +63,30 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
     return [range(numbers[a], numbers[b - 1] + 1) for a, b in pairwise([*starts, len(numbers)])]
 
 
+def seams_of(shares: Sequence[Sequence[range]], frames: FrameFolder, *, run_up: int) -> dict[int, tuple[int, float]]:
+    """The frames that are solved on both sides of a seam.
+
+    Args:
+        shares: The frames of each worker.
+        frames: Where results are; frames of an earlier run in it have seams of their own.
+        run_up: Frames solved before each range.
+
+    Returns:
+        By the frame's number: that of the first frame after the seam, and its `Lead.weight`.
+    """
+    starts = frames.seams()
+    parts = [part for share in shares for part in share if part.start]
+    # Where the frame after a range is an earlier run's, what goes on there is not what the range began.
+    starts |= {part.start for part in parts if part.stop not in frames.kept or part.stop in starts}
+    found: dict[int, tuple[int, float]] = {}
+    before = 0
+    for start in sorted(starts):
+        both = range(max(start - run_up, before), start)
+        found |= {index: (start, (k + 1) / (len(both) + 1)) for k, index in enumerate(both)}
+        before = start
+    return found
+
+
 def solve_in_chunks(
     solver: Solver,
     times: Sequence[float | None],
@@ -68,7 +94,6 @@ def solve_in_chunks(
     *,
     workers: int,
     run_up: int = RUN_UP,
-    skip: int = 0,
     start: Callable[..., Work] | None = None,
 ) -> Generator[Outcome, None, None]:
     """Solve all time codes but those that are kept, in this process or in several, and yield all in order.
@@ -78,8 +103,8 @@ def solve_in_chunks(
         times: The time codes.
         frames: Where results go; frames in its ``kept`` are taken from there.
         workers: Number of processes; 1 solves in this one.
-        run_up: Frames solved before each chunk but the first of the shot.
-        skip: How many of the first time codes serve for a run-up alone; they are not yielded.
+        run_up: Frames solved before each chunk but the first of the shot; they are yielded as the ``lead`` of the same
+            frames of the chunk before.
         start: What starts a function in a process of its own, with its arguments, in place of `Call`; then one chunk
             is not solved in this process either.
 
@@ -87,35 +112,79 @@ def solve_in_chunks(
         SolveError: A process died.
         LayerError: A result cannot be written.
     """
-    wanted = range(skip, len(times))
-    shares = chunks_of([k for k in wanted if k not in frames.kept], workers)
+    shares = chunks_of([k for k in range(len(times)) if k not in frames.kept], workers)
+    seams = seams_of(shares, frames, run_up=run_up)
     if len(shares) < 2 and start is None:
-        solved = (pair for share in shares for pair in _solve(solver, times, share, frames=frames, run_up=run_up))
-        for index in wanted:
-            time = times[index]
-            yield (frames.read(index, time) if index in frames.kept else next(solved, (0, None))[1]) or _lost(time)
+        yield from _solve_here(solver, times, shares[0] if shares else [], frames, run_up=run_up, seams=seams)
         return
     calls = [(start or Call)(_work, solver, list(times), share, frames, run_up) for share in shares]
     owners = {k: call for share, call in zip(shares, calls, strict=True) for part in share for k in part}
     try:
-        for index in wanted:
-            yield _collect(frames, index, times[index], owner=owners.get(index))
+        for index, time in enumerate(times):
+            outcome = _collect(frames, index, time, owner=owners.get(index))
+            yield _with_lead(
+                frames,
+                index,
+                outcome,
+                seams,
+                lambda k, seam: _collect(frames, k, times[k], owner=owners.get(seam), seam=seam),
+            )
     finally:
         for call in calls:
             call.end()
 
 
+def _solve_here(
+    solver: Solver,
+    times: Sequence[float | None],
+    share: Sequence[range],
+    frames: FrameFolder,
+    *,
+    run_up: int,
+    seams: Mapping[int, tuple[int, float]],
+) -> Iterator[Outcome]:
+    """Solve ranges of frames in this process, as far as the next frame to yield needs, and yield all frames."""
+    solved = _solve(solver, times, share, frames=frames, run_up=run_up)
+    made: dict[tuple[int, int | None], Outcome] = {}
+
+    def taken(index: int, seam: int | None) -> Outcome:
+        while (index, seam) not in made:
+            number, before, outcome = next(solved, None) or _lost(times[index])
+            if before is None or before == seams.get(number, (None,))[0]:
+                made[number, before] = outcome
+        return made.pop((index, seam))
+
+    for index, time in enumerate(times):
+        outcome = frames.read(index, time) if index in frames.kept else taken(index, None)
+        yield _with_lead(frames, index, outcome or _lost(time), seams, taken)
+
+
+def _with_lead(
+    frames: FrameFolder,
+    index: int,
+    outcome: Outcome,
+    seams: Mapping[int, tuple[int, float]],
+    taken: Callable[[int, int], Outcome],
+) -> Outcome:
+    """An outcome with the same frame from behind the next seam, where there is one."""
+    if index not in seams:
+        return outcome
+    seam, weight = seams[index]
+    lead = frames.read(index, outcome.time, seam=seam) if seam in frames.kept else taken(index, seam)
+    return outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight))
+
+
 def _solve(
     solver: Solver, times: Sequence[float | None], share: Sequence[range], *, frames: FrameFolder, run_up: int
-) -> Iterator[tuple[int, Outcome]]:
-    """Solve ranges of frames, each after its run-up, and file them."""
+) -> Iterator[tuple[int, int | None, Outcome]]:
+    """Solve ranges of frames, each after its run-up, and file them; yields number, seam that it is before, outcome."""
     for part in share:
         first = max(0, part.start - run_up)
         with memory_is_named():
             for index, outcome in enumerate(solver(times[first : part.stop]), start=first):
-                if index >= part.start:
-                    frames.write(index, outcome)
-                    yield index, outcome
+                seam = part.start if index < part.start else None
+                frames.write(index, outcome, seam=seam)
+                yield index, seam, outcome
 
 
 def _work(
@@ -126,12 +195,14 @@ def _work(
         pass
 
 
-def _collect(frames: FrameFolder, index: int, time: float | None, *, owner: Work | None) -> Outcome:
-    """Wait for one frame's file and read it."""
+def _collect(
+    frames: FrameFolder, index: int, time: float | None, *, owner: Work | None, seam: int | None = None
+) -> Outcome:
+    """Wait for one frame's file and read it; ``seam`` as `FrameFolder.read` takes it."""
     ended: float | None = None
     while True:
         over = owner is None or owner.ready
-        outcome = frames.read(index, time)
+        outcome = frames.read(index, time, seam=seam)
         if outcome is not None:
             return outcome
         if over:
@@ -143,5 +214,5 @@ def _collect(frames: FrameFolder, index: int, time: float | None, *, owner: Work
         clock.sleep(POLL_SECONDS)
 
 
-def _lost(time: float | None) -> Outcome:
+def _lost(time: float | None) -> NoReturn:
     raise SolveError(f"a worker ended without the result of time code {time}")

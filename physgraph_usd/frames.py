@@ -25,6 +25,22 @@ RUN = "run.json"
 """The file that says what decides the frames."""
 _DONE, _FAILED, _TEMPORARY = ".npz", ".failed.npz", ".tmp"
 _FRAMES = ".frames"
+_BEFORE = ".before"
+
+
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """The same time code, solved by the process that goes on after a seam.
+
+    Attributes:
+        outcome: What came of it there.
+        seam: Number of the first frame that is that process's alone.
+        weight: Part of its positions in the joined frame: k / (L + 1) in the k-th of the L frames that both solved.
+    """
+
+    outcome: Outcome
+    seam: int
+    weight: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +53,7 @@ class Outcome:
         reused: For each garment, True when it kept the previous frame's points.
         record: Telemetry, or {"error": message}, ready for JSON.
         heat: Heat maps of each garment by name, None where it has no sample; () when none was asked for.
+        lead: The same frame from behind the next seam, or None.
     """
 
     time: float | None
@@ -44,6 +61,7 @@ class Outcome:
     reused: tuple[bool, ...]
     record: dict[str, object]
     heat: tuple[dict[str, np.ndarray] | None, ...] = ()
+    lead: Lead | None = None
 
 
 def frames_folder(layer: Path) -> Path:
@@ -122,15 +140,21 @@ class FrameFolder:
             there = {}
         return sorted(_different(there, wanted))
 
-    def _file(self, index: int, suffix: str = _DONE) -> Path:
-        return self.folder / f"{index}{suffix}"
+    def _file(self, index: int, suffix: str = _DONE, *, seam: int | None = None) -> Path:
+        return self.folder / (f"{index}" + ("" if seam is None else f"{_BEFORE}{seam}") + suffix)
+
+    def seams(self) -> set[int]:
+        """Numbers of the frames before which finished frames of two processes meet."""
+        names = [file.name.removesuffix(_DONE) for file in self.folder.glob(f"*{_BEFORE}*{_DONE}")]
+        found = {int(seam) for name in names if (seam := name.partition(_BEFORE)[2]).isdecimal()}
+        return found & self.kept
 
     def __getstate__(self) -> dict[str, Any]:
         """Name the folder for processes that may be at work elsewhere."""
         return self.__dict__ | {"folder": self.folder.absolute()}
 
-    def write(self, index: int, outcome: Outcome) -> None:
-        """Write what came of a frame.
+    def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
+        """Write what came of a frame; ``seam`` where it serves for the run-up of the frame of that number.
 
         Raises:
             LayerError: The disk is full, or the folder is gone or another run's: a task on another machine may outlast
@@ -140,25 +164,27 @@ class FrameFolder:
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
         arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
-        temporary = temporary_path(self._file(index), suffix="")
+        file = self._file(index, _DONE if outcome.points else _FAILED, seam=seam)
+        temporary = temporary_path(file, suffix="")
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
                 raise LayerError(f"{self.folder} is another run's by now")
             with temporary.open("wb") as stream:
                 np.savez(stream, **arrays)
-            temporary.replace(self._file(index, _DONE if outcome.points else _FAILED))
+            temporary.replace(file)
         except OSError as error:
-            raise LayerError(f"cannot write {self._file(index)}: {error.strerror}") from error
+            raise LayerError(f"cannot write {file}: {error.strerror}") from error
         finally:
             temporary.unlink(missing_ok=True)
 
-    def read(self, index: int, time: float | None) -> Outcome | None:
-        """What came of a frame, or None where it is not there yet.
+    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
+        """What came of a frame, or None where it is not there yet; ``seam`` as `write` takes it.
 
         Raises:
             LayerError: The file is damaged.
         """
-        file = next((f for f in (self._file(index), self._file(index, _FAILED)) if f.exists()), None)
+        files = (self._file(index, suffix, seam=seam) for suffix in (_DONE, _FAILED))
+        file = next((each for each in files if each.exists()), None)
         if file is None:
             return None
         try:

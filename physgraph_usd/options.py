@@ -52,7 +52,7 @@ class RefineOptions:
         contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
         self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
         workers: Processes that share the frames; with a scheduler, tasks.
-        run_up: Frames solved before ``frames`` and not written: the layer is a chunk, which `stitch` joins to others.
+        run_up: Frames solved before ``frames`` and no samples: the layer is a chunk, which `stitch` joins to others.
             None for a layer by itself.
         scheduler: Address of a Dask scheduler whose workers solve the frames, or None.
         report: JSON file to write, or a folder for it and a page, or None.

@@ -7,6 +7,7 @@ from copy import copy
 from dataclasses import replace
 from functools import reduce
 from statistics import median
+from typing import Any
 
 import numpy as np
 import torch
@@ -206,6 +207,32 @@ class Refiner:
             touching = self._touching(part, frames, self._near(part, frames))
             total += sum(self.group_of(part).energies(frames, [points[index] for index in part], touching).values())
         return total
+
+    def out_of_bodies(
+        self, frame: Frame, points: Sequence[np.ndarray | None]
+    ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
+        """Move world positions [m] out of bodies, without a solve.
+
+        Args:
+            frame: The frame.
+            points: Of each garment, shape (V_fine, 3); those that are solved together with one of None are left alone.
+
+        Returns:
+            For each garment its positions, and what touches and crosses there as telemetry has it: empty where nothing
+            may.
+        """
+        refuse_far(self._scene, frame)
+        self._bodies.pose(frame.colliders)
+        found: list[tuple[np.ndarray | None, dict[str, Any]]] = [(each, {}) for each in points]
+        for part in self._parts.of(frame.garments):
+            own = [each for each in (points[index] for index in part) if each is not None]
+            if len(own) == len(part):
+                frames = [frame.garments[index] for index in part]
+                touching = self._touching(part, frames, self._near(part, frames))
+                moved, told = self.group_of(part).out_of_bodies(frames, own, touching)
+                for index, each in zip(part, moved, strict=True):
+                    found[index] = each, told
+        return found
 
     def _touching(
         self, part: Sequence[int], frames: Sequence[GarmentFrame], near: Sequence[int]

@@ -21,6 +21,7 @@ from .farm import connected, shots_at_once
 from .frames import FrameFolder, Outcome, frames_folder
 from .history import told_broken
 from .integrate.metric import FACTOR
+from .joined import Looking, joined
 from .lead_in import cages_walked
 from .mesh.lanes import kernels_are_kept, start_warp
 from .options import RefineOptions, json_of
@@ -395,19 +396,18 @@ def _write_layer(
 ) -> Layer | None:
     """Solve and write all frames; returns the layer where it is in memory."""
     chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
-    times, skip = _to_solve(opened, chunk, options)
-    leads = chunk is not None and times[skip] not in (None, *chunk.times)
+    times, leads = _to_solve(opened, chunk, options)
     began, provenance = clock.perf_counter(), _provenance(opened, out, options)
     made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite, "chunk": chunk}
     refinements = Refiner.subdivide(opened.scene, solver.levels)
     with ExitStack() as stack:
         frames = None if out is None else stack.enter_context(_frames(solver, times, out, options, provenance))
         writer = stack.enter_context(LayerWriter(opened, refinements, out, provenance=provenance, **made))
-        solved = solver(times) if frames is None else _solved(solver, times, frames, options, report, skip=skip)
+        solved = solver(times) if frames is None else _solved(opened, solver, times, frames, options, report=report)
         stack.enter_context(closing(solved))
-        if leads:
+        for _ in range(leads):
             _begin_after(next(solved), writer)
-        _write_frames(writer, solved, len(times) - skip - leads, options, report=report)
+        _write_frames(writer, solved, len(times) - leads, options, report=report)
         layer = writer.layer if out is None else None
     report.strict = options.strict
     report.seconds["frames"] = clock.perf_counter() - began
@@ -452,20 +452,22 @@ def _frames(
 
 
 def _solved(
+    opened: Shot,
     solver: _ShotSolver,
     times: list[float | None],
     frames: FrameFolder,
     options: RefineOptions,
-    report: RefineReport,
     *,
-    skip: int,
+    report: RefineReport,
 ) -> Outcomes:
-    """Frames in order, those of an interrupted run among them; ``skip`` as `solve_in_chunks` takes it."""
+    """Frames in order, those of an interrupted run among them, joined where several processes solved them."""
     run_up = _run_up(options)
-    report.warn(*_resumed(frames, len(times) - skip, run_up))
-    given = {"workers": options.workers, "run_up": run_up, "skip": skip}
+    report.warn(*_resumed(frames, len(times), run_up))
+    look = Looking(opened, options, solver.levels)
     with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
-        yield from solve_in_chunks(solver, times, frames, **given, start=farm)
+        solved = solve_in_chunks(solver, times, frames, workers=options.workers, run_up=run_up, start=farm)
+        with closing(solved):
+            yield from joined(solved, look, report.warn)
 
 
 def _run_up(options: RefineOptions) -> int:
@@ -475,17 +477,17 @@ def _run_up(options: RefineOptions) -> int:
 
 
 def _to_solve(opened: Shot, chunk: Chunk | None, options: RefineOptions) -> tuple[list[float | None], int]:
-    """Time codes to solve, in order, and how many of the first are neither written nor compared with a chunk before."""
+    """Time codes to solve, in order, and how many of the first are the run-up of a chunk."""
     every: list[float | None] = list(opened.scene.times) or [None]
     if chunk is None or not chunk.times:
         return every, 0
     first = every.index(chunk.times[0])
     lead = min(first, _run_up(options))
-    return every[first - lead : first + len(chunk.times)], max(lead - 1, 0)
+    return every[first - lead : first + len(chunk.times)], lead
 
 
 def _begin_after(outcome: Outcome, writer: LayerWriter) -> None:
-    """Keep where the run-up of a chunk ended, unless that frame failed."""
+    """Keep a frame of a chunk's run-up, unless it failed."""
     if outcome.points and outcome.time is not None:
         writer.begin_after(outcome.time, outcome.points)
 

@@ -153,11 +153,18 @@ def test_a_task_that_outlasts_its_run_writes_nothing_into_another(tmp_path: Path
         assert other.read(0, 0.0) is None
 
 
-def test_frames_of_a_run_up_alone_are_not_handed_back(tmp_path: Path):
-    with FrameFolder(tmp_path / "f", {}) as frames:
-        outcomes = list(solve_in_chunks(Counting(), TIMES, frames, workers=1, run_up=3, skip=2))
-    assert [outcome.time for outcome in outcomes] == TIMES[2:]
-    assert before(outcomes) == list(range(2, 8))
+@pytest.mark.parametrize("workers", [1, 2])
+def test_frames_that_two_processes_solved_come_with_both(tmp_path: Path, workers: int):
+    """In parts of the way that grow evenly, and only as far back as the last seam."""
+    outcomes = solve(Counting(), tmp_path / "a", workers=workers)
+    leads = {outcome.time: outcome.lead for outcome in outcomes if outcome.lead}
+    if workers == 1:
+        assert not leads
+        return
+    assert {time: (lead.seam, lead.weight) for time, lead in leads.items()} == {1: (4, 0.25), 2: (4, 0.5), 3: (4, 0.75)}
+    assert [int(np.asarray(lead.outcome.points[0])[0, 0]) for lead in leads.values()] == [0, 1, 2]
+    near = {outcome.time: outcome.lead for outcome in solve(Counting(), tmp_path / "b", workers=8) if outcome.lead}
+    assert {time: (lead.seam, lead.weight) for time, lead in near.items()} == {t: (t + 1, 0.5) for t in range(7)}
 
 
 class TestKeptFrames:
@@ -245,9 +252,11 @@ class TestLayers:
         shot = cloth_shot(tmp_path / "shot.usdc", times=LONG)
         one, two = (layer_with(shot, tmp_path / str(n), workers=n, temporal=temporal) for n in (1, 2))
         apart = [rms(fine(shot, one, time) - fine(shot, two, time)) / (EDGE / 2) for time in LONG]
-        assert max(apart[:12]) == 0.0
+        assert max(apart[:6]) == 0.0
         assert max(apart) < SEAM, apart
-        assert np.mean(apart[-4:]) < np.mean(apart[12:16]), apart[12:]
+        off = {t: fine(shot, two, t) - fine(shot, one, t) for t in LONG}
+        steps = [rms(off[b] - off[a]) / (EDGE / 2) for a, b in pairwise(LONG)]
+        assert max(steps) < max(apart), steps
         moves = [rms(fine(shot, one, a) - fine(shot, one, b)) / (EDGE / 2) for a, b in pairwise(LONG)]
         assert min(moves) > 2 * max(apart)
         assert sample_times(one) == sample_times(two) == LONG
@@ -270,6 +279,6 @@ class TestLayers:
         assert [frame["time"] for frame in report.frames] == list(LONG)
         whole = layer_with(shot, tmp_path / "whole")
         apart = [rms(fine(shot, whole, time) - fine(shot, out, time)) / (EDGE / 2) for time in LONG]
-        assert max(apart[:12]) == 0.0
+        assert max(apart[:6]) == 0.0
         assert max(apart) < SEAM, apart
         assert faults(out, shot) == []

@@ -15,9 +15,10 @@ from shots import CLOTH, EDGE, cloth_shot, command, faults, fine, refine, sample
 from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageError
+from physgraph_usd.joined import stitch
 from physgraph_usd.usd.chunk import read_chunk
 from physgraph_usd.usd.provenance import read_record
-from physgraph_usd.usd.stitch import SEAM_BOUND, stitch
+from physgraph_usd.usd.stitch import SEAM_BOUND
 from physgraph_usd.usd.validate import validate_layer
 
 TIMES = tuple(float(time) for time in range(1, 49))
@@ -63,7 +64,7 @@ def points(layer: Path, time: float) -> np.ndarray:
 class TestOneLayer:
     def test_h34_seams_move_less_than_a_twentieth_of_a_fine_edge(self, runs: Runs):
         apart = [rms(fine(runs.shot, runs.one, t) - fine(runs.shot, runs.joined, t)) / (EDGE / 2) for t in TIMES]
-        assert max(apart[:12]) == 0.0
+        assert max(apart[:6]) == 0.0
         assert 0.0 < max(apart) < SEAM_BOUND, apart
 
     def test_holds_the_chunks_positions_and_those_of_as_many_workers(self, runs: Runs):
@@ -72,8 +73,9 @@ class TestOneLayer:
             own = [time for time in TIMES if span[0] <= time <= span[1]]
             assert sample_times(chunk) == tuple(own)
             for time in own:
-                assert np.array_equal(points(chunk, time), points(runs.joined, time))
-                assert np.array_equal(points(runs.workers, time), points(runs.joined, time))
+                joined = points(runs.joined, time)
+                assert np.array_equal(points(chunk, time), joined) == (time + 6 <= span[1] or time > 42), time
+                assert np.allclose(points(runs.workers, time), joined, rtol=0, atol=1e-6)
 
     def test_is_valid_and_says_what_it_was_made_from(self, runs: Runs):
         assert validate_layer(runs.joined) == []
@@ -214,8 +216,9 @@ def test_an_interrupted_chunk_goes_on_to_the_same_bytes_where_frames_stand_alone
     ended, whole = (read_chunk(Sdf.Layer.FindOrOpen(str(file))) for file in (out, tmp_path / "whole.usdc"))
     assert ended is not None
     assert whole is not None
-    assert ended.before == whole.before == 3.0
-    assert np.array_equal(ended.points[CLOTH], whole.points[CLOTH])
+    assert [*ended.run_up] == [*whole.run_up] == [2.0, 3.0]
+    for time, points in whole.run_up.items():
+        assert np.array_equal(ended.run_up[time][CLOTH], points[CLOTH])
 
 
 @pytest.fixture
@@ -271,7 +274,7 @@ class TestClips:
     @pytest.mark.parametrize("name", ["clips.usda", "clips.usdc"])
     def test_show_the_same_as_one_layer(self, runs: Runs, tmp_path: Path, name: str):
         stitch(runs.chunks, tmp_path / name, clips=True)
-        made = {"clips.manifest.usda", "clips.topology.usdc", name}
+        made = {"clips.manifest.usda", "clips.topology.usdc", name} | {f"clips.seam{t}.usdc" for t in (13, 25, 37)}
         assert {file.name for file in tmp_path.iterdir()} == made
         joined, clips = (open_over(runs.shot, layer) for layer in (runs.joined, tmp_path / name))
         compared = 0

@@ -49,7 +49,7 @@ def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
 
     A folder stands for all layers in it. How far each seam moves goes to stderr.
     """
-    from ..usd.stitch import stitch as join
+    from ..joined import stitch as join
 
     for seam in join(chunks, out, **options):
         click.echo(seam, err=True)

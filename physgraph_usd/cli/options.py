@@ -161,7 +161,7 @@ farm_options = together(
         "--run-up",
         type=click.IntRange(min=0),
         metavar="N",
-        help="Write --frames as a chunk for stitch; N frames before it are solved and not written.",
+        help="Write --frames as a chunk for stitch, which joins it to the one before over the N frames before it.",
     ),
     _farm(
         "--scheduler",

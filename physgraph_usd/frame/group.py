@@ -138,6 +138,20 @@ class Group:
         touched = () if contact is None else contact.at(self.levels[-1]).terms(x)[1]
         return ForceModule((*module.forces, *touched)).energies(x)
 
+    def out_of_bodies(
+        self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
+    ) -> tuple[list[np.ndarray], dict[str, Any]]:
+        """Move the garments' world positions [m] out of bodies; also what touches and crosses then, as plain values."""
+        _, contact, origin = self.potential(frames, touching)
+        if contact is None:
+            return list(points), {}
+        given = self._tensor(np.concatenate(points) - origin)
+        moved, _ = contact.finish(given)
+        apart = (moved - given).double().cpu().numpy()
+        return [each + apart[span] for each, span in zip(points, self.levels[-1].spans, strict=True)], contact.measure(
+            moved
+        )[0]
+
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
 

@@ -1,8 +1,8 @@
 """A part of a shot's frames as a layer of its own, a chunk, and what its record says so that `stitch` can join it.
 
 A chunk opens the whole shot, so that what all frames decide is the same in every chunk, and writes some of its frames.
-Those that it solves before them, the run-up, it does not write; where the cloth was in the last of these stays in the
-record, for a comparison with the chunk before.
+Those that it solves before them, the run-up, are no samples; where the cloth was in them stays in the record, for
+`stitch` to go over from the chunk before.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .times import within
 
 CHUNK = "chunk"
 """The chunk's entry of a layer's record."""
-_TIMES, _ALL, _BEFORE, _POINTS = "frames", "all_frames", "run_up_ends_at", "run_up_points"
+_TIMES, _ALL, _RUN_UP = "frames", "all_frames", "run_up"
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,22 +30,20 @@ class Chunk:
     Attributes:
         times: Time codes that it has, or failed to solve.
         every: Time codes of the whole shot, in order.
-        before: Time code of the last frame of its run-up, or None where there is none.
-        points: Where the cloth was in that frame: local points by the path of the fine mesh, shape (V, 3), float32.
+        run_up: Where the cloth was in the frames before them: by time code, local points by the path of the fine mesh,
+            shape (V, 3), float32.
     """
 
     times: tuple[float, ...]
     every: tuple[float, ...]
-    before: float | None = None
-    points: Mapping[str, np.ndarray] = field(default_factory=dict)
+    run_up: Mapping[float, Mapping[str, np.ndarray]] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """The entry for the layer's record."""
         return {
             _TIMES: list(self.times),
             _ALL: list(self.every),
-            _BEFORE: self.before,
-            _POINTS: dict(self.points) or None,
+            _RUN_UP: {repr(time): dict(points) for time, points in self.run_up.items()} or None,
         }
 
 
@@ -72,7 +70,9 @@ def read_chunk(layer: Sdf.Layer) -> Chunk | None:
     told = (read_record(layer) or {}).get(CHUNK)
     if not isinstance(told, Mapping):
         return None
-    points = {str(path): np.asarray(value) for path, value in dict(told.get(_POINTS, {})).items()}
-    before = told.get(_BEFORE)
+    run_up = {
+        float(time): {str(path): np.asarray(value) for path, value in dict(points).items()}
+        for time, points in dict(told.get(_RUN_UP, {})).items()
+    }
     times, every = (tuple(float(time) for time in told.get(name, ())) for name in (_TIMES, _ALL))
-    return Chunk(times, every, None if before is None else float(before), points)
+    return Chunk(times, every, run_up)

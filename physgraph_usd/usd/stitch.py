@@ -1,15 +1,16 @@
 """Joins chunks, which `refine --run-up` writes, into one layer, or into value clips where one file would be too large.
 
-Each chunk begins a few frames early, and its record says where the cloth was in the last frame of that run-up. The
-chunk before holds the same frame: the distance between the two is what the seam moves.
+Each chunk begins a few frames early, and its record says where the cloth was in these. The chunk before holds the same
+frames: over them the cloth goes from one to the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -17,44 +18,27 @@ import numpy as np
 from pxr import Sdf, Usd, UsdUtils, Vt
 
 from ..errors import LayerError, UsageError
+from ..mesh.topology import PolygonMesh
 from .atomic import prepare_target, publish, temporary_path
 from .chunk import CHUNK, Chunk, read_chunk
 from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .hints import ATTRIBUTE as HINT
+from .normals import VertexNormals
 from .provenance import FAILED, UNSETTLED, asset_path, author_record, export_layer, read_record, recorded_shot
+from .seams import Look, Points, Seam, between
 from .stage import is_there, pxr_errors
 from .stream import LayerStream
 from .times import within
+from .track import extent_of
 from .validate import check_layer
 from .view import StageView
 
 SEAM_BOUND = 0.05
-"""Largest difference at a seam, RMS over a garment, in mean fine edge lengths. `docs/farm.md` has what was measured."""
+"""Most that a seam may add to a frame's move, RMS over a garment, in mean fine edges; `docs/farm.md` has figures."""
+LookWith = Callable[[Path, Mapping[str, Any], Mapping[str, int]], Look | None]
+"""Makes what looks at joined frames, of the shot, the options it was refined with, and vertex counts by fine mesh."""
 _OF_ONE_CHUNK = {"frames"}
 """Options in which chunks of one shot differ."""
-
-
-@dataclass(frozen=True)
-class Seam:
-    """How far a garment moves between two chunks because they were solved apart.
-
-    Attributes:
-        before: Time code of the last frame before the seam, in which the two are compared.
-        after: Time code of the first frame after it.
-        path: The fine mesh.
-        rms: Distance of its vertices, RMS, in mean fine edge lengths.
-        largest: The largest distance, in the same unit.
-    """
-
-    before: float
-    after: float
-    path: str
-    rms: float
-    largest: float
-
-    def __str__(self) -> str:
-        """Place and distance in one line."""
-        return f"seam at {self.after:g}: <{self.path}> moves {self.rms:.3g} fine edges RMS, {self.largest:.3g} at most"
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +50,11 @@ class _Part:
     record: Mapping[str, Any]
     chunk: Chunk
 
+    def has(self, time: float) -> bool:
+        """Whether a frame is one of its own and did not fail."""
+        failed = {float(each) for each in self.record.get(FAILED, ())}
+        return time in self.chunk.times and time not in failed
+
     def span(self) -> str:
         """Its frames in words."""
         return _span(self.chunk.times)
@@ -73,6 +62,21 @@ class _Part:
     def garments(self) -> list[str]:
         """Paths of its fine meshes."""
         return [str(path) for path in self.record.get("garments", ())]
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """Two chunks that follow one another.
+
+    Attributes:
+        seams: How far each garment moves.
+        points: By time code, the joined positions; those of a frame that both have and in which they differ.
+    """
+
+    before: _Part
+    after: _Part
+    seams: list[Seam]
+    points: dict[float, dict[str, np.ndarray]] = field(default_factory=dict)
 
 
 def stitch(
@@ -83,6 +87,7 @@ def stitch(
     seam_bound: float = SEAM_BOUND,
     clips: bool = False,
     overwrite: bool = False,
+    look_with: LookWith | None = None,
 ) -> list[Seam]:
     """Join chunks of one shot into one layer.
 
@@ -90,10 +95,12 @@ def stitch(
         chunks: Layers that `refine_shot` wrote with ``run_up``, in any order; a folder stands for all layers in it.
         out: Layer to write.
         frames: First and last time code that the layer must have; None for all of the shot.
-        seam_bound: Largest difference at a seam, RMS over a garment, in mean fine edge lengths.
+        seam_bound: Most that a seam may add to a frame's move, RMS over a garment, in mean fine edge lengths.
         clips: Leave the chunks where they are and make ``out`` a small layer that plays them as value clips. Beside it
-            come ``<out>.topology.usdc`` with what does not move and ``<out>.manifest.usda``.
+            come ``<out>.topology.usdc`` with what does not move, ``<out>.manifest.usda``, and ``<out>.seam<time>.usdc``
+            with the frames in which two chunks are joined.
         overwrite: Whether existing files may be replaced.
+        look_with: Makes what looks at joined frames, which else are taken as they are.
 
     Returns:
         The seams, in order.
@@ -111,19 +118,26 @@ def stitch(
             raise UsageError(f"there are no chunks to stitch in {', '.join(map(str, chunks)) or 'no files'}")
         shot = _check_alike(parts)
         _check_frames(parts, frames)
-        seams = [seam for pair in pairwise(parts) for seam in _seams(*pair)]
-        _check_seams(parts, seams, seam_bound)
         inputs = {part.file for part in parts} | files_of(shot)
-        check_targets([(f"the {what}", path) for what, path in _targets(out, clips=clips).items()], inputs)
+        check_targets([(f"the {what}", path) for what, path in _targets(parts, out, clips=clips).items()], inputs)
+        joints = _joints(parts, shot, look_with)
+        seams = [seam for joint in joints for seam in joint.seams]
+        _check_seams(parts, seams, seam_bound)
         write = _write_clips if clips else _write_layer
-        write(parts, shot, out, _record(parts, shot, out, frames=frames), overwrite=overwrite)
+        write(parts, joints, shot, out, _record(parts, shot, out, frames=frames), overwrite=overwrite)
     return seams
 
 
-def _targets(out: Path, *, clips: bool) -> dict[str, Path]:
-    """Files to write, by what they are."""
+def _targets(parts: Sequence[_Part], out: Path, *, clips: bool) -> dict[str, Path]:
+    """Files that may be written, by what they are."""
     beside = {"topology": out.with_suffix(".topology.usdc"), "manifest": out.with_suffix(".manifest.usda")}
-    return {"layer": out} | (beside if clips else {})
+    seams = {f"seam at {part.chunk.times[0]:g}": _seam_file(out, part) for part in parts[1:]}
+    return {"layer": out} | (beside | seams if clips else {})
+
+
+def _seam_file(out: Path, after: _Part) -> Path:
+    """The clip with the joined frames before a chunk."""
+    return out.with_suffix(f".seam{after.chunk.times[0]:g}.usdc")
 
 
 def _layers_in(place: Path) -> list[Path]:
@@ -218,18 +232,77 @@ def _spans(times: Sequence[float], every: Sequence[float]) -> str:
     return ", ".join(map(_span, runs))
 
 
-def _seams(before: _Part, after: _Part) -> Iterator[Seam]:
-    """How far the run-up of a chunk ends from the chunk before it, for each garment that has a sample there."""
-    time = after.chunk.before
-    if time is None or not before.chunk.times or time != before.chunk.times[-1]:
-        return
-    for path, run_up in after.chunk.points.items():
-        there = points_at(before.layer, path, time)
-        if there is None or there.shape != run_up.shape:
-            continue
-        distances = np.linalg.norm(there.astype(np.float64) - run_up, axis=1) / mean_edge(after.layer, path, there)
-        rms, largest = float(np.sqrt(np.mean(distances**2))), float(distances.max(initial=0.0))
-        yield Seam(time, after.chunk.times[0], path, rms, largest)
+def _joints(parts: Sequence[_Part], shot: Path, look_with: LookWith | None) -> list[_Joint]:
+    """Join each two chunks that follow one another."""
+    look: Look | None = None
+    joints = []
+    for before, after in pairwise(parts):
+        both = _both(before, after)
+        if look is None and look_with is not None and both:
+            meshes = {path: points_count(part.layer, path) for part in parts for path in part.garments()}
+            look = look_with(shot, _options(before), meshes)
+        joints.append(_joint(before, after, both, look))
+    return joints
+
+
+def _options(part: _Part) -> dict[str, Any]:
+    """The options that a chunk was made with, plain."""
+    return {name: _comparable(value) for name, value in dict(part.record["options"]).items()}
+
+
+def _both(before: _Part, after: _Part) -> list[float]:
+    """Time codes without a gap, up to the seam, that the run-up of a chunk and the chunk before it have."""
+    every = after.chunk.every
+    first = last = every.index(after.chunk.times[0])
+    while first > 0 and every[first - 1] in after.chunk.run_up and before.has(every[first - 1]):
+        first -= 1
+    return list(every[first:last])
+
+
+def _joint(before: _Part, after: _Part, both: Sequence[float], look: Look | None) -> _Joint:
+    """Go over from one chunk to the next in the frames that both have; at once where that would newly cross."""
+    points: dict[float, dict[str, np.ndarray]] = {}
+    moves: dict[str, list[tuple[float, float]]] = {}
+    why = ""
+    for number, time in enumerate(both, start=1):
+        sides: tuple[Points, Points] = _sides(before, after.chunk.run_up[time], time)
+        for path, ours in sides[0].items():
+            moves.setdefault(path, []).append(_distance(ours, sides[1][path], mean_edge(after.layer, path, ours)))
+        weight = number / (len(both) + 1)
+        made = {path: between(ours, sides[1][path], weight).astype(np.float32) for path, ours in sides[0].items()}
+        if not why and any(move[-1][0] for move in moves.values()):
+            given, why = (made, "") if look is None else look(time, *sides, made)
+            points[time] = dict(given)
+    seams = []
+    for path, found in moves.items():
+        rms, largest = found[-1] if why else tuple(np.max(found, axis=0) / (len(both) + 1))
+        frames = 0 if why else len(both)
+        seams.append(Seam(after.chunk.times[0], path, float(rms), float(largest), frames, why))
+    return _Joint(before, after, seams, {} if why else points)
+
+
+def _sides(before: _Part, run_up: Points, time: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Positions in a frame that two chunks have, of the garments that both have there."""
+    found = {path: points_at(before.layer, path, time) for path in run_up}
+    ours = {path: each for path, each in found.items() if each is not None and each.shape == run_up[path].shape}
+    return ours, {path: run_up[path] for path in ours}
+
+
+def _distance(one: np.ndarray, other: np.ndarray, edge: float) -> tuple[float, float]:
+    """Between two sets of positions, RMS and at most, in edges."""
+    distances = np.linalg.norm(one.astype(np.float64) - other, axis=1) / edge
+    return float(np.sqrt(np.mean(distances**2))), float(distances.max(initial=0.0))
+
+
+def points_count(layer: Sdf.Layer, path: str) -> int:
+    """Number of a fine mesh's vertices."""
+    times = layer.ListTimeSamplesForPath(f"{path}.points")
+    value = (
+        layer.QueryTimeSample(f"{path}.points", times[0])
+        if times
+        else layer.GetAttributeAtPath(f"{path}.points").default
+    )
+    return len(value)
 
 
 def points_at(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
@@ -256,7 +329,9 @@ def _check_seams(parts: Sequence[_Part], seams: Sequence[Seam], bound: float) ->
     """Refuse a seam that moves too far, or of which nothing is known though frames depend on one another."""
     worst = max(seams, key=lambda seam: seam.rms, default=None)
     if worst is not None and worst.rms > bound:
-        remedy = "refine with a longer --run-up or with --temporal off, or allow more by --seam-bound"
+        longer = ceil(worst.rms * (worst.frames + 1) / bound) if bound > 0 else 0
+        longer = f"--run-up {longer}" if longer else "a longer --run-up"
+        remedy = f"refine with {longer} or with --temporal off, or allow more by --seam-bound"
         raise LayerError(f"{worst}; at most {bound:g} RMS is allowed: {remedy}")
     known = {seam.after for seam in seams}
     for part in parts[1:] if dict(parts[0].record["options"]).get("temporal") != "off" else ():
@@ -290,7 +365,15 @@ def _record(parts: Sequence[_Part], shot: Path, out: Path, *, frames: tuple[floa
     }
 
 
-def _write_layer(parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[str, Any], *, overwrite: bool) -> None:
+def _write_layer(
+    parts: Sequence[_Part],
+    joints: Sequence[_Joint],
+    shot: Path,
+    out: Path,
+    record: Mapping[str, Any],
+    *,
+    overwrite: bool,
+) -> None:
     """Join chunks into one file; each leaves memory when it is in."""
     with LayerStream(out, overwrite=overwrite) as stream:
         stream.layer.TransferContent(parts[0].layer)
@@ -299,14 +382,110 @@ def _write_layer(parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[
             _union_hints(stream.layer, part.layer)
             author_record(stream.layer, record)
             stream.flush()
+        for layer in map(_joined_layer, joints):
+            for name in _animated(layer):
+                for time in layer.ListTimeSamplesForPath(name):
+                    stream.set(Sdf.Path(name), layer.QueryTimeSample(name, time), time=time)
         for path in record["garments"]:
-            _author_velocities(stream, path, {t for part in parts for t in _ends(part.layer, f"{path}.velocities")})
+            ends = {t for part in parts for t in _ends(part.layer, f"{path}.velocities")}
+            near = {t for joint in joints for t in (*joint.points, *_beside(joint))}
+            _author_velocities(
+                stream, path, ends | near.intersection(stream.layer.ListTimeSamplesForPath(f"{path}.velocities"))
+            )
         stream.flush()
         below = StageView.of_layer(Sdf.Layer.FindOrOpen(str(shot))) if is_there(shot) else None
         errors = [each for each in check_layer(stream.layer, below, samples=3) if each.severity == "error"]
         if errors:
             raise LayerError(f"the joined layer is invalid ({len(errors)} problems); first: {errors[0]}")
         stream.commit()
+
+
+def _beside(joint: _Joint) -> list[float]:
+    """The frame before the first that is joined, and the first after the seam."""
+    every = joint.after.chunk.every
+    first = every.index(min(joint.points, default=joint.after.chunk.times[0]))
+    return [*every[max(first - 1, 0) : first], joint.after.chunk.times[0]]
+
+
+def _joined_layer(joint: _Joint) -> Sdf.Layer:
+    """The samples of the frames in which two chunks are joined, and before them the end of a run of equal ones.
+
+    What is no position stays as the chunk before has it.
+    """
+    out, before = Sdf.Layer.CreateAnonymous(".usdc"), joint.before.layer
+    out.timeCodesPerSecond = before.timeCodesPerSecond
+    paths = dict.fromkeys(path for points in joint.points.values() for path in points)
+    for path in paths:
+        normals = _normals(before, path)
+        joined = {time: points[path] for time, points in joint.points.items() if path in points}
+        held = _held(before, path, _beside(joint)[0])
+        if held is not None:
+            joined |= {_beside(joint)[0]: held}
+        Sdf.CreatePrimInLayer(out, path)
+        for name in _animated(before):
+            if Sdf.Path(name).GetPrimPath() == Sdf.Path(path):
+                spec = before.GetAttributeAtPath(name)
+                Sdf.AttributeSpec(out.GetPrimAtPath(path), Sdf.Path(name).name, spec.typeName, spec.variability)
+        for time, points in joined.items():
+            values = {"points": points, "normals": normals(points), "extent": extent_of(points)}
+            for spec in out.GetPrimAtPath(path).attributes:
+                own = values.get(spec.name)
+                given = _value_at(before, str(spec.path), time) if own is None else Vt.Vec3fArray.FromNumpy(own)
+                if given is not None:
+                    out.SetTimeSample(spec.path, time, given)
+        _velocities_between(out, joint, path)
+    return out
+
+
+def _velocities_between(out: Sdf.Layer, joint: _Joint, path: str) -> None:
+    """Velocities of joined frames, from the samples beside each, as `track` has them."""
+    name = f"{path}.velocities"
+    if not out.GetAttributeAtPath(name):
+        return
+    shown: dict[float, Sdf.Layer] = {}
+    for layer in (joint.before.layer, joint.after.layer, out):
+        shown |= dict.fromkeys(layer.ListTimeSamplesForPath(f"{path}.points"), layer)
+    times = sorted(shown)
+    for time in out.ListTimeSamplesForPath(name):
+        k = times.index(time)
+        a, b = times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)]
+        low, high = (np.asarray(shown[at].QueryTimeSample(f"{path}.points", at), np.float64) for at in (a, b))
+        moved = (high - low) / ((b - a) / out.timeCodesPerSecond)
+        out.SetTimeSample(name, time, Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)))
+
+
+def _normals(layer: Sdf.Layer, path: str) -> VertexNormals:
+    """What computes a fine mesh's normals, on the side on which the layer has them."""
+    names = ("faceVertexCounts", "faceVertexIndices")
+    counts, indices = (np.asarray(layer.GetAttributeAtPath(f"{path}.{name}").default) for name in names)
+    mesh = PolygonMesh(counts, indices, points_count(layer, path))
+    time = layer.ListTimeSamplesForPath(f"{path}.normals")[0]
+    points, there = (np.asarray(layer.QueryTimeSample(f"{path}.{name}", time)) for name in ("points", "normals"))
+    found = VertexNormals(mesh)
+    return found if float((found(points) * there).sum()) >= 0 else VertexNormals(mesh, left_handed=True)
+
+
+def _animated(layer: Sdf.Layer) -> list[str]:
+    """Paths of the attributes with samples."""
+    found: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(Sdf.Path(path)))
+    return [str(path) for path in found if path.IsPropertyPath() and layer.GetNumTimeSamplesForPath(path)]
+
+
+def _value_at(layer: Sdf.Layer, name: str, time: float) -> Any:
+    """A layer's sample at a time code, or the last before it."""
+    found, low, _ = layer.GetBracketingTimeSamplesForPath(name, time)
+    return layer.QueryTimeSample(name, low) if found else None
+
+
+def _held(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
+    """The points before joined frames, where these end a run of equal samples or change a velocity; else None."""
+    name = f"{path}.points"
+    found, low, high = layer.GetBracketingTimeSamplesForPath(name, time)
+    if not found or (low == high and (low != time or not layer.GetAttributeAtPath(f"{path}.velocities"))):
+        return None
+    a, b = (np.asarray(layer.QueryTimeSample(name, each)) for each in (low, high))
+    return a if np.array_equal(a, b) else None
 
 
 def _union_hints(layer: Sdf.Layer, other: Sdf.Layer) -> None:
@@ -317,13 +496,21 @@ def _union_hints(layer: Sdf.Layer, other: Sdf.Layer) -> None:
         if not path.IsPropertyPath() or path.name != HINT:
             continue
         for time in other.ListTimeSamplesForPath(path):
-            layer.SetTimeSample(path, time, other.QueryTimeSample(path, time))
-        ours, theirs = (np.asarray(each.GetAttributeAtPath(path).default) for each in (layer, other))
-        if ours.shape == theirs.shape and ours.ndim == 2:
-            grown = ours.copy()
-            grown[0::2] = np.minimum(ours[0::2], theirs[0::2])
-            grown[1::2] = np.maximum(ours[1::2], theirs[1::2])
-            layer.GetAttributeAtPath(path).default = Vt.Vec3fArray.FromNumpy(grown)
+            layer.SetTimeSample(path, time, _union(*(each.QueryTimeSample(path, time) for each in (layer, other))))
+        ours, theirs = (each.GetAttributeAtPath(path).default for each in (layer, other))
+        if ours is not None and theirs is not None:
+            layer.GetAttributeAtPath(path).default = _union(ours, theirs)
+
+
+def _union(ours: Any, theirs: Any) -> Any:
+    """Boxes, one corner after the other, that hold two sets of them; the second where they are not of one shape."""
+    one, other = np.asarray(ours), np.asarray(theirs)
+    if ours is None or one.shape != other.shape or one.ndim != 2:
+        return theirs
+    grown = one.copy()
+    grown[0::2] = np.minimum(one[0::2], other[0::2])
+    grown[1::2] = np.maximum(one[1::2], other[1::2])
+    return Vt.Vec3fArray.FromNumpy(grown)
 
 
 def _author_velocities(stream: LayerStream, garment: str, times: Collection[float]) -> None:
@@ -341,9 +528,19 @@ def _author_velocities(stream: LayerStream, garment: str, times: Collection[floa
         stream.set(velocities, Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)), time=time)
 
 
-def _write_clips(parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[str, Any], *, overwrite: bool) -> None:
+def _write_clips(
+    parts: Sequence[_Part],
+    joints: Sequence[_Joint],
+    shot: Path,
+    out: Path,
+    record: Mapping[str, Any],
+    *,
+    overwrite: bool,
+) -> None:
     """Write what does not move, the manifest, and a layer that plays the chunks over both."""
-    targets = _targets(out, clips=True)
+    joined = {joint.after.file: _joined_layer(joint) for joint in joints if joint.points}
+    unwanted = {f"seam at {part.chunk.times[0]:g}" for part in parts if part.file not in joined}
+    targets = {what: path for what, path in _targets(parts, out, clips=True).items() if what not in unwanted}
     for path in targets.values():
         check_suffix("the layer", path, LAYER_SUFFIXES)
         prepare_target(path, overwrite=overwrite)
@@ -352,12 +549,23 @@ def _write_clips(parts: Sequence[_Part], shot: Path, out: Path, record: Mapping[
         for part in parts:
             _union_hints(topology, part.layer)
         topology.customLayerData = {}
-    root, manifest = _clip_root(parts, out, record["garments"], manifest=targets["manifest"].name)
+    played = [
+        each
+        for part in parts
+        for each in (
+            *([(joined[part.file], _seam_file(out, part))] if part.file in joined else []),
+            (part.layer, part.file),
+        )
+    ]
+    for layer, file in played:
+        if layer.anonymous:
+            export_layer(layer, file)
+    root, manifest = _clip_root(played, out, record["garments"], manifest=targets["manifest"].name)
     root.subLayerPaths.append(f"./{targets['topology'].name}")
     author_record(root, record)
     export_layer(manifest, targets["manifest"])
     export_layer(root, out)
-    _check_clips(parts, shot, out)
+    _check_clips(played, record["garments"], shot, out)
 
 
 @contextmanager
@@ -375,49 +583,54 @@ def _on_disk(target: Path) -> Iterator[Sdf.Layer]:
 
 
 def _clip_root(
-    parts: Sequence[_Part], out: Path, garments: Sequence[str], *, manifest: str
+    played: Sequence[tuple[Sdf.Layer, Path]], out: Path, garments: Sequence[str], *, manifest: str
 ) -> tuple[Sdf.Layer, Sdf.Layer]:
     """The layer in memory that plays chunks as value clips, without sublayers yet, and its manifest.
 
-    Each garment has its own clips, those of the chunks in which it has samples: where a clip holds nothing of an
-    attribute, USD takes a default in place of the samples around it.
+    Each garment has its own clips, those of the layers, in their order, in which it has samples: where a clip holds
+    nothing of an attribute, USD takes a default in place of the samples around it.
     """
     root, declared = Sdf.Layer.CreateAnonymous(".usda"), Sdf.Layer.CreateAnonymous(".usda")
-    first = parts[0].layer.pseudoRoot
+    first = played[0][0].pseudoRoot
     for key in first.ListInfoKeys():
         if key not in ("customLayerData", "subLayers", "subLayerOffsets"):
             root.pseudoRoot.SetInfo(key, first.GetInfo(key))
     stage, folder = Usd.Stage.Open(root), out.resolve().parent
     for path in garments:
-        held = [(part, ends) for part in parts if (ends := _ends(part.layer, f"{path}.points"))]
+        held = [(layer, file, ends) for layer, file in played if (ends := _ends(layer, f"{path}.points"))]
+        # Joined frames that begin with a chunk take its place.
+        starts = [ends[0] for _, _, ends in held]
+        held = [each for each, after in zip(held, [*starts[1:], float("inf")], strict=False) if each[2][0] < after]
         if not held:
             continue
-        layers = [part.layer for part, _ in held]
+        layers = [layer for layer, _, _ in held]
         UsdUtils.StitchLayers(declared, Usd.ClipsAPI.GenerateClipManifestFromLayers(layers, path))
         clips = Usd.ClipsAPI(stage.OverridePrim(path))
         clips.SetClipPrimPath(path)
-        clips.SetClipAssetPaths([Sdf.AssetPath(asset_path(part.file, folder)) for part, _ in held])
+        clips.SetClipAssetPaths([Sdf.AssetPath(asset_path(file, folder)) for _, file, _ in held])
         clips.SetClipManifestAssetPath(Sdf.AssetPath(f"./{manifest}"))
-        clips.SetClipActive(Vt.Vec2dArray([(ends[0], index) for index, (_, ends) in enumerate(held)]))
-        clips.SetClipTimes(Vt.Vec2dArray([(time, time) for time in (held[0][1][0], held[-1][1][1])]))
+        clips.SetClipActive(Vt.Vec2dArray([(ends[0], index) for index, (_, _, ends) in enumerate(held)]))
+        clips.SetClipTimes(Vt.Vec2dArray([(time, time) for time in (held[0][2][0], held[-1][2][1])]))
     return root, declared
 
 
-def _check_clips(parts: Sequence[_Part], shot: Path, out: Path) -> None:
-    """Refuse clips that do not show what the chunks hold, in the first and last frame of each: USD fails silently."""
+def _check_clips(played: Sequence[tuple[Sdf.Layer, Path]], garments: Sequence[str], shot: Path, out: Path) -> None:
+    """Refuse clips that do not show what the layers hold, in the first and last frame of each: USD fails silently."""
     below = [str(shot)] if is_there(shot) else []
     root = Sdf.Layer.CreateAnonymous(".usda")
-    root.timeCodesPerSecond = parts[0].layer.timeCodesPerSecond
+    root.timeCodesPerSecond = played[0][0].timeCodesPerSecond
     for identifier in (str(out.resolve()), *below):
         root.subLayerPaths.append(identifier)
     stage = Usd.Stage.Open(root)
-    for part in parts:
-        for path in part.garments():
-            for time in _ends(part.layer, f"{path}.points"):
-                shown = stage.GetAttributeAtPath(f"{path}.points").Get(time)
-                held = part.layer.QueryTimeSample(f"{path}.points", time)
-                if shown is None or not np.array_equal(np.asarray(shown), np.asarray(held)):
-                    raise LayerError(f"{out} does not show <{path}> at time code {time:g} as {part.file} holds it")
+    for path in garments:
+        name = f"{path}.points"
+        owners: dict[float, tuple[Sdf.Layer, Path]] = {}
+        for layer, file in sorted(played, key=lambda each: each[0].anonymous):
+            owners |= dict.fromkeys(_ends(layer, name), (layer, file))
+        for time, (layer, file) in owners.items():
+            shown, held = stage.GetAttributeAtPath(name).Get(time), layer.QueryTimeSample(name, time)
+            if shown is None or not np.array_equal(np.asarray(shown), np.asarray(held)):
+                raise LayerError(f"{out} does not show <{path}> at time code {time:g} as {file} holds it")
 
 
 def _ends(layer: Sdf.Layer, name: str) -> list[float]:

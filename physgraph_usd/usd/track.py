@@ -93,7 +93,7 @@ class PointTrack:
             self._author(None, points if self._rest is None else self._rest)
             self._has_default, self._rest = True, None
         if time is None:
-            self.box = _extent(points)
+            self.box = extent_of(points)
             return
         sample = _Sample(time, points)
         if self._last is None:
@@ -106,7 +106,7 @@ class PointTrack:
     def _begin(self, sample: _Sample) -> None:
         """Take the first sample."""
         self._last = sample
-        self.box = _extent(sample.points)
+        self.box = extent_of(sample.points)
         if not self._still:
             self._emit(sample)
 
@@ -159,7 +159,7 @@ class PointTrack:
 
     def _author(self, time: float | None, points: np.ndarray) -> None:
         """Author points, normals and extent at one time."""
-        self.box = _extent(points)
+        self.box = extent_of(points)
         values = {"points": points, "normals": self._normals(points), "extent": self.box}
         for name, value in values.items():
             self._stream.set(self._paths[name], Vt.Vec3fArray.FromNumpy(value), time=time)
@@ -202,7 +202,7 @@ def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | 
     return np.ascontiguousarray(local.T)
 
 
-def _extent(points: np.ndarray) -> np.ndarray:
+def extent_of(points: np.ndarray) -> np.ndarray:
     """Least and greatest corner, shape (2, 3), float32."""
     if not len(points):
         return np.zeros((2, 3), np.float32)

@@ -31,7 +31,7 @@ from .primvars import carry_primvars, carry_subsets
 from .reader import Shot
 from .stage import Notice, pxr_errors
 from .stream import LayerStream
-from .track import PointTrack, to_local
+from .track import PointTrack, extent_of, to_local
 from .validate import check_layer
 
 MODES = ("over", "sibling")
@@ -138,7 +138,7 @@ class LayerWriter:
         self._time = np.inf if time is None else time
 
     def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
-        """Take the last frame of a chunk's run-up into the chunk's record.
+        """Take a frame of a chunk's run-up into the chunk's record.
 
         Args:
             time: Its time code.
@@ -149,11 +149,11 @@ class LayerWriter:
         """
         assert self._chunk is not None, "only a chunk has a run-up"
         found = {
-            str(mesh.target): to_local(array, self._shot.to_metres(index, time), str(mesh.target), time)
+            str(mesh.target): mesh.before(time, array)
             for index, mesh in self._meshes.items()
             if (array := points[index]) is not None
         }
-        self._chunk = replace(self._chunk, before=time, points=found)
+        self._chunk = replace(self._chunk, run_up={**self._chunk.run_up, time: found})
 
     def _author_values(self, time: float | None) -> None:
         """Leave the values used on the coarse prims."""
@@ -281,6 +281,12 @@ class _RefinedMesh:
         self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed)
         self._hints.write(time, self._track.box)
         self._heat.write(time, heat)
+
+    def before(self, time: float, points: np.ndarray) -> np.ndarray:
+        """Local points of a frame of the run-up, float32; the hints hold them, since `stitch` may show part of them."""
+        local = to_local(points, self._shot.to_metres(self._index, time), str(self.target), time)
+        self._hints.write(time, extent_of(local))
+        return local
 
     def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
         """Refuse points and heat maps that do not fit."""

@@ -1,0 +1,98 @@
+"""Two solutions of the same frames become one, without a jump and without cloth through cloth."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from shots import cloth_shot
+
+from physgraph_usd.frames import Lead, Outcome
+from physgraph_usd.joined import Looking, joined
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.usd.reader import open_shot
+
+
+def outcome(time: float, height: float, *, kept: bool = False) -> Outcome:
+    """A triangle at a height."""
+    points = np.array([[0.0, 0.0, height], [1.0, 0.0, height], [0.0, 1.0, height]])
+    return Outcome(time, (points,), (kept,), {"time": time})
+
+
+def seam(count: int, height: float) -> list[Outcome]:
+    """A cloth at rest at zero, which another process has at a height in its last frames, and goes on there."""
+    both = [
+        replace(outcome(float(k), 0.0, kept=True), lead=Lead(outcome(float(k), height), count, (k + 1) / (count + 1)))
+        for k in range(count)
+    ]
+    return [*both, outcome(float(count), height, kept=True), outcome(count + 1.0, height, kept=True)]
+
+
+class Passing:
+    """Finds nothing to object to, or says what crosses."""
+
+    def __init__(self, why: str = "") -> None:
+        self.why = why
+
+    def __call__(self, _: object, pairs: Any, weight: float) -> tuple[list[np.ndarray | None], str]:
+        return [a + weight * (b - a) for a, b in pairs], self.why
+
+
+def heights(found: list[Outcome]) -> list[float]:
+    """Of each frame."""
+    return [float(np.asarray(each.points[0])[0, 2]) for each in found]
+
+
+def test_positions_go_over_in_equal_parts():
+    told: list[str] = []
+    found = list(joined(seam(4, 1.0), Passing(), told.append))
+    assert heights(found) == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
+    assert [each.reused for each in found] == [(False,)] * 5 + [(True,)]
+    assert [each.lead for each in found] == [None] * 6
+    assert told == []
+
+
+def test_equal_solutions_stay_as_they_are():
+    found = list(joined(seam(3, 0.0), Passing("never asked"), print))
+    assert [each.reused for each in found] == [(True,)] * 3 + [(False,), (True,)]
+
+
+def test_cloth_that_would_cross_jumps_and_is_told_of():
+    told: list[str] = []
+    found = list(joined(seam(3, 1.0), Passing("</a> would have 3 edges through cloth"), told.append))
+    assert heights(found) == [0.0, 0.0, 0.0, 1.0, 1.0]
+    (said,) = told
+    assert "after time code 2" in said
+    assert "3 edges through cloth" in said
+
+
+def test_a_frame_that_failed_on_one_side_is_taken_as_it_is():
+    frames = seam(2, 1.0)
+    lead = frames[0].lead
+    assert lead is not None
+    frames[0] = replace(frames[0], lead=replace(lead, outcome=Outcome(0.0, (), (), {"error": "no"})))
+    found = list(joined(frames, Passing(), print))
+    assert heights(found) == pytest.approx([0.0, 2 / 3, 1.0, 1.0])
+
+
+def test_folds_that_change_sides_are_seen_to_cross(tmp_path: Path):
+    """Half way between a half that lies over the other one, and under it, they pass through each other."""
+    with closing(open_shot(str(cloth_shot(tmp_path / "shot.usdc", times=(1.0,), size=(4, 3))))) as opened:
+        look = Looking(opened, RefineOptions(), [0])
+        flat = opened.frame(1.0).garments[0].points * [1.0, 1.0, 0.0]
+        middle = flat.mean(axis=0)
+        turned = np.flatnonzero(flat[:, 0] > middle[0] + 0.01)
+
+        def folded(height: float) -> np.ndarray:
+            points = flat.copy()
+            points[turned, 0] = middle[0] - 0.9 * (flat[turned, 0] - middle[0])
+            points[turned, 2] = height + 0.2 * (flat[turned, 1] - middle[1])
+            return points
+
+        _, why = look(1.0, [(folded(0.02), folded(-0.02))], 0.5)
+        assert "edges through cloth" in why
+        assert look(1.0, [(folded(0.02), folded(0.03))], 0.5)[1] == ""
