@@ -4,8 +4,9 @@ Over the L frames of a run-up the positions go from one solution to the other in
 
     x_k = (1 - s_k) a_k + s_k b_k,   s_k = k / (L + 1),   k = 1 .. L,
 
-so that the seam adds |b - a| / (L + 1) to a frame's move in place of |b - a| at once. What that brings into a body is
-moved out of it; where cloth would cross that crosses in neither, nothing is joined and the seam is told.
+so that the seam adds |b - a| / (L + 1) to a frame's move in place of |b - a| at once. From the nearer of the two the
+cloth moves there as far as nothing newly crosses, and out of bodies. Where the input itself crosses, that promises
+less: if more crosses than in both, or is in bodies, nothing is joined and the seam is told.
 """
 
 from __future__ import annotations
@@ -139,23 +140,25 @@ class Looking:
             World positions of each garment, and what newly crosses in words, "" where nothing does.
         """
         made = [a if a is None or b is None else between(a, b, weight) for a, b in pairs]
-        return self.looked_at(self._opened.frame(time), [a for a, _ in pairs], [b for _, b in pairs], made)
+        sides = [a for a, _ in pairs], [b for _, b in pairs]
+        near, far = sides if weight < 0.5 else sides[::-1]
+        return self.looked_at(self._opened.frame(time), near, far, made)
 
     def looked_at(
         self,
         frame: Frame,
-        before: Sequence[np.ndarray | None],
-        after: Sequence[np.ndarray | None],
+        near: Sequence[np.ndarray | None],
+        far: Sequence[np.ndarray | None],
         made: Sequence[np.ndarray | None],
     ) -> tuple[list[np.ndarray | None], str]:
-        """Move joined positions out of bodies, and compare what crosses in them with both that they lie between."""
+        """Move cloth safely from the nearer solution to joined positions, and compare what crosses then with both."""
         if self._refiner is None:
             start_warp()
             lanes = os.cpu_count() or 1
             given = {"levels": self._levels, "device": self._options.device, "lanes": lanes}
             self._refiner = Refiner(self._opened.scene, self._options.solve_settings(), **given)
-        found = self._refiner.out_of_bodies(frame, made)
-        told = [[each for _, each in self._refiner.out_of_bodies(frame, side)] for side in (before, after)]
+        found = self._refiner.moved_safely(frame, near, made)
+        told = [[each for _, each in self._refiner.moved_safely(frame, side, side)] for side in (near, far)]
         for index, (_, own) in enumerate(found):
             worse = _worse(own, [side[index] for side in told])
             if worse:
@@ -212,11 +215,11 @@ def _level_of(opened: Shot, index: int, count: int | None) -> int:
 
 
 def _look_at_local(
-    opened: Shot, looking: Looking, paths: Sequence[str], time: float, before: Points, after: Points, made: Points
+    opened: Shot, looking: Looking, paths: Sequence[str], time: float, near: Points, far: Points, made: Points
 ) -> tuple[dict[str, np.ndarray], str]:
     """`Look` at local positions by path; those of garments that are not joined there are left out."""
     matrices = {path: opened.to_metres(index, time) for index, path in enumerate(paths) if path in made}
-    sides = [[_world(each.get(path), matrices.get(path)) for path in paths] for each in (before, after, made)]
+    sides = [[_world(each.get(path), matrices.get(path)) for path in paths] for each in (near, far, made)]
     found, worse = looking.looked_at(opened.frame(time), *sides)
     out = dict(made)
     for path, given, each in zip(paths, sides[2], found, strict=True):

@@ -208,14 +208,15 @@ class Refiner:
             total += sum(self.group_of(part).energies(frames, [points[index] for index in part], touching).values())
         return total
 
-    def out_of_bodies(
-        self, frame: Frame, points: Sequence[np.ndarray | None]
+    def moved_safely(
+        self, frame: Frame, start: Sequence[np.ndarray | None], wanted: Sequence[np.ndarray | None]
     ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
-        """Move world positions [m] out of bodies, without a solve.
+        """Move cloth as near to wanted positions as nothing newly crosses on the way, and out of bodies; no solve.
 
         Args:
             frame: The frame.
-            points: Of each garment, shape (V_fine, 3); those that are solved together with one of None are left alone.
+            start: Where each garment is, world positions [m], shape (V_fine, 3).
+            wanted: Where it is to go, the same; those that are solved together with one of None are taken as they are.
 
         Returns:
             For each garment its positions, and what touches and crosses there as telemetry has it: empty where nothing
@@ -223,13 +224,13 @@ class Refiner:
         """
         refuse_far(self._scene, frame)
         self._bodies.pose(frame.colliders)
-        found: list[tuple[np.ndarray | None, dict[str, Any]]] = [(each, {}) for each in points]
+        found: list[tuple[np.ndarray | None, dict[str, Any]]] = [(each, {}) for each in wanted]
         for part in self._parts.of(frame.garments):
-            own = [each for each in (points[index] for index in part) if each is not None]
-            if len(own) == len(part):
+            sides = [[each for each in (side[index] for index in part) if each is not None] for side in (start, wanted)]
+            if all(len(side) == len(part) for side in sides):
                 frames = [frame.garments[index] for index in part]
                 touching = self._touching(part, frames, self._near(part, frames))
-                moved, told = self.group_of(part).out_of_bodies(frames, own, touching)
+                moved, told = self.group_of(part).moved_safely(frames, *sides, touching=touching)
                 for index, each in zip(part, moved, strict=True):
                     found[index] = each, told
         return found

@@ -15,6 +15,7 @@ from physgraph_usd.frames import Lead, Outcome
 from physgraph_usd.joined import Looking, joined
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.seams import between
 
 
 def outcome(time: float, height: float, *, kept: bool = False) -> Outcome:
@@ -79,8 +80,8 @@ def test_a_frame_that_failed_on_one_side_is_taken_as_it_is():
     assert heights(found) == pytest.approx([0.0, 2 / 3, 1.0, 1.0])
 
 
-def test_folds_that_change_sides_are_seen_to_cross(tmp_path: Path):
-    """Half way between a half that lies over the other one, and under it, they pass through each other."""
+def test_folds_that_change_sides_stop_before_they_cross(tmp_path: Path):
+    """Half way between a half that lies over the other one, and under it, they would pass through each other."""
     with closing(open_shot(str(cloth_shot(tmp_path / "shot.usdc", times=(1.0,), size=(4, 3))))) as opened:
         look = Looking(opened, RefineOptions(), [0])
         flat = opened.frame(1.0).garments[0].points * [1.0, 1.0, 0.0]
@@ -93,6 +94,12 @@ def test_folds_that_change_sides_are_seen_to_cross(tmp_path: Path):
             points[turned, 2] = height + 0.2 * (flat[turned, 1] - middle[1])
             return points
 
-        _, why = look(1.0, [(folded(0.02), folded(-0.02))], 0.5)
-        assert "edges through cloth" in why
-        assert look(1.0, [(folded(0.02), folded(0.03))], 0.5)[1] == ""
+        for weight in (0.49, 0.51):
+            (points,), why = look(1.0, [(folded(0.02), folded(-0.02))], weight)
+            assert why == ""
+            assert points is not None
+            assert np.abs(points - between(folded(0.02), folded(-0.02), weight)).max() > 0.001
+        (points,), why = look(1.0, [(folded(0.02), folded(0.03))], 0.5)
+        assert why == ""
+        assert points is not None
+        assert np.allclose(points, folded(0.025), atol=1e-6)

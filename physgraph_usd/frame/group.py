@@ -138,19 +138,26 @@ class Group:
         touched = () if contact is None else contact.at(self.levels[-1]).terms(x)[1]
         return ForceModule((*module.forces, *touched)).energies(x)
 
-    def out_of_bodies(
-        self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
+    def moved_safely(
+        self,
+        frames: Sequence[GarmentFrame],
+        start: Sequence[np.ndarray],
+        wanted: Sequence[np.ndarray],
+        *,
+        touching: Sequence[Touching] = (),
     ) -> tuple[list[np.ndarray], dict[str, Any]]:
-        """Move the garments' world positions [m] out of bodies; also what touches and crosses then, as plain values."""
+        """World positions [m] as near to wanted ones as nothing newly crosses on the way, and out of bodies.
+
+        Also what touches and crosses there, as plain values; none where nothing may touch.
+        """
         _, contact, origin = self.potential(frames, touching)
         if contact is None:
-            return list(points), {}
-        given = self._tensor(np.concatenate(points) - origin)
-        moved, _ = contact.finish(given)
+            return list(wanted), {}
+        begun, given = (self._tensor(np.concatenate(each) - origin) for each in (start, wanted))
+        moved, _ = contact.finish(contact.at(self.levels[-1]).moved(begun, given))
         apart = (moved - given).double().cpu().numpy()
-        return [each + apart[span] for each, span in zip(points, self.levels[-1].spans, strict=True)], contact.measure(
-            moved
-        )[0]
+        pairs = zip(wanted, self.levels[-1].spans, strict=True)
+        return [each + apart[span] for each, span in pairs], contact.measure(moved)[0]
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.

@@ -11,8 +11,8 @@ Points = Mapping[str, np.ndarray]
 """Local points by the path of the fine mesh, each of shape (V, 3), float32."""
 
 Look = Callable[[float, Points, Points, Points], tuple[Points, str]]
-"""Looks at a joined frame: of its time code, the cloth before, after and between, it gives the last clear of bodies,
-and what crosses in it that crosses in neither of the others; "" where nothing does."""
+"""Looks at a joined frame: of its time code, the nearer and the other side's cloth and that between, it gives the last
+moved so that nothing newly crosses or is in bodies, and what still does more than on both sides; "" for nothing."""
 
 
 @dataclass(frozen=True)

@@ -262,22 +262,31 @@ def _both(before: _Part, after: _Part) -> list[float]:
 def _joint(before: _Part, after: _Part, both: Sequence[float], look: Look | None) -> _Joint:
     """Go over from one chunk to the next in the frames that both have; at once where that would newly cross."""
     points: dict[float, dict[str, np.ndarray]] = {}
+    jumps: dict[str, tuple[float, float]] = {}
     moves: dict[str, list[tuple[float, float]]] = {}
+    lag: dict[str, np.ndarray] = {}
     why = ""
     for number, time in enumerate(both, start=1):
-        sides: tuple[Points, Points] = _sides(before, after.chunk.run_up[time], time)
-        for path, ours in sides[0].items():
-            moves.setdefault(path, []).append(_distance(ours, sides[1][path], mean_edge(after.layer, path, ours)))
+        ours, theirs = _sides(before, after.chunk.run_up[time], time)
         weight = number / (len(both) + 1)
-        made = {path: between(ours, sides[1][path], weight).astype(np.float32) for path, ours in sides[0].items()}
-        if not why and any(move[-1][0] for move in moves.values()):
-            given, why = (made, "") if look is None else look(time, *sides, made)
+        made = {path: between(own, theirs[path], weight).astype(np.float32) for path, own in ours.items()}
+        given: Points = made
+        if not why and look is not None and any(not np.array_equal(own, theirs[path]) for path, own in ours.items()):
+            given, why = look(time, *((ours, theirs) if weight < 0.5 else (theirs, ours)), made)
+        for path, own in ours.items():
+            edge, part = mean_edge(after.layer, path, own), (theirs[path].astype(np.float64) - own) / (len(both) + 1)
+            late = given[path].astype(np.float64) - made[path]
+            jumps[path] = _size(theirs[path].astype(np.float64) - own, edge)
+            moves.setdefault(path, []).append(_size(part + late - lag.get(path, 0.0), edge))
+            lag[path] = late
+            if time == both[-1]:
+                moves[path].append(_size(part - late, edge))
+        if any(move[-1][0] for move in moves.values()):
             points[time] = dict(given)
     seams = []
-    for path, found in moves.items():
-        rms, largest = found[-1] if why else tuple(np.max(found, axis=0) / (len(both) + 1))
-        frames = 0 if why else len(both)
-        seams.append(Seam(after.chunk.times[0], path, float(rms), float(largest), frames, why))
+    for path, jump in jumps.items():
+        rms, largest = jump if why else tuple(map(float, np.max(moves[path], axis=0)))
+        seams.append(Seam(after.chunk.times[0], path, rms, largest, 0 if why else len(both), why))
     return _Joint(before, after, seams, {} if why else points)
 
 
@@ -288,9 +297,9 @@ def _sides(before: _Part, run_up: Points, time: float) -> tuple[dict[str, np.nda
     return ours, {path: run_up[path] for path in ours}
 
 
-def _distance(one: np.ndarray, other: np.ndarray, edge: float) -> tuple[float, float]:
-    """Between two sets of positions, RMS and at most, in edges."""
-    distances = np.linalg.norm(one.astype(np.float64) - other, axis=1) / edge
+def _size(moves: np.ndarray, edge: float) -> tuple[float, float]:
+    """Of moves of vertices, shape (V, 3), RMS and at most, in edges."""
+    distances = np.linalg.norm(moves, axis=1) / edge
     return float(np.sqrt(np.mean(distances**2))), float(distances.max(initial=0.0))
 
 
