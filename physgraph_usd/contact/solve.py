@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,6 +25,8 @@ NEAR = 10.0
 """Tolerances of remaining move under which a warm frame makes no more steps than its budget has."""
 UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
 """Most rounds that draw out what crosses: from cold at the cage, and in a warm frame."""
+SHORTER = 4
+"""How often a way is halved on which cloth that is held up raises the energy, before all of it stays."""
 MakeSystem = Callable[[Sequence[Touch], Tensor, System | None], System]
 """Makes a level's system with contact terms at positions; the last round's tells of its metric, which may serve on."""
 
@@ -72,7 +76,7 @@ def solve_touching(
         y, report, ended = _descended(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         reports.append(report)
         made += report.steps
-        x, last = view.moved(x, y, listed), system
+        x, last = _fallen(partial(view.moved, listed=listed), system, x, y), system
         carry = ended if x is y else None if ended.setbacks else replace(ended, x=x)
         if _ends(report, short=x is not y) or (smoothing is None and _serves(report, budget, made)):
             break
@@ -113,10 +117,26 @@ def _drawn_out(
         if not view.comes_apart(x, order=cold):
             break
         view, terms = view.terms(x, order=cold)
-        y, report = solve_level(make_system(terms, x, None), integrator, x, level=level.index, budget=short)
-        x = view.drawn(x, y) if cold else view.moved(x, y)
+        system = make_system(terms, x, None)
+        y, report = solve_level(system, integrator, x, level=level.index, budget=short)
+        x = _fallen(view.drawn if cold else view.moved, system, x, y)
         reports.append(report)
     return view.without_hope(x, start) if cold else x, reports
+
+
+def _fallen(move: Callable[[Tensor, Tensor], Tensor], system: System, x: Tensor, y: Tensor) -> Tensor:
+    """Where a safe move from x towards y ends, of a shorter way where cloth that is held up raises the energy [m]."""
+    moved = move(x, y)
+    if moved is y:
+        return y
+    energy = system.energy_and_force(x)[0]
+    most = energy + torch.finfo(x.dtype).eps * abs(energy)
+    for _ in range(SHORTER):
+        if system.energy_and_force(moved)[0] <= most:
+            return moved
+        y = x + 0.5 * (y - x)
+        moved = move(x, y)
+    return moved if system.energy_and_force(moved)[0] <= most else x
 
 
 def _budget_of(budget: Budget, system: System, *, first: bool, steps: int) -> Budget:
