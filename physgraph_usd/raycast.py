@@ -1,7 +1,7 @@
 """Draws triangle meshes on the CPU: one ray per sample, a soft key light and ambient occlusion.
 
 Light is gathered at the vertices and interpolated, which costs the same at every picture size and has no
-noise between them. Needs ``trimesh[easy]``'s embree binding and numpy; no GPU and no display.
+noise between them. No GPU and no display.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
+
+from .mesh.rays import Rays
 
 KEY = np.array([-0.62, 0.62, 0.48])
 """Direction to the key light in the camera's frame (right, up, towards the viewer)."""
@@ -136,8 +136,7 @@ class _World:
         self.normals = _vertex_normals(self.points, self.triangles)
         self.size = float(np.linalg.norm(np.ptp(self.points, axis=0)))
         self.key = _unit(KEY) @ view.axes
-        self.scene = EmbreeScene()
-        self.mesh = TriangleMesh(self.scene, self.points, self.triangles)
+        self.rays = Rays(self.points, self.triangles)
         towards = np.einsum("vk,vk->v", self.normals, view.eye - self.points)
         self.light = self.gather(self.points, np.where(towards[:, None] < 0, -self.normals, self.normals))
 
@@ -149,19 +148,14 @@ class _World:
         ambient = np.zeros(len(points), np.float32)
         count = max(6, int(AMBIENT_RAYS * share))
         for x, y, z in _hemisphere(count):
-            ambient += self._open(origins, x * first + y * second + z * normals)
+            ambient += self.rays.free(origins, x * first + y * second + z * normals)
         key = np.zeros(len(points), np.float32)
         total = max(4, int(KEY_RAYS * share))
         side, up = _frames(self.key[None])
         for x, y in _disk(total):
             direction = _unit(self.key + 0.16 * (x * side[0] + y * up[0]))
-            key += self._open(origins, np.broadcast_to(direction, points.shape))
+            key += self.rays.free(origins, np.broadcast_to(direction, points.shape))
         return _Light(ambient / count, key / total)
-
-    def _open(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """1 for each ray that meets nothing."""
-        hits = self.scene.run(origins.astype(np.float32), directions.astype(np.float32), query="OCCLUDED")
-        return (hits < 0).astype(np.float32)
 
 
 def _draw_ground(picture: np.ndarray, view: View, world: _World, floor: float) -> None:
@@ -192,14 +186,12 @@ def _draw_surfaces(picture: np.ndarray, view: View, world: _World, samples: int)
     if right <= left or bottom <= top:
         return
     directions = _directions(view, (width, height), box, samples)
-    origins = np.broadcast_to(view.eye.astype(np.float32), directions.shape)
-    found = world.scene.run(np.ascontiguousarray(origins), directions, output=True)
-    hit = np.flatnonzero(found["primID"] >= 0)
+    found = world.rays.first(np.broadcast_to(view.eye, directions.shape), directions)
+    hit = np.flatnonzero(found.face >= 0)
     area = picture[top:bottom, left:right]
     fine = np.repeat(np.repeat(area, samples, axis=0), samples, axis=1).reshape(-1, 3)
-    weights = np.stack([1.0 - found["u"][hit] - found["v"][hit], found["u"][hit], found["v"][hit]], axis=1)
-    pixel = 2.0 * view.tangent / height * found["tfar"][hit]
-    fine[hit] = _color(world, found["primID"][hit], weights, -directions[hit], pixel)
+    pixel = 2.0 * view.tangent / height * found.distance[hit]
+    fine[hit] = _color(world, found.face[hit], found.weights[hit], -directions[hit], pixel)
     area[:] = fine.reshape(bottom - top, samples, right - left, samples, 3).mean(axis=(1, 3))
 
 

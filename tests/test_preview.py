@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pxr", reason="previews read stages with usd-core")
-pytest.importorskip("embreex", reason="previews cast rays with embreex")
+pytest.importorskip("PIL", reason="previews are written with Pillow")
 
 from PIL import Image, ImageSequence
 from pxr import Sdf, Usd, UsdGeom, Vt

@@ -61,7 +61,7 @@ def test_what_was_left_out_and_why(made: tuple[Path, Path, RefineReport]):
 
 
 def test_pictures_are_in_the_page(made: tuple[Path, Path, RefineReport]):
-    pytest.importorskip("embreex", reason="pictures cast rays with embreex")
+    pytest.importorskip("PIL", reason="pictures are written with Pillow")
     assert text_of(made).count("src='data:image/png;base64,") == 3
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
-pytest.importorskip("embreex", reason="the material grid is drawn with embree")
+pytest.importorskip("PIL", reason="the material grid is written with Pillow")
 
 import torch
 from cloth import sheet

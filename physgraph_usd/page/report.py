@@ -95,8 +95,8 @@ def _warnings(report: RefineReport) -> str:
 def _pictures(report: RefineReport) -> str:
     """Coarse beside fine at a few time codes."""
     title = "<h2>Before and after</h2>"
-    if missing := [name for name in ("PIL", "embreex") if find_spec(name) is None]:
-        return f"{title}<p class='note'>No pictures: {missing[0]} is missing; pip install 'physgraph-usd[preview]'</p>"
+    if find_spec("PIL") is None:
+        return f"{title}<p class='note'>No pictures: PIL is missing; pip install 'physgraph-usd[preview]'</p>"
     written = [frame["time"] for frame in report.frames if "garments" in frame]
     picks = sorted({round(i * (len(written) - 1) / (PICTURES - 1)) for i in range(PICTURES)}) if written else []
     try:
