@@ -1,25 +1,28 @@
 """How far a chunk that begins in the middle of a sample is from the run of all frames, and what a joined seam moves.
 
-    python -m benchmarks.seams [--short]
+    python -m benchmarks.seams [--short] [--run-up 6] [--shot NAME] [FOLDER]
 
-For each sample and level: how far the fine cloth moves from frame to frame, and how far the frames of the chunk are
-from the same ones of the whole run: in its first frame and six frames later, RMS and at most, in mean fine edges.
-Then what the seam adds to a frame's move at most, once both are joined over the run-up as `stitch` does.
+For each sample and level, and each real shot in FOLDER: how far the fine cloth moves from frame to frame, and how
+far the frames of the chunk are from the same ones of the whole run: in its first frame and six frames later, RMS and
+at most, in mean fine edges. Then what the seam adds to a frame's move at most, once both are joined over the run-up as
+`stitch` does, but for frames that would cross.
 A run-up that reaches the first frame of the shot leaves nothing and is not shown. ``temporal off`` needs none.
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 from pxr import Sdf
 
+from benchmarks.contact_shots import REAL, say
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import refine_shot
@@ -35,32 +38,46 @@ MORE = (
     ("flag", 1, {"steps": 80, "tolerance": 1e-4}),
     ("flag", 1, {"temporal": "off"}),
 )
+SHOTS = ("06_torus_pull.usda", "08_sphere_spin_xformcollider.usdc", "09_cesiumman_kilt/shot.usda")
+SHOTS += ("10_style3d_skirt_twist.usdc",)
 RUN_UPS = (2, 6, 12, 20)
 FRAMES = 6
 
 
-def main() -> None:
+@click.command()
+@click.argument("folder", required=False, type=click.Path(path_type=Path, exists=True))
+@click.option("--shot", "shots", multiple=True, help="Only these.")
+@click.option("--run-up", "run_ups", multiple=True, type=int, default=RUN_UPS, help="Only these; 0 stands for none.")
+@click.option("--short", is_flag=True, help="Only three samples.")
+def main(folder: Path | None, shots: Sequence[str], run_ups: Sequence[int], *, short: bool) -> None:
     """Print the table."""
-    sys.stdout.write(
-        "sample level  options       a frame moves  run-up  first frame  sixth frame  joined adds  seconds of run-up\n"
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        for index, case in enumerate(CASES if "--short" in sys.argv else CASES + MORE):
-            for line in rows(*case, Path(folder) / str(index)):
-                sys.stdout.write(line + "\n")
-                sys.stdout.flush()
+    say("sample level  options       a frame moves  run-up  first frame  sixth frame  joined adds  seconds of run-up")
+    real: tuple[tuple[str, int, dict[str, Any]], ...] = tuple((name, 1, {}) for name in (SHOTS if folder else ()))
+    with tempfile.TemporaryDirectory() as place:
+        for index, (name, level, options) in enumerate((CASES if short else CASES + MORE) + real):
+            if shots and not any(each in name for each in shots):
+                continue
+            out, given = Path(place) / str(index), dict(options)
+            if name in REAL and folder is not None:
+                out.mkdir()
+                shot, given["garments"], given["colliders"] = folder.resolve() / name, *REAL[name][:2]
+            else:
+                shot = write_sample(name, out)
+            for row in rows(shot, level, given, out, run_ups):
+                said = ",".join(f"{key}={value}" for key, value in options.items())
+                say(f"{name[:6]:7}{level:5}  {said:26}{row}")
 
 
-def rows(name: str, level: int, options: dict[str, Any], folder: Path) -> list[str]:
+def rows(shot: Path, level: int, options: dict[str, Any], folder: Path, run_ups: Sequence[int]) -> Iterator[str]:
     """One case, a row for each run-up."""
-    shot = write_sample(name, folder)
-    times = open_shot(str(shot)).scene.times
+    named = {name: options.get(name, ()) for name in ("garments", "colliders")}
+    times = open_shot(str(shot), **named).scene.times
     first = len(times) // 2
     own = times[first : first + FRAMES]
     whole, path = _refine(shot, folder / "whole.usdc", level=level, **options)
     moves = np.mean([_apart(whole, whole, path, a, b)[0] for a, b in pairwise(times)])
-    lines, alone = [], 0.0
-    for run_up in (0, *(each for each in RUN_UPS if each < first)):
+    alone = 0.0
+    for run_up in (0, *(each for each in run_ups if 0 < each < first)):
         began = time.process_time()
         span = {"frames": (own[0], own[-1]), "run_up": run_up}
         chunk, _ = _refine(shot, folder / f"{run_up}.usdc", level=level, **options | span)
@@ -68,9 +85,7 @@ def rows(name: str, level: int, options: dict[str, Any], folder: Path) -> list[s
         alone = spent if run_up == 0 else alone
         adds = _adds(whole, chunk, path)
         ends = "  ".join("{:5.3f}/{:5.2f}".format(*_apart(whole, chunk, path, t, t)) for t in (own[0], own[-1]))
-        said = ",".join(f"{key}={value}" for key, value in options.items())
-        lines.append(f"{name:7}{level:5}  {said:26}{moves:6.2f}{run_up:7}   {ends}  {adds:11}  {spent - alone:5.1f}")
-    return lines
+        yield f"{moves:6.2f}{run_up:7}   {ends}  {adds:11}  {spent - alone:5.1f}"
 
 
 def _refine(shot: Path, out: Path, **options: Any) -> tuple[Sdf.Layer, str]:

@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import Any
 
 from .errors import PhysGraphError, SolveError, UsageError
-from .version import __version__
+from .version import __version__, code_digest
 
 RETRIES = 2
 """How often a task is begun again after an error that nobody foresaw, such as a disk that was not there."""
@@ -83,7 +83,7 @@ def connected(address: str) -> Iterator[Start]:
     with _client(address) as client:
 
         def start(function: Callable[..., Any], *args: Any) -> FarmCall:
-            return FarmCall(client.submit(_call, __version__, function, args, pure=False, retries=RETRIES))
+            return FarmCall(client.submit(_call, _code(), function, args, pure=False, retries=RETRIES))
 
         yield start
 
@@ -122,14 +122,19 @@ def _distributed() -> Any:
         raise UsageError("--scheduler needs Dask: pip install 'physgraph-usd[farm]'") from error
 
 
-def _call(version: str, function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, PhysGraphError | None]:
+def _code() -> str:
+    """The version of the package here, and its code."""
+    return f"{__version__} (code {code_digest()[:12]})"
+
+
+def _call(code: str, function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, PhysGraphError | None]:
     """Call a function on a worker; what is wrong with the shot would be wrong on any other, and is not tried again."""
     worker = _distributed().get_worker()
     if worker.state.nthreads != 1:
         said = f"the worker {worker.name} has {worker.state.nthreads} threads; start each with --nthreads 1"
         return None, UsageError(said)
-    if version != __version__:
-        said = f"the worker {worker.name} has physgraph-usd {__version__}, this machine {version}; install one version"
+    if code != _code():
+        said = f"the worker {worker.name} has physgraph-usd {_code()}, this machine {code}; install the same on both"
         return None, UsageError(said)
     try:
         return function(*args), None

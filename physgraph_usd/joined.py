@@ -47,6 +47,7 @@ def stitch(
     frames: tuple[float, float] | None = None,
     seam_bound: float = SEAM_BOUND,
     clips: bool = False,
+    root: str | Path | None = None,
     overwrite: bool = False,
 ) -> list[Seam]:
     """Join chunks of one shot into one layer, as `usd.stitch.stitch` does, and look at the joined frames in the shot.
@@ -57,6 +58,7 @@ def stitch(
         frames: First and last time code that the layer must have; None for all of the shot.
         seam_bound: Most that a seam may add to a frame's move, RMS over a garment, in mean fine edge lengths.
         clips: Leave the chunks where they are and make ``out`` a small layer that plays them as value clips.
+        root: A small root layer to write, with the layer over the shot.
         overwrite: Whether existing files may be replaced.
 
     Returns:
@@ -67,7 +69,7 @@ def stitch(
             one of them.
         LayerError: A chunk cannot be read, a seam moves too far, or the layer cannot be written or is invalid.
     """
-    given = {"frames": frames, "seam_bound": seam_bound, "clips": clips, "overwrite": overwrite}
+    given = {"frames": frames, "seam_bound": seam_bound, "clips": clips, "root": root, "overwrite": overwrite}
     with ExitStack() as stack:
         return stitch_layers(chunks, out, **given, look_with=partial(_looking, stack))
 

@@ -39,7 +39,7 @@ from .usd.reader import Shot, open_shot
 from .usd.stage import shot_name
 from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
-from .version import __version__
+from .version import __version__, code_digest
 
 try:
     import resource
@@ -571,6 +571,7 @@ def _provenance(opened: Shot, out: Path | None, options: RefineOptions) -> dict[
     folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
     return {
         "version": __version__,
+        "code": code_digest(),
         "options": options.plain(),
         "shot": None if opened.view.root.anonymous else asset_path(opened.path, folder, absolute=absolute),
         "inputs": file_hashes(opened.stage, folder, absolute=absolute),

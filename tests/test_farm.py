@@ -106,9 +106,18 @@ def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exceptio
         assert start(fails, "").result() != os.getpid()
 
 
-def test_workers_of_another_version_are_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("physgraph_usd.farm.__version__", "0.0.0")
-    with connected(cluster.scheduler_address) as start, pytest.raises(UsageError, match=r"this machine 0\.0\.0"):
+@pytest.mark.parametrize(
+    ("name", "other", "said"),
+    [
+        ("__version__", "0.0.0", r"this machine 0\.0\.0 "),
+        ("code_digest", lambda: "feedfeedfeed", r"\(code feedfeedfeed\)"),
+    ],
+)
+def test_workers_of_another_version_or_checkout_are_refused(
+    cluster: Any, monkeypatch: pytest.MonkeyPatch, name: str, other: Any, said: str
+):
+    monkeypatch.setattr(f"physgraph_usd.farm.{name}", other)
+    with connected(cluster.scheduler_address) as start, pytest.raises(UsageError, match=said):
         start(fails, "").result()
 
 

@@ -128,6 +128,12 @@ class TestRefused:
         with pytest.raises(UsageError, match=r"were made with other --steps; refine one anew"):
             stitch([*runs.chunks[:3], other], tmp_path / "joined.usdc")
 
+    def test_another_checkout(self, runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr("physgraph_usd.shot.code_digest", lambda: "other")
+        (other,) = refine_chunks(runs.shot, tmp_path, SPANS[3:])
+        with pytest.raises(UsageError, match=r"were made with other code; refine one anew"):
+            stitch([*runs.chunks[:3], other], tmp_path / "joined.usdc")
+
     def test_a_shot_that_was_edited_in_between(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc")
         chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0)])
@@ -285,6 +291,20 @@ class TestClips:
             compared += 1
         assert compared > 8
         assert clips.GetAttributeAtPath(f"{CLOTH}.points").GetTimeSamples() == list(TIMES)
+
+    @pytest.mark.parametrize("clips", [False, True])
+    def test_a_root_shows_them_over_the_shot(self, runs: Runs, tmp_path: Path, clips: bool):
+        stitch(runs.chunks, tmp_path / "joined.usdc", clips=clips, root=tmp_path / "root.usda")
+        shown, asked = Usd.Stage.Open(str(tmp_path / "root.usda")), open_over(runs.shot, runs.joined)
+        for time in (TIMES[0], TIMES[-1]):
+            points = [UsdGeom.Mesh(s.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(time) for s in (shown, asked)]
+            assert points[0] == points[1]
+
+    def test_a_root_that_is_there_is_left_alone(self, runs: Runs, tmp_path: Path):
+        (tmp_path / "root.usda").write_text("mine")
+        with pytest.raises(UsageError, match=r"root\.usda exists"):
+            stitch(runs.chunks, tmp_path / "joined.usdc", root=tmp_path / "root.usda")
+        assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("root.usda", "mine")]
 
     def test_validate_checks_what_the_clips_play(self, runs: Runs, tmp_path: Path):
         copies = [tmp_path / chunk.name for chunk in runs.chunks]

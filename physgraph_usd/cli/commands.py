@@ -43,6 +43,7 @@ from .types import FrameRange, PictureSize
     help="Most that a seam may move, RMS, in mean fine edge lengths.",
 )
 @click.option("--clips", is_flag=True, help="Play the chunks as value clips instead of copying them into one file.")
+@click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot.")
 @overwrite_option
 def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
     """Join each CHUNK of a shot, as refine --run-up writes them, into one layer and print its path.

@@ -10,9 +10,7 @@ import click
 from ..errors import PhysGraphError, UsageError
 
 DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
-EXTRAS = {
-    "pxr": "usd", "embreex": "preview", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune",
-}  # fmt: skip
+EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
 """Which extra brings a module that only some commands need."""
 
 

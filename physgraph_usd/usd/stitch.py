@@ -24,7 +24,16 @@ from .chunk import CHUNK, Chunk, read_chunk
 from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .hints import ATTRIBUTE as HINT
 from .normals import VertexNormals
-from .provenance import FAILED, UNSETTLED, asset_path, author_record, export_layer, read_record, recorded_shot
+from .provenance import (
+    FAILED,
+    UNSETTLED,
+    asset_path,
+    author_record,
+    export_layer,
+    read_record,
+    recorded_shot,
+    write_root,
+)
 from .seams import Look, Points, Seam, between
 from .stage import is_there, pxr_errors
 from .stream import LayerStream
@@ -86,6 +95,7 @@ def stitch(
     frames: tuple[float, float] | None = None,
     seam_bound: float = SEAM_BOUND,
     clips: bool = False,
+    root: str | Path | None = None,
     overwrite: bool = False,
     look_with: LookWith | None = None,
 ) -> list[Seam]:
@@ -99,6 +109,7 @@ def stitch(
         clips: Leave the chunks where they are and make ``out`` a small layer that plays them as value clips. Beside it
             come ``<out>.topology.usdc`` with what does not move, ``<out>.manifest.usda``, and ``<out>.seam<time>.usdc``
             with the frames in which two chunks are joined.
+        root: A small root layer to write, with the layer over the shot.
         overwrite: Whether existing files may be replaced.
         look_with: Makes what looks at joined frames, which else are taken as they are.
 
@@ -119,12 +130,18 @@ def stitch(
         shot = _check_alike(parts)
         _check_frames(parts, frames)
         inputs = {part.file for part in parts} | files_of(shot)
-        check_targets([(f"the {what}", path) for what, path in _targets(parts, out, clips=clips).items()], inputs)
+        targets = _targets(parts, out, clips=clips) | ({} if root is None else {"root": Path(root)})
+        check_targets([(f"the {what}", path) for what, path in targets.items()], inputs)
+        if root is not None:
+            prepare_target(Path(root), overwrite=overwrite)
         joints = _joints(parts, shot, look_with)
         seams = [seam for joint in joints for seam in joint.seams]
         _check_seams(parts, seams, seam_bound)
         write = _write_clips if clips else _write_layer
         write(parts, joints, shot, out, _record(parts, shot, out, frames=frames), overwrite=overwrite)
+        if root is not None:
+            absolute = Path(str(parts[0].record["shot"])).is_absolute()
+            write_root(Path(root), layer=out, shot=shot, absolute=absolute, overwrite=overwrite)
     return seams
 
 
@@ -177,7 +194,7 @@ def _decisive(part: _Part) -> dict[str, Any]:
     """What must be the same in all chunks, flat."""
     options = {name: value for name, value in dict(part.record["options"]).items() if name not in _OF_ONE_CHUNK}
     hashes = sorted((Path(name).name, str(value)) for name, value in dict(part.record["inputs"]).items())
-    names = ("version", "mode")
+    names = ("version", "code", "mode")
     plain = {name: part.record.get(name) for name in names} | {
         "variant selections": list(part.record.get("variants", ())),
         "files of the shot": hashes,
