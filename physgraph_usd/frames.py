@@ -1,7 +1,7 @@
 """Finished frames of a run in a folder beside its layer: they outlive the run when it is interrupted.
 
-One file a frame, whole or not there, and one that says what decides the frames. The folder goes when the layer is done;
-until then one run holds it.
+One file a frame, whole or not there, and one that says what decides the frames. The folder goes when the layer stands
+whole under its name and for no other reason; until then one run holds it.
 """
 
 from __future__ import annotations
@@ -69,8 +69,45 @@ def frames_folder(layer: Path) -> Path:
     return layer.with_name(layer.name + _FRAMES)
 
 
+@dataclass(frozen=True)
+class Kept:
+    """Finished frames of a run that did not come to its end.
+
+    Attributes:
+        folder: Where they are.
+        frames: How many.
+        of: Frames of the run.
+    """
+
+    folder: Path
+    frames: int
+    of: int
+
+    def __str__(self) -> str:
+        """For a message."""
+        return f"{self.frames} of {self.of} frames are kept in {self.folder}; --resume goes on from them"
+
+
+def kept_for(layer: Path) -> Kept | None:
+    """Finished frames that lie beside a layer, or None where there are none."""
+    folder = frames_folder(layer)
+    try:
+        times = json.loads((folder / RUN).read_text(encoding="utf-8"))["times"]
+    except (OSError, ValueError, KeyError):
+        return None
+    count = len(_whole_frames(folder))
+    return Kept(folder, count, len(times)) if count else None
+
+
+def _whole_frames(folder: Path) -> list[int]:
+    """Numbers of the frames in a folder that are whole."""
+    names = [file.name for file in folder.glob("*")]
+    numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
+    return [number for number in numbers if zipfile.is_zipfile(folder / f"{number}{_DONE}")]
+
+
 class FrameFolder:
-    """The folder; a context manager that is left with finished frames inside only by what interrupts a run.
+    """The folder; a context manager that leaves finished frames inside unless the layer came to stand whole.
 
     Attributes:
         kept: Numbers of the frames that an interrupted run had finished and that are used.
@@ -93,7 +130,7 @@ class FrameFolder:
             UsageError: The folder holds finished frames of another run, or is not ours.
             LayerError: The folder cannot be made, or another run is at work in it.
         """
-        self.folder, self._resumed, self._keep = folder, resume, keep
+        self.folder, self._keep = folder, keep
         wanted = json.loads(json.dumps(run))
         try:
             self._check_ours()
@@ -128,9 +165,7 @@ class FrameFolder:
 
     def _found(self) -> list[int]:
         """Numbers of the whole frames that are there."""
-        names = [file.name for file in self.folder.glob("*")]
-        numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
-        return [number for number in numbers if zipfile.is_zipfile(self._file(number))]
+        return _whole_frames(self.folder)
 
     def _differences(self, wanted: dict[str, Any]) -> list[str]:
         """Names of what decides the frames there, and is another here."""
@@ -211,10 +246,9 @@ class FrameFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Keep the frames of a run that was interrupted, and those that were there before it; let go of the folder."""
-        unwritten = isinstance(error, LayerError) and not self._resumed
+        """Keep the frames, however the run failed, unless that was not wanted; let go of the folder."""
         try:
-            if kind is None or unwritten or not (self._keep or self.kept) or not self._found():
+            if kind is None or not (self._keep or self.kept) or not self._found():
                 self._clear()
         finally:
             self._lock.release()

@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from .errors import PhysGraphError, SolveError
+from .interrupts import signals_raise
 
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0
@@ -67,9 +68,13 @@ class Call:
             self._process.join()
             return None, SolveError(_obituary(self._process.exitcode or 0))
 
+    def ask_to_end(self) -> None:
+        """Ask it to clear up and end, and do not wait."""
+        self._process.terminate()
+
     def end(self) -> None:
         """End it, with time to clear up."""
-        self._process.terminate()
+        self.ask_to_end()
         self._process.join(PATIENCE_SECONDS)
         self._process.kill()
         self._here.close()
@@ -102,6 +107,8 @@ def call_each(
                 yield error
     finally:
         for call in calls:
+            call.ask_to_end()
+        for call in calls:
             call.end()
 
 
@@ -126,7 +133,7 @@ def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ..
     """Call the function and send what came of it; Ctrl-C is the business of the process that started this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_outlast_parent, daemon=True).start()
-    with _Sent(there), memory_is_named():
+    with signals_raise(), _Sent(there), memory_is_named():
         there.send((function(*args), None))
 
 

@@ -16,6 +16,8 @@ FORMAT = 1
 """Version of the JSON's format; another one where a reader of the last one could fail. See report.schema.json."""
 SCHEMA = Path(__file__).with_name("report.schema.json")
 DONE, FAILED, IN_PART = 0, 1, 3
+SIGNALLED = 128
+"""Added to a signal's number, as shells report it."""
 LOG = logging.getLogger("physgraph_usd")
 """Where warnings and progress go, for the whole package."""
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
@@ -59,6 +61,7 @@ class RefineReport:
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB]; None where the system does not tell.
         error: What ended the run; "" for one that came to its end.
+        signal: Number of the signal that interrupted the run; None for none.
         skipped: Whether the layer was there already and was left as it is.
     """
 
@@ -79,11 +82,17 @@ class RefineReport:
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float | None = None
     error: str = ""
+    signal: int | None = None
     skipped: bool = False
 
     @property
     def exit_code(self) -> int:
-        """0 done, 1 it failed, 3 done in part: some frames failed, or where that is strict some did not settle."""
+        """0 done, 1 it failed, 3 done in part: some frames failed, or where that is strict some did not settle.
+
+        128 and the signal's number where the run was interrupted.
+        """
+        if self.signal is not None:
+            return SIGNALLED + self.signal
         if self.error:
             return FAILED
         if not self.failed:

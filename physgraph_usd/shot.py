@@ -18,9 +18,10 @@ from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .farm import connected, shots_at_once
-from .frames import FrameFolder, Outcome, frames_folder
+from .frames import FrameFolder, Outcome, frames_folder, kept_for
 from .history import told_broken
 from .integrate.metric import FACTOR
+from .interrupts import exit_code_of, signals_raise
 from .joined import Looking, joined
 from .lead_in import cages_walked
 from .mesh.lanes import kernels_are_kept, start_warp
@@ -28,7 +29,7 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .processes import call_each, memory_is_named
-from .report import LOG, RefineReport, is_of_failure
+from .report import LOG, SIGNALLED, RefineReport, is_of_failure
 from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
 from .usd.atomic import check_place
@@ -75,7 +76,7 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         return skipped
     if not options.dry_run:
         _check_places(out, options)
-    with _run(str(shot), options) as (opened, report):
+    with _run(str(shot), options, out=out) as (opened, report):
         if options.dry_run or _is_done(opened, out, options, report):
             return report
         _check_new(out, options)
@@ -127,13 +128,17 @@ def refine_stage(
 
 @contextmanager
 def _run(
-    shot: str | Stage, options: RefineOptions, *, on_report: Callable[[RefineReport], None] | None = None
+    shot: str | Stage,
+    options: RefineOptions,
+    *,
+    out: Path | None = None,
+    on_report: Callable[[RefineReport], None] | None = None,
 ) -> Iterator[tuple[Shot, RefineReport]]:
-    """Open a shot and begin its report; a run that fails, not one used wrongly, writes it where it was asked for."""
+    """Open a shot and begin its report; a run that fails or is interrupted writes it where it was asked for."""
     report = RefineReport(shot_name(shot), None, options.plain(), options.told_sources())
     began = clock.perf_counter()
     try:
-        with memory_is_named(), closing(_open(shot, options)) as opened:
+        with signals_raise(), memory_is_named(), closing(_open(shot, options)) as opened:
             warnings = begin_report(report, opened, options)
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
@@ -143,6 +148,12 @@ def _run(
     except PhysGraphError as error:
         report.error = str(error)
         if not isinstance(error, UsageError):
+            _write_failure(report, options)
+        raise
+    except (KeyboardInterrupt, SystemExit) as error:
+        if (code := exit_code_of(error)) is not None:
+            kept = None if out is None else kept_for(out)
+            report.signal, report.error = code - SIGNALLED, f"interrupted, {kept or 'no frame is kept'}"
             _write_failure(report, options)
         raise
     finally:

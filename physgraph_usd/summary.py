@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from .errors import PhysGraphError, UsageError
+from .frames import kept_for
 from .report import DONE, FAILED, FORMAT, IN_PART, RefineReport
-from .usd.atomic import write_text
+from .usd.atomic import check_place, write_text
 from .version import __version__
 
 SCHEMA = Path(__file__).with_name("summary.schema.json")
@@ -24,8 +25,9 @@ class Row:
     Attributes:
         shot: Input file.
         layer: Output layer.
-        state: "done", "in part", "failed", "skipped" (the layer was there) or "not begun".
-        exit_code: Its own, or None where it was not begun.
+        state: "done", "in part", "failed", "skipped" (the layer was there), "interrupted" (with frames kept) or "not
+            done" (the batch was interrupted before a frame of it).
+        exit_code: Its own, or None where it was not done.
         frames: Time codes that were asked for.
         failed_frames: Those without a sample.
         seconds_a_frame: Wall time [s], or None without frames.
@@ -36,7 +38,7 @@ class Row:
 
     shot: str
     layer: str
-    state: str = "not begun"
+    state: str = "not done"
     exit_code: int | None = None
     frames: int = 0
     failed_frames: tuple[str, ...] = ()
@@ -52,10 +54,10 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
     Args:
         shot: Input file.
         layer: Output layer.
-        done: Its report, the error that ended it, or None where it was not begun.
+        done: Its report, the error that ended it, or None where the batch was interrupted.
     """
     if done is None:
-        return Row(str(shot), str(layer))
+        return _interrupted(str(shot), layer)
     if isinstance(done, PhysGraphError):
         code = WRONG_USAGE if isinstance(done, UsageError) else FAILED
         return Row(str(shot), str(layer), "failed", code, error=str(done))
@@ -73,29 +75,44 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
     )
 
 
+def _interrupted(shot: str, layer: Path) -> Row:
+    """The row of a shot that a batch did not come to, or was at."""
+    kept = kept_for(layer)
+    if kept is None:
+        return Row(shot, str(layer))
+    return Row(shot, str(layer), "interrupted", frames=kept.frames, error=f"interrupted, {kept}")
+
+
 def exit_code_of(rows: Sequence[Row]) -> int:
-    """The exit code of a batch: that of all its shots where they agree, else 3."""
+    """The exit code of a batch that came to its end: that of all its shots where they agree, else 3."""
     codes = {row.exit_code for row in rows}
     only = codes.pop() if len(codes) == 1 else None
     return IN_PART if only is None else only
 
 
-def write_summary(path: Path, rows: Sequence[Row]) -> None:
+def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
     """Write rows as JSON, whole or not at all.
+
+    Args:
+        path: The file.
+        rows: One a shot.
+        exit_code: What the batch ends with.
 
     Raises:
         LayerError: The file cannot be written.
     """
-    plain: dict[str, Any] = {"format": FORMAT, "version": __version__, "exit_code": exit_code_of(rows)}
+    plain: dict[str, Any] = {"format": FORMAT, "version": __version__, "exit_code": exit_code}
     write_text(path, json.dumps(plain | {"shots": [asdict(row) for row in rows]}, indent=2) + "\n")
 
 
 def check_summary(path: Path, *, overwrite: bool) -> None:
-    """Refuse to write a summary over a file that is none.
+    """Refuse to write a summary over a file that is none, or where none can be written.
 
     Raises:
-        UsageError: The file exists, is no summary and may not be replaced.
+        UsageError: The file exists, is no summary and may not be replaced, or is a folder.
+        LayerError: Its folder cannot be written.
     """
+    check_place(path)
     if path.exists() and not (overwrite or _is_summary(path)):
         raise UsageError(f"{path} exists and is no summary; choose another name or allow overwriting")
 

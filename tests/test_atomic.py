@@ -16,7 +16,8 @@ from layers import vec3
 from pxr import Sdf
 
 from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.usd.atomic import HOST, leave_if_asked, remove_stale, temporary_path, termination_raises
+from physgraph_usd.interrupts import leave_if_asked, signals_raise
+from physgraph_usd.usd.atomic import HOST, remove_stale, temporary_path
 from physgraph_usd.usd.stream import LayerStream
 
 POINTS = Sdf.Path("/World/coat.points")
@@ -127,10 +128,10 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from pxr import Sdf, Vt
-from physgraph_usd.usd.atomic import termination_raises
+from physgraph_usd.interrupts import signals_raise
 from physgraph_usd.usd.stream import LayerStream
 points = Sdf.Path("/World/coat.points")
-with termination_raises(), LayerStream(Path(sys.argv[1]), overwrite=True) as stream:
+with signals_raise(), LayerStream(Path(sys.argv[1]), overwrite=True) as stream:
     stream.attribute(points, Sdf.ValueTypeNames.Point3fArray)
     for frame in range(100000):
         stream.set(points, Vt.Vec3fArray.FromNumpy(np.full((1000, 3), frame, np.float32)), time=float(frame))
@@ -172,7 +173,7 @@ def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path, number: s
 
 def write_on(target: Path) -> None:
     """Write although a termination signal came: its exception is lost, as it is in a destructor."""
-    with termination_raises(), LayerStream(target) as stream:
+    with signals_raise(), LayerStream(target) as stream:
         with suppress(SystemExit):
             signal.raise_signal(signal.SIGTERM)
         fill(stream, 2)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -107,22 +108,60 @@ def test_killed_at_any_moment_from_start_to_end(shot: Path, whole: bytes, tmp_pa
         assert command("refine", shot, "-o", out, *LINE, "--resume").returncode == 0
 
 
+def says_interrupted(out: Path, report: Path, summary: Path, *, code: int, of: int) -> int:
+    """Report and summary agree on what is kept, which is what lies there; returns how many frames that are."""
+    count = len(finished(out))
+    said = f"interrupted, {count} of {of} frames are kept in {frames_folder(out)}; --resume goes on from them"
+    plain, batch = (json.loads(file.read_text(encoding="utf-8")) for file in (report, summary))
+    assert (plain["exit_code"], plain["error"]) == (code, said if count else "interrupted, no frame is kept")
+    row = batch["shots"][0]
+    state, error = ("interrupted", said) if count else ("not done", "")
+    assert (batch["exit_code"], row["state"], row["frames"], row["error"]) == (code, state, count, error)
+    return count
+
+
 @pytest.mark.parametrize("workers", ["1", "2"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_polite_signal_keeps_finished_frames_and_nothing_else(
+def test_a_polite_signal_keeps_finished_frames_and_says_so(
     shot: Path, whole: bytes, tmp_path: Path, number: signal.Signals, workers: str
 ):
     """The run is resumed with another number of workers; the layer has the bytes of one that was left alone (S34)."""
     out = shot.parent / f"polite{number}{workers}" / "fine.usdc"
     out.parent.mkdir()
-    with running(shot, out, "--workers", workers) as process:
+    report, summary = tmp_path / "report.json", tmp_path / "summary.json"
+    with running(shot, out, "--workers", workers, "--report", str(report), "--summary", str(summary)) as process:
         process.send_signal(number)
         code = process.wait(timeout=30)
-    assert code != 0
+    assert code == 128 + number
     assert [file.name for file in out.parent.iterdir()] == [frames_folder(out).name]
     assert all(file.name == "run.json" or file in finished(out) for file in frames_folder(out).iterdir())
+    assert says_interrupted(out, report, summary, code=code, of=len(TIMES)) >= 3
     if (number, workers) == (signal.SIGTERM, "1"):
-        finishes(shot, out, whole, "--resume", "--workers", "2")
+        finishes(shot, out, whole, "--resume", "--workers", "2", "--report", str(report))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(40))
+def test_interrupted_at_any_moment_of_kernels_on_several_threads(
+    sample: Callable[[str], Path], tmp_path: Path, seed: int
+):
+    """No crash: threads end before what they work on is freed."""
+    rng = np.random.default_rng(seed)
+    number, workers = (signal.SIGTERM, signal.SIGINT)[seed % 2], "12"[seed // 2 % 2]
+    out, report, summary = tmp_path / "fine.usdc", tmp_path / "report.json", tmp_path / "summary.json"
+    line = ["refine", str(sample("sleeve")), "-o", str(out), "--report", str(report), "--summary", str(summary)]
+    process = subprocess.Popen([sys.executable, "-m", "physgraph_usd", *line, "--workers", workers])
+    try:
+        while process.poll() is None and not frames_folder(out).exists():
+            time.sleep(0.01)
+        time.sleep(float(rng.uniform(0.0, 6.0)))
+        process.send_signal(number)
+        code = process.wait(timeout=60)
+    finally:
+        process.kill()
+    if not out.exists():
+        assert code == 128 + number
+        says_interrupted(out, report, summary, code=code, of=24)
 
 
 def test_a_second_run_leaves_the_frames_of_the_first_alone(shot: Path, whole: bytes):
@@ -210,21 +249,62 @@ def _alive(group: int) -> bool:
 
 
 @pytest.mark.parametrize(("megabytes", "workers"), [(0.005, "1"), (0.005, "2"), (0.5, "1"), (2.0, "1")])
-def test_a_full_disk_is_a_clear_error(shot: Path, tmp_path: Path, megabytes: float, workers: str):
+def test_a_full_disk_is_a_clear_error_and_costs_no_finished_frame(
+    shot: Path, whole: bytes, tmp_path: Path, megabytes: float, workers: str
+):
     """Files may not grow beyond a limit, as on a disk that fills up early, in the middle and late."""
     limit = int(megabytes * 1e6)
 
     def fill() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    out = tmp_path / "fine.usdc"
+    out = shot.parent / f"full{megabytes}{workers}" / "fine.usdc"
+    out.parent.mkdir()
     done = command("refine", shot, "-o", out, *LINE, "--workers", workers, preexec_fn=fill)
     assert done.returncode == 1, done.stderr
     lines = done.stderr.strip().splitlines()
     assert lines[-1].startswith("error: "), done.stderr
     assert "Traceback" not in done.stderr
     assert str(out.name) in lines[-1]
-    assert not list(tmp_path.iterdir())
+    assert not out.exists()
+    count = len(finished(out))
+    assert count == (0 if megabytes < 0.1 else len(TIMES))
+    if count:
+        assert f"{count} of {len(TIMES)} frames are kept in {frames_folder(out)}; --resume goes on" in done.stderr
+        finishes(shot, out, whole, "--resume")
+    assert [file for file in out.parent.iterdir() if file != out] == []
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_pipe_that_nobody_reads_any_more_costs_nothing(shot: Path, tmp_path: Path, stream: str):
+    read, write = os.pipe()
+    os.close(read)
+    out = tmp_path / "fine.usdc"
+    line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), "--frames", "1:3", "-v"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | {stream: write}
+    try:
+        assert subprocess.run([*line, "--progress"], **quiet, check=False, timeout=120).returncode == 0
+    finally:
+        os.close(write)
+    assert faults(out, shot) == []
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+def test_a_log_on_a_full_disk_costs_nothing(shot: Path, tmp_path: Path):
+    out = tmp_path / "fine.usdc"
+    done = command("refine", shot, "-o", out, "--frames", "1:3", "--log-file", "/dev/full", "-v")
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("cannot write /dev/full") == 1
+    assert faults(out, shot) == []
+
+
+def test_a_summary_that_cannot_be_written_is_told_before_the_work(shot: Path, tmp_path: Path):
+    (tmp_path / "file").touch()
+    out = tmp_path / "fine.usdc"
+    done = command("refine", shot, "-o", out, "--summary", tmp_path / "file" / "summary.json")
+    assert done.returncode == 2, done.stderr
+    assert not out.exists()
 
 
 @pytest.mark.slow

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
@@ -47,7 +48,7 @@ class Saying:
         logger, on_stderr = logging.getLogger(LOGGER), _OnStderr(_LEVELS[min(self.verbose, 2)], self.several)
         handlers: list[logging.Handler] = [on_stderr]
         if self.log_file is not None:
-            into_file = logging.FileHandler(self.log_file, encoding="utf-8")
+            into_file = _IntoFile(self.log_file, encoding="utf-8")
             into_file.setLevel(_LEVELS[max(min(self.verbose, 2), 1)])
             into_file.setFormatter(logging.Formatter(_LINE, defaults={"shot": "-"}))
             handlers.append(into_file)
@@ -94,7 +95,39 @@ class _OnStderr(logging.Handler):
         """Print a record."""
         kind = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
         shot = getattr(record, "shot", "") if self._several else ""
-        click.echo(f"{kind}{shot}{': ' if shot else ''}{record.getMessage()}", err=True)
+        say(f"{kind}{shot}{': ' if shot else ''}{record.getMessage()}", err=True)
+
+
+class _IntoFile(logging.FileHandler):
+    """The log; a disk that fills up ends the log and not the run."""
+
+    _full = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Say once that the log ends here; called by `logging`."""
+        if not self._full:
+            self._full = True
+            say(f"warning: cannot write {self.baseFilename}: {sys.exc_info()[1]}; the log ends here", err=True)
+
+    def close(self) -> None:
+        """Close the file, whatever became of it."""
+        with suppress(OSError):
+            super().close()
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print a line; a terminal or pipe that is gone costs the line and not the work."""
+    try:
+        click.echo(text, err=err)
+    except OSError:
+        _to_nowhere(sys.stderr if err else sys.stdout)
+
+
+def _to_nowhere(stream: TextIO) -> None:
+    """Let what is still to be printed go nowhere, so that Python's own flush at the end does not fail either."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def tell(part: float, seconds: float, what: str) -> None:
@@ -106,7 +139,7 @@ def tell(part: float, seconds: float, what: str) -> None:
         what: What is done.
     """
     left = f"about {seconds / 60.0:.0f} min left" if seconds > 90.0 else f"about {seconds:.0f} s left"
-    click.echo(f"{part:4.0%}  {left:20s}  {what}", err=True)
+    say(f"{part:4.0%}  {left:20s}  {what}", err=True)
 
 
 def outline(value: Any, indent: str = "") -> Iterator[str]:

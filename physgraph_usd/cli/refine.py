@@ -24,9 +24,9 @@ from .options import (
     scene_options,
     solve_options,
 )
-from .printing import LOGGER, Saying
+from .printing import LOGGER, Saying, say
 from .show_file import values_for
-from .structure import GroupedCommand
+from .structure import FAILED, GroupedCommand
 
 if TYPE_CHECKING:
     from ..options import RefineOptions
@@ -59,8 +59,8 @@ def refine(
     Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
     comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
     """
+    from ..interrupts import signals_raise
     from ..shot import check_jobs
-    from ..usd.atomic import termination_raises
 
     jobs = _jobs(ctx, shots, out)
     layers = [layer for _, layer, _ in jobs]
@@ -69,7 +69,7 @@ def refine(
     also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
     if also:
         check_jobs(jobs, also=also)
-    with termination_raises(), _folder_of(layers, out, dry_run=dry_run), saying.logged():
+    with signals_raise(), _folder_of(layers, out, dry_run=dry_run), saying.logged():
         code = _refine_each(jobs, saying, summary=None if dry_run else summary)
     sys.exit(code)
 
@@ -93,7 +93,8 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
 
 def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -> int:
     """Refine the jobs and say of each what became of it; returns the exit code."""
-    from ..summary import check_summary, exit_code_of, row_of, table_of, write_summary
+    from .. import interrupts
+    from ..summary import check_summary, exit_code_of, row_of
 
     if summary is not None:
         check_summary(summary, overwrite=jobs[0][2].overwrite)
@@ -105,17 +106,26 @@ def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -
             if isinstance(done, PhysGraphError):
                 failed.append(done)
             else:
-                click.echo(done.to_json() if done.out is None else done.out)
-    finally:
+                say(done.to_json() if done.out is None else str(done.out))
+    except (KeyboardInterrupt, SystemExit) as error:
         rows += [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
-        if saying.several:
-            click.echo("\n".join(table_of(rows)), err=True)
-        if summary is not None:
-            write_summary(summary, rows)
+        _say_all(rows, saying, summary, exit_code=interrupts.exit_code_of(error) or FAILED)
+        raise
+    _say_all(rows, saying, summary, exit_code=exit_code_of(rows))
     if failed and not saying.several:
         raise failed[0]
     _say_failed(rows)
     return exit_code_of(rows)
+
+
+def _say_all(rows: Sequence[Row], saying: Saying, summary: Path | None, *, exit_code: int) -> None:
+    """Print and write what became of all shots."""
+    from ..summary import table_of, write_summary
+
+    if saying.several:
+        say("\n".join(table_of(rows)), err=True)
+    if summary is not None:
+        write_summary(summary, rows, exit_code=exit_code)
 
 
 def _say_failed(rows: Sequence[Row]) -> None:
@@ -124,7 +134,7 @@ def _say_failed(rows: Sequence[Row]) -> None:
     for row in failed:
         logging.getLogger(LOGGER).error(row.error, extra={"shot": row.shot})
     if failed:
-        click.echo(f"{len(failed)} of {len(rows)} shots failed", err=True)
+        say(f"{len(failed)} of {len(rows)} shots failed", err=True)
 
 
 def _results(jobs: Sequence[Job], saying: Saying) -> Iterator[RefineReport | PhysGraphError]:
@@ -180,9 +190,9 @@ def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, acc
 def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
     """Make the folder that layers go into, unless ``out`` names a layer; it goes again where nothing came into it.
 
-    Finished frames that are left by an interruption are named.
+    Finished frames that an interruption or an error left are named.
     """
-    from ..frames import frames_folder
+    from ..frames import kept_for
     from ..lock import is_held
 
     made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
@@ -194,9 +204,9 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
             raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
         yield
     finally:
-        for kept in filter(Path.is_dir, map(frames_folder, layers)):
-            if not is_held(kept):
-                click.echo(f"finished frames are kept in {kept}; --resume goes on from them", err=True)
+        for kept in filter(None, map(kept_for, layers)):
+            if not is_held(kept.folder):
+                say(str(kept), err=True)
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()

@@ -9,7 +9,7 @@ import click
 
 from ..errors import PhysGraphError, UsageError
 
-DONE, FAILED, WRONG_USAGE, IN_PART = 0, 1, 2, 3
+DONE, FAILED, WRONG_USAGE, IN_PART, INTERRUPTED = 0, 1, 2, 3, 130
 EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
 """Which extra brings a module that only some commands need."""
 
@@ -24,6 +24,9 @@ class Commands(click.Group):
         try:
             with memory_is_named():
                 return super().invoke(ctx)
+        except KeyboardInterrupt:
+            click.echo("interrupted", err=True)
+            ctx.exit(INTERRUPTED)
         except PhysGraphError as error:
             _leave(ctx, str(error), code_of(error))
         except OSError as error:

@@ -10,13 +10,15 @@ import copy
 import functools
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 
 import torch
 import warp as wp
+
+from ..interrupts import undisturbed
 
 _STDERR = 2
 LEAST_PER_LANE = 4000
@@ -113,9 +115,18 @@ class Launch:
             for command in self._commands:
                 command.launch(stream=stream)
             return
+        if self._lanes == 1:
+            _run(iter(self._commands))
+            return
         left = iter(self._commands)  # A list's iterator hands each command to one thread only.
-        others = [_pool(self._lanes).submit(_run, left) for _ in range(self._lanes - 1)]
-        _run(left)
+        others: list[Future[None]] = []
+        with undisturbed:  # The caller's arrays may go only when nobody works on them any more.
+            try:
+                for _ in range(self._lanes - 1):
+                    others.append(_pool(self._lanes).submit(_run, left))
+                _run(left)
+            finally:
+                wait(others)
         for other in others:
             other.result()
 

@@ -9,14 +9,10 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import socket
 import tempfile
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 
 from ..errors import LayerError, UsageError
 
@@ -163,42 +159,3 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-@contextmanager
-def termination_raises() -> Iterator[None]:
-    """Turn a polite termination signal into SystemExit, so that ``with`` blocks clean up.
-
-    An exception that a signal raises while a destructor runs is lost; `leave_if_asked` raises it again. Does nothing
-    outside the main thread, or where the host program handles the signal itself.
-    """
-    ours = threading.current_thread() is threading.main_thread()
-    if not ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, _raise_exit)
-    try:
-        yield
-    finally:
-        _asked.clear()
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-_asked: list[int] = []
-"""Signals that came, until the block that turns them into SystemExit ends."""
-
-
-def leave_if_asked() -> None:
-    """Leave where a termination signal came and its exception was lost.
-
-    Raises:
-        SystemExit: As a shell reports the signal.
-    """
-    if _asked:
-        raise SystemExit(128 + _asked[-1])
-
-
-def _raise_exit(number: int, frame: FrameType | None) -> None:
-    """Signal handler: leave as a shell reports a signal."""
-    _asked.append(number)
-    raise SystemExit(128 + number)

@@ -12,7 +12,8 @@ from typing import Any
 from pxr import Sdf, Tf
 
 from ..errors import LayerError
-from .atomic import leave_if_asked, prepare_target, publish, temporary_path
+from ..interrupts import leave_if_asked
+from .atomic import prepare_target, publish, temporary_path
 from .files import LAYER_SUFFIXES, check_suffix
 from .stage import reason_of
 
@@ -131,7 +132,7 @@ class LayerStream:
 
         Raises:
             LayerError: The disk is full or gone.
-            SystemExit: A termination signal came.
+            KeyboardInterrupt, SystemExit: A signal came, and its exception was lost.
         """
         leave_if_asked()
         if self.target is not None:

@@ -19,7 +19,6 @@ from pxr import Sdf, Usd, UsdGeom
 from ..errors import LayerError, UsageError
 from ..mesh.subdivide import Refinement
 from . import overs, provenance
-from .atomic import termination_raises
 from .carry import FineMap
 from .chunk import CHUNK, Chunk
 from .files import check_targets, files_of
@@ -87,7 +86,6 @@ class LayerWriter:
         self._chunk, self._meshes = chunk, dict[int, _RefinedMesh]()
         self.notices: list[Notice] = []
         with ExitStack() as stack:
-            stack.enter_context(termination_raises())
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
             self._author_still(refinements)
             self._cleanup = stack.pop_all()
