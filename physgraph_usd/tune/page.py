@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import html
-import sys
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import viser
-
 from ..errors import PhysGraphError
 from ..fabric import PRESETS
 from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
 from .figures import figures
+from .guard import guarded_server
 from .loop import SolveLoop
 from .picture import PLAIN, SHOWS, Picture
 from .session import Shown, TuneSession
@@ -39,7 +36,7 @@ class TunePage:
     """A session in the browser, served to this machine alone.
 
     Attributes:
-        url: Where the page is.
+        url: Where the page is, with the secret that opens it.
         loop: The thread that solves.
     """
 
@@ -51,9 +48,7 @@ class TunePage:
             port: Port on this machine; the next free one where it is taken.
         """
         self._session, self._garment = session, session.garments[0]
-        with redirect_stdout(sys.stderr):  # Its banner; stdout is for the page's address.
-            self._server = viser.ViserServer(host="127.0.0.1", port=port, label="physgraph-usd tune", verbose=False)
-        self.url = f"http://127.0.0.1:{self._server.get_port()}"
+        self._server, self.url = guarded_server(port=port, label="physgraph-usd tune")
         self._picture = Picture(self._server, session)
         self._sliders: dict[str, tuple[Any, Any]] = {}
         self._follow = False  # Whether sliders go to new values; not under the artist's hand.
