@@ -281,9 +281,10 @@ def test_a_pipe_that_nobody_reads_any_more_costs_nothing(shot: Path, tmp_path: P
     os.close(read)
     out = tmp_path / "fine.usdc"
     line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), "--frames", "1:3", "-v"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | {stream: write}
+    out_to, err_to = (write if stream == name else subprocess.DEVNULL for name in ("stdout", "stderr"))
     try:
-        assert subprocess.run([*line, "--progress"], **quiet, check=False, timeout=120).returncode == 0
+        done = subprocess.run([*line, "--progress"], stdout=out_to, stderr=err_to, check=False, timeout=120)
+        assert done.returncode == 0
     finally:
         os.close(write)
     assert faults(out, shot) == []
