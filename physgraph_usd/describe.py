@@ -14,7 +14,7 @@ from .estimate import cannot_fit, estimate
 from .integrate import LEARNED
 from .mesh.defects import defects
 from .options import RefineOptions
-from .report import RefineReport
+from .report import RefineReport, of_a_kind
 from .resolution import LevelChoice, carries_none, choose_levels, sample_frames
 from .scene import Frame, Garment, GarmentFrame
 from .strain import strained_parts, stretched
@@ -113,7 +113,7 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
             garment.path: [defect.message for defect in defects(garment.mesh, garment.rest)]
             for garment in opened.scene.garments
         },
-        "warnings": warnings,
+        "warnings": [*of_a_kind(warnings)],
     }
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ SIGNALLED = 128
 """Added to a signal's number, as shells report it."""
 LOG = logging.getLogger("physgraph_usd")
 """Where warnings and progress go, for the whole package."""
+MOST_ALONE = 3
+"""Prims that each get a warning of a kind; more of them get one together."""
+_OF_PRIM, _DIFFERS = re.compile(r"<([^>]+)>(?=[: ])"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
 _GARMENT: dict[str, Any] = dict.fromkeys(
     (
@@ -57,7 +61,8 @@ class RefineReport:
         unsettled: Frames that were written though the solver left them unsettled: path, time and in what way.
         strict: Whether a run with unsettled frames counts as done in part.
         variants: Variant selections in force on what the garments depend on, as paths ``/World/coat{fit=loose}``.
-        warnings: What the user should know.
+        warnings: What the user should know; what is so of many prims is one of them, which names a few.
+        warned: All prims that such a warning is about.
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB]; None where the system does not tell.
         error: What ended the run; "" for one that came to its end.
@@ -79,6 +84,7 @@ class RefineReport:
     strict: bool = False
     variants: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    warned: dict[str, list[str]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float | None = None
     error: str = ""
@@ -111,10 +117,11 @@ class RefineReport:
         return sum(side["after"]["crossings"] for side in sides if side) if found else None
 
     def warn(self, *warnings: str) -> None:
-        """Take warnings that are not there yet, and log them."""
-        for warning in warnings:
+        """Take warnings that are not there yet, those of a kind about many prims as one, and log them."""
+        for warning, paths in of_a_kind(warnings).items():
             if warning not in self.warnings:
                 self.warnings.append(warning)
+                self.warned |= {warning: paths} if paths else {}
                 LOG.warning(warning, extra={"shot": self.shot})
 
     def to_dict(self) -> dict[str, Any]:
@@ -140,6 +147,35 @@ class RefineReport:
             LayerError: It cannot be written.
         """
         write_text(path, self.to_json() + "\n")
+
+
+def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
+    """Warnings without those that are there twice, and one for all that tell the same of many prims, in order.
+
+    Warnings are of a kind where only their prims and figures differ.
+
+    Args:
+        warnings: What is to be told; those of prims begin with the prim's path in angle brackets.
+
+    Returns:
+        Each with the paths of the prims that it is about; none where it is as it was given.
+    """
+    kinds: dict[str, list[str]] = {}
+    for warning in dict.fromkeys(warnings):
+        about = _OF_PRIM.match(warning)
+        kinds.setdefault(_DIFFERS.sub("#", warning) if about else warning, []).append(warning)
+    found: dict[str, list[str]] = {}
+    for alike in kinds.values():
+        paths = list(dict.fromkeys(match[1] for match in map(_OF_PRIM.match, alike) if match))
+        found |= {warning: [] for warning in alike} if len(paths) <= MOST_ALONE else {_for_all(alike, paths): paths}
+    return found
+
+
+def _for_all(alike: Sequence[str], paths: Sequence[str]) -> str:
+    """One warning for many of a kind; its figures are those of the first."""
+    said = [warning.partition(">")[2] for warning in alike]
+    figures = "" if len(set(said)) == 1 else " (the figures are those of the first)"
+    return f"{len(paths):,} prims, e.g. <{paths[0]}>, <{paths[1]}>{said[0]}{figures}"
 
 
 def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:

@@ -409,6 +409,7 @@ def _write_layer(
     chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
     times, leads = _to_solve(opened, chunk, options)
     began, provenance = clock.perf_counter(), _provenance(opened, out, options)
+    known = len(opened.warnings)  # What is said of the shot itself has been.
     made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite, "chunk": chunk}
     refinements = Refiner.subdivide(opened.scene, solver.levels)
     with ExitStack() as stack:
@@ -422,7 +423,7 @@ def _write_layer(
         layer = writer.layer if out is None else None
     report.strict = options.strict
     report.seconds["frames"] = clock.perf_counter() - began
-    report.warn(*map(str, opened.warnings))
+    report.warn(*map(str, opened.warnings[known:]))
     return layer
 
 

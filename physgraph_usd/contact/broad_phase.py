@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,22 +47,46 @@ class Parts:
         """
         count = len(frames)
         whole = [not has_collapsed(garment, own.points) for garment, own in zip(self._garments, frames, strict=True)]
-        near = np.zeros((count, count), bool)
         trees: dict[int, cKDTree] = {}
-        for a in range(count if self._together else 0):
-            for b in range(a + 1, count):
-                feel = whole[a] and whole[b] and touch_one_another(self._garments[a], self._garments[b])
-                near[a, b] = feel and self._close(a, b, frames, trees)
-        graph: Any = sparse.csr_matrix(near)
-        labels = csgraph.connected_components(graph, directed=False)[1]
-        return [tuple(np.flatnonzero(labels == label).tolist()) for label in dict.fromkeys(labels.tolist())]
+        near = [
+            (a, b)
+            for a, b in (self._boxes_meet(frames) if self._together else ())
+            if whole[a] and whole[b] and touch_one_another(self._garments[a], self._garments[b])
+            if self._close(a, b, frames, trees)
+        ]
+        ends = np.array(near, np.int64).reshape(-1, 2)
+        graph: Any = sparse.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        parts: dict[int, list[int]] = {}
+        for index, label in enumerate(csgraph.connected_components(graph, directed=False)[1].tolist()):
+            parts.setdefault(label, []).append(index)
+        return [tuple(part) for part in parts.values()]
+
+    def _reach(self, index: int, frame: GarmentFrame) -> float:
+        """A garment's part of the distance at which it counts as near another [m]."""
+        return 0.5 * frame.fabric.thickness + (0.5 * REACH + 1.0) * self._edges[index]
+
+    def _boxes_meet(self, frames: Sequence[GarmentFrame]) -> Iterator[tuple[int, int]]:
+        """Pairs of cages whose bounds, grown by their reach, meet: in order of number, by a sweep along one axis."""
+        bounds = np.array([bounds_of(frame.points) for frame in frames]).reshape(-1, 2, 3)
+        reach = np.array([self._reach(index, frame) for index, frame in enumerate(frames)])[:, None]
+        low, high = bounds[:, 0] - reach, bounds[:, 1] + reach
+        kept = np.flatnonzero((low <= high).all(axis=1))  # Those of no finite points meet none.
+        if not len(kept):
+            return
+        axis = int(np.ptp(low[kept], axis=0).argmax())
+        kept = kept[np.argsort(low[kept, axis], kind="stable")]
+        low, high = low[kept], high[kept]
+        ends = np.searchsorted(low[:, axis], high[:, axis], side="right")
+        found = []
+        for place, end in enumerate(ends.tolist()):
+            others = slice(place + 1, end)
+            meets = (low[others] <= high[place]).all(axis=1) & (low[place] <= high[others]).all(axis=1)
+            found += [sorted((kept[place], other)) for other in kept[others][meets]]
+        yield from sorted((int(a), int(b)) for a, b in found)
 
     def _close(self, a: int, b: int, frames: Sequence[GarmentFrame], trees: dict[int, cKDTree]) -> bool:
-        thickness = 0.5 * (frames[a].fabric.thickness + frames[b].fabric.thickness)
-        reach = thickness + (0.5 * REACH + 1.0) * (self._edges[a] + self._edges[b])
-        first, second = bounds_of(frames[a].points), bounds_of(frames[b].points)
-        if not ((first[0] - reach <= second[1]).all() and (second[0] <= first[1] + reach).all()):
-            return False
+        """Whether vertices of two cages are as near as their reach, and they are no copies."""
+        reach = self._reach(a, frames[a]) + self._reach(b, frames[b])
         for index in (a, b):
             points = frames[index].points
             trees[index] = trees.get(index) or cKDTree(points[np.isfinite(points).all(axis=1)])

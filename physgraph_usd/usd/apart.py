@@ -31,12 +31,11 @@ def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dic
         own, odd = _named(stage, prim)
         found.append(own)
         notices += odd
-    places = [prim.GetPath() for prim in garments]
-    for index, own in enumerate(found):
-        own.pop(places[index], None)
-        for other, place in enumerate(places):
-            if place in own:
-                found[other].setdefault(places[index], own[place])
+    numbers = {prim.GetPath(): index for index, prim in enumerate(garments)}
+    for (place, _), own in zip(numbers.items(), found, strict=True):
+        own.pop(place, None)
+        for path in [path for path in own if path in numbers]:
+            found[numbers[path]].setdefault(place, own[path])
     return found, notices
 
 

@@ -69,22 +69,32 @@ def find_colliders(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Seque
         StageError: When a named one is not there.
     """
     chosen = {path for item in wanted for path in find_paths(stage, item, UsdGeom.Gprim)}
-    for prim in () if wanted else garments:
-        chosen |= felt_by(stage, prim)
+    chosen = chosen.union(*(() if wanted else felt_by(stage, garments)))
     own = {prim.GetPath() for prim in garments}
     return [prim for prim in traverse(stage) if prim.GetPath() in chosen - own]
 
 
-def felt_by(stage: Usd.Stage, garment: Usd.Prim, wanted: Sequence[str] = ()) -> set[Sdf.Path]:
-    """Paths of the gprims that one garment may collide with; arguments as for ``find_colliders``.
+def felt_by(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str] = ()) -> list[frozenset[Sdf.Path]]:
+    """For each garment, paths of the gprims that it may collide with; arguments as for ``find_colliders``.
 
     Raises:
         StageError: When a named one is not there.
     """
-    named = wanted or [str(target) for target in targets_of(garment, _COLLIDERS_RELATIONSHIP)]
+    found: dict[tuple[str, ...], frozenset[Sdf.Path]] = {}  # Many garments name the same, mostly nothing.
+    each = []
+    for garment in garments:
+        named = tuple(wanted or map(str, targets_of(garment, _COLLIDERS_RELATIONSHIP)))
+        if named not in found:
+            found[named] = _colliders_named(stage, named)
+        each.append(found[named])
+    return each
+
+
+def _colliders_named(stage: Usd.Stage, named: Sequence[str]) -> frozenset[Sdf.Path]:
+    """Gprims that are named, or where none is those of every collider of the stage."""
     if named:
-        return {path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)}
-    return {path for prim in traverse(stage) if _collides(prim) for path in _gprims_below(prim, UsdGeom.Gprim)}
+        return frozenset(path for item in named for path in find_paths(stage, item, UsdGeom.Gprim))
+    return frozenset(path for prim in traverse(stage) if _collides(prim) for path in _gprims_below(prim, UsdGeom.Gprim))
 
 
 def instance_roots(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:

@@ -95,9 +95,9 @@ class Shot:
             apart: For each garment, the paths of colliders and garments that it never touches, and what says so.
         """
         self._bodies = tuple(bodies)
-        paths = [garment.path for garment in self.scene.garments]
+        paths = {garment.path for garment in self.scene.garments}
         garments = (
-            replace(garment, colliders=own, apart_from=tuple(path for path in paths if path in excluded))
+            replace(garment, colliders=own, apart_from=tuple(path for path in excluded if path in paths))
             for garment, own, excluded in zip(self.scene.garments, felt, apart, strict=True)
         )
         colliders = tuple(body.collider for body in bodies)
@@ -132,17 +132,18 @@ class Shot:
             SchemaError: When an animated value cannot be used.
             StageError: When USD cannot read the files any more.
         """
-        garments = []
+        garments, told = [], []
         with pxr_errors(f"cannot read {self.path}" + ("" if time is None else f" at time code {time:g}")):
             for index, reader in enumerate(self._readers):
                 garment, notices = reader.frame(self.to_metres(index, time), time)
                 garments.append(garment)
-                self._tell(notices)
+                told += notices
             poses = []
             for body in self._bodies:
                 pose, notices = body.pose(time)
                 poses.append(pose)
-                self._tell(notices)
+                told += notices
+        self._tell(told)
         frame = Frame(time, tuple(garments), tuple(poses))
         refuse_far(self.scene, frame)
         return frame
@@ -173,7 +174,8 @@ class Shot:
 
     def _tell(self, notices: Sequence[Notice]) -> None:
         """Add what was not said before to the warnings."""
-        self.warnings.extend(notice for notice in notices if notice not in self.warnings)
+        known = set(self.warnings) if notices else set()
+        self.warnings.extend(notice for notice in dict.fromkeys(notices) if notice not in known)
 
     def close(self) -> None:
         """Let go of the stage; nothing can be read afterwards."""
@@ -279,20 +281,21 @@ def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) 
 def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str], *, notices: list[Notice]) -> None:
     """Read the colliders and which garment feels which; those that all are kept apart from are not read."""
     prims = [shot.stage.GetPrimAtPath(source.path) for source in shot.sources]
-    named = [felt_by(shot.stage, prim, wanted) for prim in prims]
+    named = felt_by(shot.stage, prims, wanted)
     excluded, odd = read_apart(shot.stage, prims)
     notices += odd
     cloth = {prim.GetPath() for prim in prims}
     apart = [{p: said for p, said in off.items() if p in own | cloth} for own, off in zip(named, excluded, strict=True)]
     felt = [{str(path) for path in own - set(off)} for own, off in zip(named, apart, strict=True)]
-    bodies = []
+    bodies, anywhere = [], set[str]().union(*felt)
     for path in paths:
-        if not any(str(path) in own for own in felt):
+        if str(path) not in anywhere:
             continue
         body, odd = read_collider(shot.stage.GetPrimAtPath(path), shot.metres_per_unit)
         notices += odd
         bodies += [body] if body is not None else []
-    numbers = [tuple(i for i, body in enumerate(bodies) if body.collider.path in own) for own in felt]
+    order = {body.collider.path: number for number, body in enumerate(bodies)}
+    numbers = [tuple(sorted(order[path] for path in own & order.keys())) for own in felt]
     shot.add_colliders(bodies, numbers, [{str(path): said for path, said in off.items()} for off in apart])
 
 

@@ -1,0 +1,134 @@
+"""Shots of many small garments: the work grows with their number, not with its square, and so do the warnings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cloth import frame_of, sheet
+from pxr import Gf, Usd, UsdGeom
+from sheets import garment_of
+from shots import refine
+from stages import add_sheet, new_stage
+
+from physgraph_usd.contact.broad_phase import Parts
+from physgraph_usd.report import of_a_kind
+from physgraph_usd.scene import Garment, GarmentFrame
+from physgraph_usd.shot import inspect_shot
+from physgraph_usd.usd.find import felt_by, find_colliders
+
+MESH, REST = sheet(2, 2)
+FEW, FACTOR = 40, 8
+
+
+def sheets(path: Path, count: int) -> Usd.Stage:
+    """Sheets far from one another; the last is kept apart from the first."""
+    stage = new_stage(path, metres=0.05)
+    for index in range(count):
+        mesh = add_sheet(stage, f"/World/g{index}", size=(1, 1), times=(1.0,), default=False)
+        UsdGeom.XformCommonAPI(mesh).SetTranslate(Gf.Vec3d(10.0 * index, 0.0, 0.0))
+    last = stage.GetPrimAtPath(f"/World/g{count - 1}")
+    last.CreateRelationship("physgraph:contact:exclude").AddTarget("/World/g0")
+    stage.Save()
+    return stage
+
+
+def calls(run: Callable[[], Any]) -> int:
+    """How many calls of functions something makes: time that no other process disturbs."""
+    count = 0
+
+    def one(frame: object, event: str, argument: object) -> None:
+        nonlocal count
+        count += event.endswith("call")
+
+    sys.setprofile(one)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+def linear(run: Callable[[int], Any]) -> bool:
+    """Whether the calls made for many are at most as many times those for a few as there are more, and a half."""
+    return calls(lambda: run(FACTOR * FEW)) < 1.5 * FACTOR * calls(lambda: run(FEW))
+
+
+def scattered(count: int, spread: float) -> tuple[list[Garment], list[GarmentFrame]]:
+    """Small sheets at random places."""
+    places = np.random.default_rng(3).uniform(0.0, spread, (count, 3))
+    garments = [replace(garment_of(MESH, REST), path=f"/World/g{index}") for index in range(count)]
+    return garments, [frame_of(REST + place).garments[0] for place in places]
+
+
+@pytest.fixture(scope="module")
+def stages(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Usd.Stage]:
+    folder = tmp_path_factory.mktemp("many")
+    return {count: sheets(folder / f"{count}.usda", count) for count in (FEW, FACTOR * FEW)}
+
+
+@pytest.mark.parametrize("look", [find_colliders, felt_by])
+def test_what_they_touch_is_looked_for_in_time_that_grows_with_their_number(
+    stages: dict[int, Usd.Stage], look: Callable[..., Any]
+):
+    def run(count: int) -> None:
+        look(stages[count], [stages[count].GetPrimAtPath(f"/World/g{index}") for index in range(count)])
+
+    assert linear(run)
+
+
+def test_those_that_meet_are_looked_for_in_time_that_grows_with_their_number():
+    given = {count: scattered(count, 10.0 * count) for count in (FEW, FACTOR * FEW)}
+    assert linear(lambda count: Parts(given[count][0], together=True).of(given[count][1]))
+
+
+@pytest.mark.parametrize("spread", [0.5, 2.0, 8.0])
+def test_those_that_meet_are_found_as_by_looking_at_every_pair(spread: float):
+    garments, frames = scattered(40, spread)
+    found = Parts(garments, together=True).of(frames)
+    pairs = [
+        (a, b)
+        for a in range(40)
+        for b in range(a + 1, 40)
+        if len(Parts([garments[a], garments[b]], together=True).of([frames[a], frames[b]])) == 1
+    ]
+    assert found == joined(40, pairs)
+
+
+def joined(count: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
+    """Numbers in groups that pairs join, by their least."""
+    parts = {index: {index} for index in range(count)}
+    for a, b in pairs:
+        both = parts[a] | parts[b]
+        parts |= dict.fromkeys(both, both)
+    return sorted({tuple(sorted(part)) for part in parts.values()})
+
+
+class TestWarnings:
+    def test_of_a_kind_are_one(self):
+        given = [f"</g{index}>: edges of {index + 0.5} mm" for index in range(5)] + ["</g1>: is still", "stage: odd"]
+        assert of_a_kind(given) == {
+            "5 prims, e.g. </g0>, </g1>: edges of 0.5 mm (the figures are those of the first)": [
+                f"/g{index}" for index in range(5)
+            ],
+            "</g1>: is still": [],
+            "stage: odd": [],
+        }
+
+    def test_of_a_few_prims_stay_as_they_are(self):
+        given = [f"</g{index}>: is still" for index in range(3)]
+        assert of_a_kind([*given, *given]) == {each: [] for each in given}
+
+    def test_of_a_shot_name_all_prims_in_the_report(self, tmp_path: Path):
+        shot = tmp_path / "shot.usda"
+        sheets(shot, 5)
+        report = refine(shot, tmp_path / "fine.usdc")
+        (said,) = [each for each in report.warnings if "waves" in each]
+        assert said.startswith("5 prims, e.g. </World/g0>, </World/g1>: ")
+        assert report.warned[said] == [f"/World/g{index}" for index in range(5)]
+        assert said in inspect_shot(shot, level=1)["warnings"]
