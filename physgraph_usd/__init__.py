@@ -18,6 +18,7 @@ from .version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .errors import (
+        AbsentError,
         GarmentError,
         LayerError,
         PhysGraphError,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PRESETS",
+    "AbsentError",
     "Fabric",
     "GarmentError",
     "LayerError",
@@ -62,6 +64,7 @@ __all__ = [
 
 _ROOMS = {
     "errors": (
+        "AbsentError",
         "GarmentError",
         "LayerError",
         "PhysGraphError",

@@ -2,6 +2,7 @@
 
     PhysGraphError
     |-- UsageError          an option or argument is wrong (exit code 2)
+    |   `-- AbsentError     a file or a prim that was named is not there; a StageError too
     |-- StageError          the input stage cannot be read as asked
     |   |-- GarmentError    one garment prim is broken: names prim, time code and remedy
     |   `-- SchemaError     an attribute has an unusable type or value
@@ -18,7 +19,13 @@ from typing import Any
 
 
 class PhysGraphError(Exception):
-    """Root of all errors raised on purpose; its text is meant for the user."""
+    """Root of all errors raised on purpose; its text is meant for the user.
+
+    Attributes:
+        exit_code: What a command that it ends leaves with.
+    """
+
+    exit_code = 1
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel between processes as text and fields, whatever the arguments of a subclass are."""
@@ -34,9 +41,15 @@ def _restored(kind: type[PhysGraphError], args: tuple[Any, ...], fields: dict[st
 class UsageError(PhysGraphError):
     """An option or argument is wrong; the command line exits with 2."""
 
+    exit_code = 2
+
 
 class StageError(PhysGraphError):
     """The input stage cannot be opened or read as asked."""
+
+
+class AbsentError(UsageError, StageError):
+    """A file or a prim that was named is not there."""
 
 
 class GarmentError(StageError):

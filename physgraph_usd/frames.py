@@ -20,6 +20,7 @@ import numpy as np
 from .errors import LayerError, UsageError
 from .lock import LOCK, FolderLock
 from .usd.atomic import temporary_path
+from .words import counted
 
 RUN = "run.json"
 """The file that says what decides the frames."""
@@ -85,7 +86,10 @@ class Kept:
 
     def __str__(self) -> str:
         """For a message."""
-        return f"{self.frames} of {self.of} frames are kept in {self.folder}; --resume goes on from them"
+        said = (
+            f"{self.frames} of {counted(self.of, 'frame')} {'is' if self.frames == 1 else 'are'} kept in {self.folder}"
+        )
+        return f"{said}; --resume goes on from {'it' if self.frames == 1 else 'them'}"
 
 
 def kept_for(layer: Path) -> Kept | None:
@@ -147,10 +151,9 @@ class FrameFolder:
         found = self._found()
         different = self._differences(wanted) if found else []
         if different and (resume or not drop):
-            raise UsageError(
-                f"{self.folder} holds {len(found)} finished frames of a run with other {', '.join(different[:3])}; "
-                "refine as then, or drop them by --overwrite without --resume"
-            )
+            holds = f"{self.folder} holds {counted(len(found), 'finished frame')} of a run"
+            remedy = "refine as then, or drop them by --overwrite without --resume"
+            raise UsageError(f"{holds} with other {', '.join(different[:3])}; {remedy}")
         self.kept = frozenset(found if resume else ())
         self.dropped = 0 if resume or different else len(found)
         if not self.kept:

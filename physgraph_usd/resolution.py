@@ -173,7 +173,7 @@ def too_coarse(path: str, level: int, shares: Mapping[float | None, float]) -> s
     worst = max(shares, key=lambda time: shares[time])
     at = "" if worst is None else f" at time code {worst:g}"
     return (
-        f"<{path}>{at}: {shares[worst]:.2g} of the edges fold by more than 45 degrees: level {level} is too coarse for "
+        f"<{path}>{at}: {shares[worst]:.0%} of the edges fold by more than 45 degrees: level {level} is too coarse for "
         f"this fabric and shows wrinkles of the mesh's own size; use level {level + 1} or raise bendStiffness"
     )
 

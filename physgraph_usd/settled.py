@@ -8,6 +8,7 @@ from itertools import groupby
 from typing import Any
 
 from .integrate.solve import FAR
+from .words import counted
 
 COLLAPSED = "collapsed"
 
@@ -113,7 +114,7 @@ def told_contact(path: str, entries: Mapping[float | None, Mapping[str, Any]]) -
         left = {time: count for time, count in counts.items() if count}
         if left:
             worst = max(left, key=lambda time: left[time])
-            others = f", and fewer in {len(left) - 1} other frames" if len(left) > 1 else ""
+            others = f", and fewer in {counted(len(left) - 1, 'other frame')}" if len(left) > 1 else ""
             code = "default" if worst is None else f"{worst:g}"
             said.append(f"<{path}> at time code {code}: {left[worst]:,} {what}{others}")
     return said

@@ -41,6 +41,7 @@ from .usd.stage import shot_name
 from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
 from .version import __version__, code_digest
+from .words import counted
 
 try:
     import resource
@@ -262,7 +263,7 @@ def _check_new(out: Path, options: RefineOptions) -> None:
 
 def _check_none(path: Path, options: RefineOptions) -> None:
     if path.is_file() and not (options.overwrite or is_of_failure(path)):
-        raise UsageError(f"{path} exists; choose another name or allow overwriting")
+        raise UsageError(f"{path} exists; choose another name or replace it by --overwrite")
 
 
 def _is_done(opened: Shot, out: Path, options: RefineOptions, report: RefineReport) -> bool:
@@ -302,8 +303,8 @@ def inspect_shot(shot: str | Path | Stage, **given: Any) -> dict[str, Any]:
         given: Options of `RefineOptions` that concern reading.
 
     Returns:
-        Plain values. Where the shot cannot be refined as asked, ``problem`` says why and ``meshes`` lists what is
-        there.
+        Plain values. Where the shot cannot be refined as asked, ``problem`` says why, ``meshes`` lists what is there,
+        and ``exit_code`` is 2 where a garment or collider that was named is not there, else 1.
 
     Raises:
         StageError: The file cannot be opened at all.
@@ -315,7 +316,7 @@ def inspect_shot(shot: str | Path | Stage, **given: Any) -> dict[str, Any]:
         with closing(_open(source, options)) as opened:
             return describe(opened, options)
     except StageError as error:
-        return describe_meshes(source, str(error))
+        return describe_meshes(source, str(error)) | {"exit_code": error.exit_code}
 
 
 def _open(shot: str | Stage, options: RefineOptions) -> Shot:
@@ -507,12 +508,14 @@ def _begin_after(outcome: Outcome, writer: LayerWriter) -> None:
 def _resumed(frames: FrameFolder, count: int, run_up: int) -> list[str]:
     """A warning where frames of an earlier run are used, or could have been."""
     if frames.dropped:
-        said = "finished frames of a run that was interrupted are solved anew; --resume would have used them"
-        return [f"{frames.dropped} {said}"]
+        one, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
+        dropped = counted(frames.dropped, "finished frame")
+        return [f"{dropped} of a run that was interrupted {one} solved anew; --resume would have used {them}"]
     if not frames.kept:
         return []
-    how = f", each stretch after {run_up} frames that are solved again" if run_up else ""
-    return [f"{len(frames.kept)} of {count} frames are those of a run that was interrupted; the others are solved{how}"]
+    how = f", each stretch after {counted(run_up, 'frame')} solved again" if run_up else ""
+    kept = f"{len(frames.kept)} of {counted(count, 'frame')}"
+    return [f"{kept} are those of a run that was interrupted; the others are solved{how}"]
 
 
 def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:

@@ -15,7 +15,6 @@ from .usd.atomic import check_place, write_text
 from .version import __version__
 
 SCHEMA = Path(__file__).with_name("summary.schema.json")
-WRONG_USAGE = 2
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,7 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
     if done is None:
         return _interrupted(str(shot), layer)
     if isinstance(done, PhysGraphError):
-        code = WRONG_USAGE if isinstance(done, UsageError) else FAILED
-        return Row(str(shot), str(layer), "failed", code, error=str(done))
+        return Row(str(shot), str(layer), "failed", done.exit_code, error=str(done))
     frames = len(done.frames)
     return Row(
         str(shot),
@@ -84,10 +82,11 @@ def _interrupted(shot: str, layer: Path) -> Row:
 
 
 def exit_code_of(rows: Sequence[Row]) -> int:
-    """The exit code of a batch that came to its end: that of all its shots where they agree, else 3."""
+    """The exit code of a batch that came to its end: that of all its shots where they agree; 1 where all failed; 3."""
     codes = {row.exit_code for row in rows}
-    only = codes.pop() if len(codes) == 1 else None
-    return IN_PART if only is None else only
+    if len(codes) == 1 and (only := codes.pop()) is not None:
+        return only
+    return FAILED if all(row.state == "failed" for row in rows) else IN_PART
 
 
 def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
@@ -114,7 +113,7 @@ def check_summary(path: Path, *, overwrite: bool) -> None:
     """
     check_place(path)
     if path.exists() and not (overwrite or _is_summary(path)):
-        raise UsageError(f"{path} exists and is no summary; choose another name or allow overwriting")
+        raise UsageError(f"{path} exists and is no summary; choose another name or replace it by --overwrite")
 
 
 def _is_summary(path: Path) -> bool:

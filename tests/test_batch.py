@@ -140,7 +140,7 @@ class TestSummary:
         monkeypatch.setattr("physgraph_usd.shot.refine_shots", interrupted)
         shots = [cloth_shot(tmp_path / f"{name}.usda", times=(1.0,)) for name in "ab"]
         run("refine", *shots, "-o", tmp_path, "--summary", tmp_path / "summary.json", *SMALL)
-        assert {row["state"] for row in rows_of(tmp_path / "summary.json").values()} == {"not begun"}
+        assert {row["state"] for row in rows_of(tmp_path / "summary.json").values()} == {"not done"}
 
     def test_crossings_of_garments_solved_together_count_once(self) -> None:
         from physgraph_usd.report import RefineReport

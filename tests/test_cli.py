@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import pickle
 import subprocess
 import sys
 import sysconfig
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -24,6 +26,7 @@ from physgraph_usd.cli.options import INTEGRATORS
 from physgraph_usd.cli.printing import Saying
 from physgraph_usd.cli.refine import refine
 from physgraph_usd.report import RefineReport
+from physgraph_usd.words import counted
 
 pytest.importorskip("pxr", reason="the commands read stages with usd-core")
 
@@ -279,6 +282,16 @@ class TestSeveralShots:
             assert any(f"{name}.usda: " in line and why in line for line in said), said
         assert (out / "done.refined.usdc").read_text() == (reports / "told").read_text() == "mine"
 
+    @pytest.mark.parametrize("names", [("torn", "absent"), ("absent", "absent too")])
+    def test_all_failed_is_no_part(self, tmp_path: Path, names: tuple[str, ...]) -> None:
+        """1, and 2 where each was told what is not there."""
+        shots = [tmp_path / f"{name}.usda" for name in names]
+        for shot in shots:
+            if shot.stem == "torn":
+                shot.write_text("#usda 1.0\ndef Mesh")
+        result = run("refine", *shots, "-o", tmp_path / "out", *SMALL)
+        assert result.exit_code == (1 if "torn" in names else 2), result.stderr
+
     def test_one_that_dies_leaves_the_others(self, tmp_path: Path) -> None:
         from physgraph_usd.options import RefineOptions
         from physgraph_usd.shot import refine_shots
@@ -341,14 +354,14 @@ class TestErrors:
         assert (result.exit_code, result.stdout) == (2, "")
         assert "rror: " in result.stderr
 
-    @pytest.mark.parametrize("command", ["refine", "inspect", "tag", "validate", "preview", "chart"])
-    def test_missing_file_is_1(self, command: str, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("command", ["refine", "stitch", "inspect", "tag", "validate", "preview", "chart"])
+    def test_missing_file_is_2(self, command: str, tmp_path: Path) -> None:
         out = {"inspect": (), "validate": (), "preview": ("-o", tmp_path / "x.png")}.get(
             command, ("-o", tmp_path / "x.usdc")
         )
         garment = ("--garment", "/A") if command == "tag" else ()
         result = run(command, tmp_path / "missing.usda", *out, *garment)
-        assert (result.exit_code, result.stdout) == (1, "")
+        assert (result.exit_code, result.stdout) == (2, "")
         assert result.stderr == f"error: no such file: {tmp_path / 'missing.usda'}\n"
         assert not list(tmp_path.iterdir())
 
@@ -389,12 +402,24 @@ class TestOtherCommands:
         assert "swatch" in text.stdout
         assert "times: 1, 2, 3, ..., 24 (24 in all)" in text.stdout
 
-    def test_inspect_of_what_cannot_be_refined_is_1(self, sample: Sample) -> None:
-        result = run("inspect", sample("swatch"), "--garment", "/trousers", "--json")
-        assert result.exit_code == 1
+    @pytest.mark.parametrize("option", ["--garment", "--collider"])
+    def test_a_prim_that_is_not_there_is_2(self, sample: Sample, tmp_path: Path, option: str) -> None:
+        result = run("inspect", sample("swatch"), option, "/trousers", "--json")
+        assert result.exit_code == 2
         found = json.loads(result.stdout)
         assert "no prim at </trousers>" in found["problem"]
         assert found["meshes"]
+        done = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", option, "/trousers", *SMALL)
+        assert (done.exit_code, "no prim at </trousers>" in done.stderr) == (2, True)
+
+    def test_what_cannot_be_refined_as_it_is_is_1(self, tmp_path: Path) -> None:
+        """Nothing wrong was asked for: the stage itself names what is not there, or has a garment that is broken."""
+        shot = cloth_shot(tmp_path / "shot.usda")
+        stage = Usd.Stage.Open(str(shot))
+        stage.GetPrimAtPath(CLOTH).CreateRelationship("physgraph:colliders").SetTargets(["/World/gone"])
+        stage.Save()
+        result = run("inspect", shot)
+        assert (result.exit_code, f"<{CLOTH}>.physgraph:colliders: no prim at </World/gone>" in result.stdout) == (1, 1)
 
     @pytest.mark.parametrize(("name", "down"), [("swatch", "-Y"), ("swatch_zup", "-Z")])
     def test_inspect_says_where_gravity_pulls(self, sample: Sample, name: str, down: str) -> None:
@@ -434,3 +459,48 @@ def test_progress_shows_time_left_on_a_terminal(monkeypatch: pytest.MonkeyPatch)
             progress(done, 4)
     assert "shot.usda" in terminal.getvalue()
     assert "100%" in terminal.getvalue()
+
+
+def test_a_terminal_has_each_message_on_a_line_of_its_own(tmp_path: Path) -> None:
+    """Not behind the progress bar, which a frame before has left in the line."""
+    pty = pytest.importorskip("pty", reason="terminals of POSIX")
+    shot = cloth_shot(tmp_path / "part.usda", times=(1.0, 2.0, 3.0), broken={2.0: float("nan")})
+    ours, theirs = pty.openpty()
+    line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(tmp_path / "fine.usdc"), *SMALL[2:]]
+    said = b""
+    with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=theirs) as process:
+        os.close(theirs)
+        with suppress(OSError):  # Linux reports so that nobody has the terminal open any more.
+            while more := os.read(ours, 1 << 16):
+                said += more
+    os.close(ours)
+    assert process.returncode == 3
+    seen = [text.rpartition("\r\033[K")[2] for text in said.decode().replace("\r\n", "\n").split("\n")]
+    (warning,) = [text for text in seen if "no sample is written" in text]
+    assert warning.startswith("warning: "), said
+    assert any("%" in text for text in seen)
+
+
+def test_numbers_of_things() -> None:
+    assert [counted(1, "frame"), counted(1024, "frame"), counted(2, "vertex", "vertices")] == [
+        "1 frame",
+        "1,024 frames",
+        "2 vertices",
+    ]
+
+
+def test_messages_name_the_option(sample: Sample, tmp_path: Path) -> None:
+    out = tmp_path / "fine.usdc"
+    out.write_bytes(b"mine")
+    assert "--overwrite" in run("refine", sample("swatch"), "-o", out, *SMALL).stderr
+    bare = Usd.Stage.CreateNew(str(tmp_path / "bare.usda"))
+    UsdGeom.Mesh.Define(bare, "/coat")
+    bare.Save()
+    assert "--garment PATH" in run("refine", tmp_path / "bare.usda", "-o", tmp_path / "o.usdc").stderr
+
+
+def test_frames_that_are_left_out_on_purpose_are_no_warning(tmp_path: Path) -> None:
+    shot = cloth_shot(tmp_path / "shot.usda")
+    found = json.loads(run("inspect", shot, "--frames", "2:3", "--json").stdout)
+    assert not [each for each in found["warnings"] if "frame" in each]
+    assert "4 of 6 samples, 1 and 4 to 6" in found["left_out"]["samples"]

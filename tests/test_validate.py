@@ -13,7 +13,7 @@ import pytest
 from layers import COAT, dress_up, errors, make_shot, vec3, write_layer
 from pxr import Sdf, Tf, Usd, UsdSkel, Vt
 
-from physgraph_usd.errors import LayerError
+from physgraph_usd.errors import AbsentError, LayerError
 from physgraph_usd.usd.validate import Problem, validate_layer
 
 Mutation = Callable[[Sdf.Layer], None]
@@ -323,7 +323,7 @@ def test_without_the_shot_of_its_record_a_layer_fails(good: Path, tmp_path: Path
 
 def test_files_that_are_not_there_are_said_to_be_missing(good: Path, tmp_path: Path) -> None:
     for layer, shot in ((tmp_path / "nothing.usda", None), (good, tmp_path / "nothing.usda")):
-        with pytest.raises(LayerError, match=f"^no such file: {tmp_path / 'nothing.usda'}$"):
+        with pytest.raises(AbsentError, match=f"^no such file: {tmp_path / 'nothing.usda'}$"):
             validate_layer(layer, shot)
 
 

@@ -94,7 +94,7 @@ def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
     check_targets([("the chart", file) for file in files], files_of(shot))
     there = next((file for file in files if file.exists()), None)
     if there is not None and not overwrite and not files[-1].exists():
-        raise UsageError(f"{there} exists; choose another folder or allow overwriting")
+        raise UsageError(f"{there} exists; choose another folder or replace it by --overwrite")
     check_place(files[0])
 
 

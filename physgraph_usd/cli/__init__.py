@@ -1,7 +1,7 @@
 """The console command: each subcommand declares its options, imports its work and makes one call.
 
 Data goes to stdout; progress, warnings and errors go to stderr.
-Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part.
+Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part, 130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations

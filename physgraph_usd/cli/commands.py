@@ -66,14 +66,14 @@ def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
 def inspect(ctx: click.Context, shot: str, *, as_json: bool, **options: Any) -> None:
     """Print what would be refined, with what, from where, and every defect found in SHOT.
 
-    Exits with 1 when SHOT cannot be refined as asked.
+    Exits with 1 when SHOT cannot be refined as asked, with 2 when what was named is not there.
     """
     from ..shot import inspect_shot
 
     values, _ = values_for(ctx, shot, refine)
     found = inspect_shot(shot, **{name: values[name] for name in options if name != "config"})
     click.echo(json.dumps(found, indent=2) if as_json else "\n".join(outline(found)))
-    sys.exit(FAILED if "problem" in found else DONE)
+    sys.exit(found.get("exit_code", DONE))
 
 
 @click.command()

@@ -14,11 +14,13 @@ from typing import Any, TextIO
 import click
 
 from ..errors import PhysGraphError
+from ..words import counted
 
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
 LOGGER = "physgraph_usd"
 _LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
+_CLEAR_LINE = "\r\033[K"
 _LINE = "%(asctime)s %(levelname)s %(shot)s: %(message)s"
 
 
@@ -79,7 +81,7 @@ class Saying:
                 bar.length = total
                 bar.update(done - bar.pos)
                 if self.in_lines:
-                    tell(bar.pct, bar.eta, f"{done} of {total} frames")
+                    tell(bar.pct, bar.eta, f"{done} of {counted(total, 'frame')}")
 
             yield show
 
@@ -116,7 +118,9 @@ class _IntoFile(logging.FileHandler):
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a line; a terminal or pipe that is gone costs the line and not the work."""
+    """Print a line, on a terminal in place of a progress bar that is there; one that is gone costs the line alone."""
+    if err and sys.stderr.isatty():
+        text = _CLEAR_LINE + text
     try:
         click.echo(text, err=err)
     except OSError:

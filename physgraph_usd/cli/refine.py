@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import LayerError, PhysGraphError, UsageError
+from ..words import counted
 from .options import (
     farm_options,
     file_options,
@@ -134,7 +135,7 @@ def _say_failed(rows: Sequence[Row]) -> None:
     for row in failed:
         logging.getLogger(LOGGER).error(row.error, extra={"shot": row.shot})
     if failed:
-        say(f"{len(failed)} of {len(rows)} shots failed", err=True)
+        say(f"{len(failed)} of {counted(len(rows), 'shot')} failed", err=True)
 
 
 def _results(jobs: Sequence[Job], saying: Saying) -> Iterator[RefineReport | PhysGraphError]:

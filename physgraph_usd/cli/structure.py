@@ -7,9 +7,9 @@ from typing import Any, Never
 
 import click
 
-from ..errors import PhysGraphError, UsageError
+from ..errors import PhysGraphError
 
-DONE, FAILED, WRONG_USAGE, IN_PART, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, FAILED, INTERRUPTED = 0, 1, 130
 EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
 """Which extra brings a module that only some commands need."""
 
@@ -28,7 +28,7 @@ class Commands(click.Group):
             click.echo("interrupted", err=True)
             ctx.exit(INTERRUPTED)
         except PhysGraphError as error:
-            _leave(ctx, str(error), code_of(error))
+            _leave(ctx, str(error), error.exit_code)
         except OSError as error:
             if error.errno == errno.EPIPE:
                 raise
@@ -38,11 +38,6 @@ class Commands(click.Group):
             if missing not in EXTRAS:
                 raise
             _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
-
-
-def code_of(error: PhysGraphError) -> int:
-    """The exit code of a command that ends with an error."""
-    return WRONG_USAGE if isinstance(error, UsageError) else FAILED
 
 
 def _leave(ctx: click.Context, message: str, code: int) -> Never:

@@ -15,6 +15,7 @@ from ..colliders.orient import pieces_of
 from ..colliders.pose import Collider, MeshPose, ShapePose
 from ..colliders.sweep import Sweep, through_shape
 from ..scene import Frame, Garment
+from ..words import counted
 
 
 class Passed:
@@ -99,8 +100,6 @@ def told(garment: str, found: Mapping[float | None, Mapping[str, int]]) -> list[
         times = [time for time, counts in found.items() if body in counts]
         most = max(counts.get(body, 0) for counts in found.values())
         when = f"before time code {times[0]:g}" + (f" and {len(times) - 1} more" if len(times) > 1 else "")
-        said.append(
-            f"<{garment}>: the coarse cloth passes right through <{body}> {when}, at most {most} points at once; the "
-            "refined cloth follows it to the other side"
-        )
+        passes = f"<{garment}>: the coarse cloth passes right through <{body}> {when}, at most {counted(most, 'point')}"
+        said.append(f"{passes} at once; the refined cloth follows it to the other side")
     return said

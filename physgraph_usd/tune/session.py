@@ -93,7 +93,7 @@ class TuneSession:
         prepare_device("cpu")
         self.out = Path(out) if out is not None else Path(shot).with_suffix(".tuned.usda")
         if self.out.exists() and not overwrite:
-            raise UsageError(f"{self.out} exists; choose another name with -o, or allow overwriting")
+            raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
         self._overwrite, self._named = overwrite, (tuple(garments), tuple(colliders))
         self.shot = self._opened = open_shot(shot, garments=garments, colliders=colliders)
         scene = self.shot.scene

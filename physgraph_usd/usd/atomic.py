@@ -49,7 +49,7 @@ def prepare_target(target: Path, *, overwrite: bool) -> None:
     if target.is_dir():
         raise UsageError(f"{target} is a folder; name a layer such as {target / 'refined.usdc'}")
     if target.exists() and not overwrite:
-        raise UsageError(f"{target} exists; choose another name or allow overwriting")
+        raise UsageError(f"{target} exists; choose another name or replace it by --overwrite")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

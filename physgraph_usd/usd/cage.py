@@ -14,6 +14,7 @@ from pxr import Usd, UsdGeom
 
 from ..errors import GarmentError
 from ..mesh.topology import PolygonMesh
+from ..words import counted
 from .stage import Notice
 
 _CONTROLS = {
@@ -126,7 +127,7 @@ def _left_out(path: str, keep: np.ndarray, unknown_holes: int) -> list[Notice]:
     notices = []
     if not keep.all():
         face = int(np.argmin(keep))
-        said = f"{np.sum(~keep)} faces with fewer than three corners are left out, the first is face {face}"
+        said = f"{counted(int(np.sum(~keep)), 'face')} with fewer than three corners left out, the first is face {face}"
         notices.append(Notice(path, None, said))
     if unknown_holes:
         notices.append(Notice(path, None, f"{unknown_holes} holeIndices name no face and are ignored"))

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from pxr import Sdf, Usd, UsdGeom
 
-from ..errors import GarmentError, StageError
+from ..errors import AbsentError, GarmentError, StageError
 from .lookup import COLLIDER_ENABLED, is_on
 from .materials import is_collision_prim
 from .schema import COLLIDER_API, GARMENT_API
@@ -35,14 +35,17 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
         Mesh prims in stage order, those inside instances included.
 
     Raises:
-        StageError: When an item, or nothing at all, is found; the message lists the meshes that there are.
+        AbsentError: When an item is not found; the message lists the meshes that there are.
+        StageError: When nothing is named and nothing found.
     """
     if wanted:
         chosen = {path for item in wanted for path in find_paths(stage, item, UsdGeom.Mesh)}
         return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
     found = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API)]
     if not found:
-        raise StageError(f"no prim has {GARMENT_API} and no garment was named; {_meshes_said(stage)}")
+        raise StageError(
+            f"no prim has {GARMENT_API} and no garment was named; --garment PATH names one; {_meshes_said(stage)}"
+        )
     for prim in found:
         if not UsdGeom.Mesh(prim):
             kind = prim.GetTypeName() or "prim without a type"
@@ -66,7 +69,7 @@ def find_colliders(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Seque
         Gprims in stage order.
 
     Raises:
-        StageError: When a named one is not there.
+        AbsentError: When a named one is not there.
     """
     chosen = {path for item in wanted for path in find_paths(stage, item, UsdGeom.Gprim)}
     chosen = chosen.union(*(() if wanted else felt_by(stage, garments)))
@@ -78,14 +81,20 @@ def felt_by(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str
     """For each garment, paths of the gprims that it may collide with; arguments as for ``find_colliders``.
 
     Raises:
-        StageError: When a named one is not there.
+        AbsentError: When a named one is not there.
+        StageError: When one that the garment's ``physgraph:colliders`` name is not.
     """
     found: dict[tuple[str, ...], frozenset[Sdf.Path]] = {}  # Many garments name the same, mostly nothing.
     each = []
     for garment in garments:
         named = tuple(wanted or map(str, targets_of(garment, _COLLIDERS_RELATIONSHIP)))
         if named not in found:
-            found[named] = _colliders_named(stage, named)
+            try:
+                found[named] = _colliders_named(stage, named)
+            except AbsentError as error:
+                if wanted:
+                    raise
+                raise StageError(f"<{garment.GetPath()}>.{_COLLIDERS_RELATIONSHIP}: {error}") from error
         each.append(found[named])
     return each
 
@@ -133,7 +142,7 @@ def find_paths(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
         kind: A class of UsdGeom.
 
     Raises:
-        StageError: When there is none.
+        AbsentError: When there is none.
     """
     roots: Iterable[Usd.Prim]
     if _COLLECTION in item:  # its members are told one by one, so that what it excludes stays out
@@ -146,7 +155,7 @@ def find_paths(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
         roots = [prim for prim in traverse(stage) if prim.GetName() == item]
     found = [path for root in roots for path in _gprims_below(root, kind)]
     if not found:
-        raise StageError(f"{item!r} names no {kind.__name__}; {_meshes_said(stage)}")
+        raise AbsentError(f"{item!r} names no {kind.__name__}; {_meshes_said(stage)}")
     return found
 
 
@@ -161,13 +170,13 @@ def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
     """The prim at a path.
 
     Raises:
-        StageError: When there is none that can be used; says whether it is inactive, undefined or abstract.
+        AbsentError: When there is none that can be used; says whether it is inactive, undefined or abstract.
     """
     if not Sdf.Path.IsValidPathString(item):
-        raise StageError(f"{item!r} is no prim path")
+        raise AbsentError(f"{item!r} is no prim path")
     prim = stage.GetPrimAtPath(item)
     if not prim:
-        raise StageError(f"no prim at <{item}>; {_meshes_said(stage)}")
+        raise AbsentError(f"no prim at <{item}>; {_meshes_said(stage)}")
     states = {
         "inactive": not prim.IsActive(),
         "abstract": prim.IsAbstract(),
@@ -176,7 +185,7 @@ def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
     }
     said = [name for name, holds in states.items() if holds]
     if said:
-        raise StageError(f"<{item}> is {said[0]} and does not exist for refining; {_meshes_said(stage)}")
+        raise AbsentError(f"<{item}> is {said[0]} and does not exist for refining; {_meshes_said(stage)}")
     return prim
 
 
@@ -184,14 +193,14 @@ def _collection(stage: Usd.Stage, item: str) -> list[Usd.Prim]:
     """The prims of a collection.
 
     Raises:
-        StageError: When there is no such collection; lists those of the prim.
+        AbsentError: When there is no such collection; lists those of the prim.
     """
     path, name = item.split(_COLLECTION, 1)
     prim = _at_path(stage, path)
     collection = Usd.CollectionAPI.Get(prim, name)
     known = [each.GetName() for each in Usd.CollectionAPI.GetAllCollections(prim)]
     if name not in known:
-        raise StageError(f"<{path}> has no collection {name!r}; collections: {', '.join(known) or 'none'}")
+        raise AbsentError(f"<{path}> has no collection {name!r}; collections: {', '.join(known) or 'none'}")
     included = collection.ComputeIncludedObjects(collection.ComputeMembershipQuery(), stage, TRAVERSAL)
     return sorted((each for each in included if isinstance(each, Usd.Prim)), key=lambda each: each.GetPath())
 

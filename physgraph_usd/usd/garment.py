@@ -156,7 +156,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
         subsets=_subsets(prim, cage.kept_faces),
     )
-    return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices, *_range_notices(source)])
+    return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices])
 
 
 def _rest_asked(
@@ -237,12 +237,6 @@ def _painted(prim: Usd.Prim, count: int, notices: list[Notice], *, values: Value
     arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
     arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
     return arrays
-
-
-def _range_notices(source: GarmentSource) -> list[Notice]:
-    """Tell of samples that the frame range leaves out."""
-    said = f"the frame range leaves out {source.left_out_said}: there the layer holds it still"
-    return [Notice(str(source.path), None, said)] if source.left_out else []
 
 
 def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:

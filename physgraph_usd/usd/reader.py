@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Sdf, Usd
 
-from ..errors import SchemaError, StageError, UsageError
+from ..errors import AbsentError, SchemaError, StageError, UsageError
 from ..scene import Frame, Scene, refuse_far
 from .apart import read_apart
 from .bodies import ColliderReader, read_collider
@@ -275,7 +275,8 @@ def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) 
     except StageError as error:
         if not notices:
             raise
-        raise StageError(f"{error}; missing: {'; '.join(notice.message for notice in notices)}") from error
+        kind = AbsentError if isinstance(error, AbsentError) else StageError
+        raise kind(f"{error}; missing: {'; '.join(notice.message for notice in notices)}") from error
 
 
 def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str], *, notices: list[Notice]) -> None:

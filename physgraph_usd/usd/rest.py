@@ -105,7 +105,8 @@ def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray)
     notices = rest.notices
     if len(short):
         low, high = edges[short[0]]
-        said = f"{len(short)} edges of the rest shape ({rest.source}) have no length, the first between points[{low}]"
+        edge = "edge has" if len(short) == 1 else "edges have"
+        said = f"{len(short)} {edge} no length in the rest shape ({rest.source}), the first between points[{low}]"
         notices = (*notices, Notice(path, None, f"{said} and points[{high}]: points at one place are taken for one"))
     now = float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean()) if len(edges) else 0.0
     ratio = mean / now if now > 0 else 1.0

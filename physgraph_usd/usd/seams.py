@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..words import counted
+
 Points = Mapping[str, np.ndarray]
 """Local points by the path of the fine mesh, each of shape (V, 3), float32."""
 
@@ -37,7 +39,7 @@ class Seam:
 
     def __str__(self) -> str:
         """Place and distance in one line."""
-        how = f"a frame, over {self.frames} frames" if self.frames else "at once"
+        how = f"a frame, over {counted(self.frames, 'frame')}" if self.frames else "at once"
         said = f"seam at {self.after:g}: <{self.path}> moves {self.rms:.3g} fine edges RMS, {self.largest:.3g} at most"
         return f"{said}, {how}" + (f" ({self.why})" if self.why else "")
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from ..errors import PhysGraphError, StageError
+from ..errors import AbsentError, PhysGraphError, StageError
 from .view import StageView
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
@@ -233,14 +233,14 @@ def is_there(path: str | Path) -> bool:
     return Sdf.Layer.IsAnonymousLayerIdentifier(str(path)) or bool(Ar.GetResolver().Resolve(str(path)))
 
 
-def check_there(path: str | Path, kind: type[PhysGraphError] = StageError) -> None:
+def check_there(path: str | Path) -> None:
     """Refuse a file that is not there; what USD says of one tells neither what nor where.
 
     Raises:
-        PhysGraphError: Of that kind.
+        AbsentError: It is not.
     """
     if not is_there(path):
-        raise kind(f"no such file: {path}")
+        raise AbsentError(f"no such file: {path}")
 
 
 def is_sound(layer: Sdf.Layer) -> bool:

@@ -35,7 +35,7 @@ from .provenance import (
     write_root,
 )
 from .seams import Look, Points, Seam, between
-from .stage import is_there, pxr_errors
+from .stage import check_there, is_there, pxr_errors
 from .stream import LayerStream
 from .times import within
 from .track import extent_of
@@ -166,8 +166,7 @@ def _layers_in(place: Path) -> list[Path]:
 
 def _open(file: Path) -> _Part:
     """Open a chunk."""
-    if not is_there(file):
-        raise LayerError(f"{file} is not there")
+    check_there(file)
     layer = Sdf.Layer.FindOrOpen(str(file))
     chunk, record = (read_chunk(layer), read_record(layer)) if layer else (None, None)
     if chunk is None or record is None:

@@ -35,6 +35,7 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
         Problems, errors first; each names its path and time. A recorded shot that is not there is one of them.
 
     Raises:
+        AbsentError: The layer or the shot is not there.
         LayerError: The layer or the shot cannot be opened or read.
     """
     opened = layer if isinstance(layer, Sdf.Layer) else _open(layer)
@@ -125,7 +126,7 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
 
 def _open(path: str | Path) -> Sdf.Layer:
     """Open a layer."""
-    check_there(path, LayerError)
+    check_there(path)
     try:
         layer = Sdf.Layer.FindOrOpen(str(path))
     except USD_ERRORS as error:
