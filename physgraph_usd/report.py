@@ -40,7 +40,8 @@ def is_of_failure(path: Path) -> bool:
         plain = json.loads(path.read_text(encoding="utf-8")) if path.suffix == ".json" else None
     except (OSError, ValueError):
         return False
-    return isinstance(plain, dict) and bool(plain.get("error")) and "exit_code" in plain
+    ours = RefineReport("", None, {}).to_dict().keys()
+    return isinstance(plain, dict) and bool(plain.get("error")) and plain.keys() == ours
 
 
 @dataclass(eq=False)

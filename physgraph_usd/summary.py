@@ -121,7 +121,7 @@ def _is_summary(path: Path) -> bool:
         plain = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    return isinstance(plain, dict) and {"format", "shots"} <= plain.keys()
+    return isinstance(plain, dict) and plain.keys() == {"format", "version", "exit_code", "shots"}
 
 
 def table_of(rows: Sequence[Row]) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdUtils
 from shots import cloth_shot, refine
 from stages import clip_shot, save
 
@@ -181,6 +181,71 @@ def test_a_refined_layer_under_the_shot_may_be_refined_anew(tmp_path: Path) -> N
     shot, out, root = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "fine.usdc", tmp_path / "root.usda"
     refine(shot, out, root=root)
     assert refine(root, out, overwrite=True, level=2).exit_code == 0
+
+
+@pytest.fixture
+def stitched(tmp_path: Path) -> Path:
+    """A result with the animation that it was made from in one layer, as others join them, and the result's record."""
+    shot, out, both = (
+        cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0)),
+        tmp_path / "fine.usdc",
+        tmp_path / "both.usda",
+    )
+    refine(shot, out)
+    layer = Sdf.Layer.CreateNew(str(both))
+    layer.TransferContent(Sdf.Layer.FindOrOpen(str(out)))
+    UsdUtils.StitchLayers(layer, Sdf.Layer.FindOrOpen(str(shot)))
+    layer.Save()
+    return both
+
+
+@pytest.mark.parametrize("command", ["refine", "inspect", "over"])
+def test_a_layer_that_others_stitched_to_a_result_is_refused_by_name(stitched: Path, command: str) -> None:
+    top = stitched.with_name("top.usda")
+    top.write_text("#usda 1.0\n(subLayers = [@./both.usda@])\n")
+    shot = top if command == "over" else stitched
+    write = () if command == "inspect" else ("-o", stitched.with_name("again.usdc"))
+    result = run("inspect" if command == "inspect" else "refine", shot, "--garment", "/World/cloth", *write)
+    assert result.exit_code == 1
+    assert "</World/cloth> is refined already in both.usda, which holds other things as well" in result.output
+    assert "refine the shot that it was made from, ./shot.usda" in result.output
+
+
+def test_a_result_alone_is_no_shot(stitched: Path) -> None:
+    result = run("refine", stitched.with_name("fine.usdc"), "-o", stitched.with_name("again.usdc"))
+    assert (result.exit_code, "is a refined layer and no shot" in result.output) == (1, True), result.output
+
+
+@pytest.mark.parametrize("command", ["tag", "refine"])
+def test_what_others_stitched_to_a_result_is_never_written(stitched: Path, command: str) -> None:
+    top, before = stitched.with_name("top.usda"), stitched.read_bytes()
+    top.write_text("#usda 1.0\n(subLayers = [@./both.usda@])\n")
+    result = run(command, top, "-o", stitched, "--garment", "/World/cloth", "--overwrite")
+    assert (result.exit_code, "part of the shot" in result.output) == (2, True), result.output
+    assert stitched.read_bytes() == before
+
+
+@pytest.mark.parametrize("how", ["sublayer", "prim", "attribute", "sample", "layer data"])
+def test_a_result_with_anything_else_in_it_is_part_of_the_shot(stitched: Path, how: str) -> None:
+    out, below, root = (stitched.with_name(name) for name in ("fine.usdc", "below.usda", "root.usda"))
+    below.write_text("#usda 1.0\n")
+    root.write_text("#usda 1.0\n(subLayers = [@./fine.usdc@, @./shot.usda@])\n")
+    layer = Sdf.Layer.FindOrOpen(str(out))
+    cloth = layer.GetPrimAtPath("/World/cloth")
+    if how == "sublayer":
+        layer.subLayerPaths.append("./below.usda")
+    elif how == "prim":
+        Sdf.CreatePrimInLayer(layer, "/World/light")
+    elif how == "attribute":
+        Sdf.AttributeSpec(cloth, "primvars:age", Sdf.ValueTypeNames.Float).default = 1.0
+    elif how == "sample":
+        layer.SetTimeSample("/World/cloth.points", 77.0, layer.QueryTimeSample("/World/cloth.points", 1.0))
+    else:
+        layer.customLayerData = dict(layer.customLayerData) | {"pipeline": "mine"}
+    layer.Save()
+    for target in (out, below) if how == "sublayer" else (out,):
+        result = run("tag", root, "-o", target, "--garment", "/World/cloth", "--overwrite")
+        assert (result.exit_code, "part of the shot" in result.output) == (2, True), result.output
 
 
 def test_the_record_names_value_clips(tmp_path: Path) -> None:

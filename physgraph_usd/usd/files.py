@@ -11,7 +11,7 @@ from pathlib import Path
 from pxr import Ar, Sdf, Usd, UsdUtils
 
 from ..errors import UsageError
-from .provenance import read_record
+from .provenance import is_only_ours, read_record
 from .stage import USD_ERRORS, is_sound, quiet
 
 LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
@@ -56,7 +56,9 @@ def _layer_of(file: Path) -> Sdf.Layer | None:
 
 def _is_result(file: Path) -> bool:
     layer = _layer_of(file)
-    return layer is not None and bool((read_record(layer) or {}).get("garments"))
+    if layer is None or not (read_record(layer) or {}).get("garments"):
+        return False
+    return is_only_ours(layer)
 
 
 def _named_in(file: Path) -> Iterator[str]:

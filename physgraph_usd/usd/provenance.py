@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, Vt
 
-from ..errors import LayerError
+from ..errors import LayerError, StageError
 from .atomic import prepare_target, publish, temporary_path
 from .stage import TRAVERSAL, USD_ERRORS, reason_of
 from .view import root_over
 
 RECORD = "physgraph"
+CONTENTS = "contents"
+"""Entry of the record: a digest of what the layer holds, since who copies a record copies no layer."""
 FAILED, UNSETTLED = "failed", "unsettled"
 """Entries of the record: time codes without a sample, and how many were written though they did not settle."""
 _COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
@@ -49,10 +51,38 @@ def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float
 
 
 def author_record(layer: Sdf.Layer, record: Mapping[str, Any]) -> None:
-    """Write the record into ``customLayerData["physgraph"]``; None entries are left out."""
-    data = dict(layer.customLayerData)
-    data[RECORD] = _plain(record)
-    layer.customLayerData = data
+    """Write the record into ``customLayerData["physgraph"]``, once all else is written; None entries are left out."""
+    layer.customLayerData = {RECORD: _plain(dict(record) | {CONTENTS: _contents(layer)})}
+
+
+def _contents(layer: Sdf.Layer) -> str:
+    """Digest of what a layer has opinions on and at which times, without the values; of its other layer data too."""
+    digest = hashlib.sha256()
+    others = sorted(set(layer.customLayerData) - {RECORD})
+    digest.update(repr((list(layer.subLayerPaths), others)).encode())
+    paths: list[str] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(str(path)))
+    for path in sorted(paths):
+        spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.PrimSpec):
+            arcs = [spec.referenceList, spec.payloadList, spec.inheritPathList, spec.specializesList]
+            said = [str(spec.specifier), spec.typeName, *map(str, arcs)]
+        elif isinstance(spec, Sdf.AttributeSpec):
+            times = layer.ListTimeSamplesForPath(path)
+            said = [str(spec.typeName), *map(str, (spec.HasInfo("default"), spec.connectionPathList, times))]
+        else:
+            said = []
+        digest.update(repr((path, said)).encode())
+    return digest.hexdigest()
+
+
+def is_only_ours(layer: Sdf.Layer) -> bool:
+    """Whether a layer with our record holds what we wrote into it and nothing else, such as a shot stitched to it."""
+    record = read_record(layer)
+    try:
+        return record is not None and record.get(CONTENTS) == _contents(layer)
+    except (*USD_ERRORS, UnicodeDecodeError):
+        return False
 
 
 def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
@@ -73,12 +103,12 @@ def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False
         settled: Whether every frame must have settled, too.
     """
     wanted = Sdf.Layer.CreateAnonymous()
-    author_record(wanted, record)
+    wanted.customLayerData = {RECORD: _plain(record)}
     try:
         layer = Sdf.Layer.FindOrOpen(str(path))
     except USD_ERRORS:
         return False
-    there = (read_record(layer) if layer else None) or {}
+    there = (read_record(layer) if layer and is_only_ours(layer) else None) or {}
     lacking = FAILED in there or (settled and UNSETTLED in there)
     return not lacking and all(there.get(key) == value for key, value in (read_record(wanted) or {}).items())
 
@@ -98,7 +128,7 @@ def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
 def mute_refined(stage: Usd.Stage) -> list[str]:
     """Hide on a stage every layer that holds refined garments, so that what artists changed above them counts.
 
-    Only this stage is affected; nothing is written.
+    One that holds other things as well, or is the root, stays. Only this stage is affected; nothing is written.
 
     Args:
         stage: A stage that may show a shot through a refined layer, as `write_root` makes it.
@@ -106,10 +136,33 @@ def mute_refined(stage: Usd.Stage) -> list[str]:
     Returns:
         Identifiers of the layers hidden.
     """
-    identifiers = [layer.identifier for layer in refined_layers(stage)]
+    found = (layer for layer in refined_layers(stage) if layer != stage.GetRootLayer())
+    identifiers = [layer.identifier for layer in found if is_only_ours(layer)]
     for identifier in identifiers:
         stage.MuteLayer(identifier)
     return identifiers
+
+
+def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
+    """Refuse cloth that is refined already by a layer that cannot be hidden.
+
+    Args:
+        stage: The shot, its refined layers hidden.
+        paths: Garments; the root alone is looked at where none is given.
+
+    Raises:
+        StageError: The root is a refined layer, or a garment's fine cloth lies in one layer with other things.
+    """
+    for layer in refined_layers(stage):
+        record, name = read_record(layer) or {}, Path(layer.identifier).name
+        instead = f"refine the shot that it was made from, {record.get('shot') or 'which was in memory'}"
+        if layer == stage.GetRootLayer() and is_only_ours(layer):
+            raise StageError(f"{name} is a refined layer and no shot; {instead}")
+        for path in {str(path) for path in paths}.intersection(map(str, record["garments"])):
+            raise StageError(
+                f"<{path}> is refined already in {name}, which holds other things as well and so cannot be left out; "
+                f"{instead}"
+            )
 
 
 def unsaved_layers(stage: Usd.Stage) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ from .limits import beyond_limits_of_all
 from .lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
 from .materials import find_values
 from .placement import to_metres
-from .provenance import mute_refined, unsaved_layers
+from .provenance import mute_refined, refuse_refined, unsaved_layers
 from .rest import AUTO
 from .schema import GARMENT
 from .skinning import Bake
@@ -227,7 +227,9 @@ def open_shot(
     notices += [Notice("", None, f"{layer} holds refined cloth and is left out") for layer in mute_refined(stage)]
     with pxr_errors(f"cannot read {path}"), quiet():
         unsaved = unsaved_layers(stage)
+        refuse_refined(stage)
         prims = _find(stage, garments, notices)
+        refuse_refined(stage, [prim.GetPath() for prim in prims])
         check_overrides(asked, [prim.GetPath() for prim in prims])
         found = find_colliders(stage, prims, colliders)
         for prim in (*prims, *found):

@@ -69,8 +69,7 @@ class LayerWriter:
                 all.
 
         Raises:
-            UsageError: The mode is unknown, the file exists or is one that the shot is made of, or a garment is refined
-                already.
+            UsageError: The mode is unknown, or the file exists or is one that the shot is made of.
             LayerError: The layer cannot be written.
         """
         if mode not in MODES:
@@ -79,7 +78,6 @@ class LayerWriter:
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
         if out is not None:
             check_targets([("the layer", out)], files_of(shot.path))
-        _check_not_refined(shot)
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._velocities, self._open = velocities, True
         self._record = {"mode": mode} | dict(provenance or {})
@@ -339,16 +337,6 @@ def _rate(stage: Usd.Stage) -> float:
     """Time codes per second; USD's fallback of 24 where the stage's cannot be a rate."""
     rate = stage.GetTimeCodesPerSecond()
     return rate if rate > 0 else 24.0
-
-
-def _check_not_refined(shot: Shot) -> None:
-    """Refuse garments whose coarse mesh is hidden by an earlier refinement."""
-    paths = {str(source.path) for source in shot.sources}
-    for layer in provenance.refined_layers(shot.stage):
-        record = provenance.read_record(layer) or {}
-        for path in paths.intersection(str(garment) for garment in record["garments"]):
-            name = Path(layer.identifier).name
-            raise UsageError(f"<{path}> is refined already, by {name}; refine the shot below it: {record.get('shot')}")
 
 
 def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:
