@@ -59,7 +59,7 @@ def _contents(layer: Sdf.Layer) -> str:
     """Digest of what a layer has opinions on and at which times, without the values; of its other layer data too."""
     digest = hashlib.sha256()
     others = sorted(set(layer.customLayerData) - {RECORD})
-    digest.update(repr((list(layer.subLayerPaths), others)).encode())
+    digest.update(repr((str(layer.subLayerPaths), others)).encode())
     paths: list[str] = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(str(path)))
     for path in sorted(paths):
