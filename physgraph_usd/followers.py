@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from .level import PIN_MARGIN, Level
+from .level import PIN_MARGIN, Level, Placed
 from .mesh.topology import PolygonMesh
 
 NEAREST = 1e-6
@@ -37,12 +37,17 @@ class Followers:
         self._place_fixed = sp.csr_matrix(level.from_coarse[self._fixed])
         self._beside, self._from_coarse = sp.csr_matrix(beside @ sp.diags(1.0 - idle)), level.from_coarse
 
-    def placed(self, points: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+    def placed(self, x: Placed, origin: np.ndarray, coarse: np.ndarray) -> np.ndarray:
         """World positions [m], shape (V, 3), of which these are placed by the cage's and by the others.
 
         Fixed vertices are the upsampled cage's own; a corner is moved off it as its neighbours are on the mean.
+
+        Args:
+            x: Where the cloth is, about the origin [m].
+            origin: World position [m], shape (3,).
+            coarse: The cage's world positions [m], shape (C, 3).
         """
-        out = points.copy()
+        out = x.double().cpu().numpy() + origin
         out[self._fixed] = self._place_fixed @ coarse
         if self._inverse is not None:
             base = self._from_coarse @ coarse

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NewType
 
 import numpy as np
 import scipy.sparse as sp
@@ -33,6 +34,15 @@ QUAD_HINGE = (1.28, 0.64)
 
 PIN_MARGIN = 1e-6
 """A pin within this of 1 is exact."""
+
+Placed = NewType("Placed", Tensor)
+"""Positions of a level's cloth [m], shape (V, 3), at which nothing crosses that did not where the level began. Only a
+start, a safe move, or the absence of anything to touch makes them; the type checker refuses any other positions."""
+
+
+def unhindered(x: Tensor) -> Placed:
+    """Positions of cloth that nothing may touch [m]."""
+    return Placed(x)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from physgraph_usd.forces.base import ForceModule
 from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.integrate.base import System
 from physgraph_usd.integrate.metric import Metric
+from physgraph_usd.level import Placed
 from physgraph_usd.pipeline import Refiner
 from physgraph_usd.scene import GarmentFrame, Scene
 
@@ -162,16 +163,16 @@ QUESTIONS: dict[str, Callable[[Asked], Any]] = {
     "FrameContact.aim": lambda a: a.contact.aim,
     "FrameContact.crossed": lambda a: a.contact.crossed,
     "FrameContact.crowding": lambda a: a.contact.crowding,
-    "FrameContact.finish": lambda a: a.contact.finish(a.x),
+    "FrameContact.finish": lambda a: a.contact.finish(Placed(a.x)),
     "FrameContact.measure": lambda a: a.contact.measure(a.x),
     "LevelContact.terms": lambda a: ForceModule(a.view.terms(a.x)[1]).energies(a.x),
     "LevelContact.terms elsewhere": lambda a: ForceModule(a.view.terms(a.y)[1]).energies(a.y),
     "LevelContact.crosses": lambda a: a.view.crosses(a.x),
     "LevelContact.closed": lambda a: a.view.closed(a.x),
     "LevelContact.comes_apart": lambda a: a.view.comes_apart(a.x, order=True),
-    "LevelContact.moved": lambda a: a.view.moved(a.x, a.y),
-    "LevelContact.drawn": lambda a: a.view.drawn(a.x, a.y),
-    "LevelContact.out_of_bodies": lambda a: a.view.out_of_bodies(a.x),
+    "LevelContact.moved": lambda a: a.view.moved(Placed(a.x), a.y),
+    "LevelContact.drawn": lambda a: a.view.drawn(Placed(a.x), a.y),
+    "LevelContact.out_of_bodies": lambda a: a.view.out_of_bodies(Placed(a.x)),
     "LevelContact.metric": lambda a: metric(a, a.x),
     "LevelContact.metric elsewhere": lambda a: metric(a, a.y),
 }

@@ -18,6 +18,7 @@ from pxr import Usd
 from scipy.spatial import cKDTree
 from shots import faults, refine, sample_times
 
+from physgraph_usd.samples import write_sample
 from physgraph_usd.samples.panel import sew
 from physgraph_usd.samples.solids import box, join, lathe, off_box, off_torus, torus
 from physgraph_usd.samples.tshirt import SHIRT, dress
@@ -262,3 +263,11 @@ def test_solids_are_closed_and_points_are_pushed_to_them() -> None:
         assert (before < gap).sum() > 20
         assert after.min() > gap - 5e-4
         np.testing.assert_array_equal(points[before > gap + 5e-4], pushed[before > gap + 5e-4])
+
+
+def test_folds_twice_as_high_cross_nothing(tmp_path: Path) -> None:
+    """Without a safe move after it the scale would have them cross 573 times."""
+    shot = write_sample("hood", tmp_path)
+    report = refine(shot, tmp_path / "fine.usdc", steps=30, frames=(1.0, 1.0), overrides=["detail=2"])
+    told = report.frames[0]["garments"][0]["contact"]["cloth"]
+    assert told["after"]["crossings"] == 0

@@ -9,6 +9,8 @@ from bodies import ball, box
 from brute import Soup, crossings
 from folds import contact_of, frame_with, levels_of, named, refiner_with, square
 
+from physgraph_usd.level import Placed
+
 
 class TestCorners:
     @pytest.mark.parametrize("level", [0, 1, 2])
@@ -38,7 +40,7 @@ class TestCloth:
         wanted = start.clone()
         wanted[~upper, 1] += 0.015 * torch.exp(-(wanted[~upper][:, [0, 2]].norm(dim=1) / 0.05).square())
         assert len(crossings(Soup.of(level, wanted))) > 10
-        x = contact_of(levels, garments, levels[0].rest).at(level).moved(start, wanted)
+        x = contact_of(levels, garments, levels[0].rest).at(level).moved(Placed(start), wanted)
         assert len(crossings(Soup.of(level, x))) == 0
         middle = int(start[~upper][:, [0, 2]].norm(dim=1).argmin())
         assert float(x[middle, 1] - start[middle, 1]) > 0.0005

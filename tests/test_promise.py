@@ -11,6 +11,7 @@ from physgraph_usd.collide.near import weights
 from physgraph_usd.collide.sweep import Pairs
 from physgraph_usd.contact.along import COMES, along
 from physgraph_usd.contact.carry import carried
+from physgraph_usd.level import Placed
 
 GAP = 0.2 * EDGE
 
@@ -31,7 +32,7 @@ class TestLayersThatMoveTogether:
         bump = 0.5 * EDGE * torch.exp(-((x - x[~upper].mean(dim=0)) / (2 * EDGE)).square().sum(dim=1)) * ~upper
         way = torch.zeros_like(x)
         way[:, 1] = 20 * EDGE + bump
-        y = promise_of(levels, garments).move(x, x + way)
+        y = promise_of(levels, garments).move(Placed(x), x + way)
         assert not crossings(Soup.of(levels[-1], y))
         late = (x + way - y).norm(dim=1)
         assert float(late.max()) < 0.5 * EDGE
@@ -41,7 +42,7 @@ class TestLayersThatMoveTogether:
         (levels, garments), x, _ = two_sheets()
         c, s = np.cos(1.0), np.sin(1.0)
         wanted = x @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=x.dtype)
-        assert torch.allclose(promise_of(levels, garments).move(x, wanted), wanted, atol=1e-9)
+        assert torch.allclose(promise_of(levels, garments).move(Placed(x), wanted), wanted, atol=1e-9)
 
 
 class TestCarried:

@@ -37,7 +37,7 @@ from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.forces import elastic_terms
 from physgraph_usd.forces.base import ForceModule
 from physgraph_usd.forces.seam import Seam, SewnForces
-from physgraph_usd.level import Level
+from physgraph_usd.level import Level, Placed
 from physgraph_usd.mesh.topology import PolygonMesh, joined_by
 from physgraph_usd.scene import Garment
 
@@ -267,7 +267,7 @@ class TestCloth:
         wanted = seam.closed(base + 0.3 * EDGE * noise(base, seed))
         view = promise.view
         assert view.crossings(wanted).count > 0
-        x = promise.move(start, wanted)
+        x = promise.move(Placed(start), wanted)
         assert crossings(view.parts, x).count == 0
         assert gap_of(x.numpy(), base.numpy()) < 1e-6
         assert torch.equal(seam.closed(x), x)

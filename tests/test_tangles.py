@@ -17,7 +17,7 @@ from physgraph_usd.contact.cloth_mesh import ClothMesh
 from physgraph_usd.contact.promise import Promise
 from physgraph_usd.contact.tangles import Tangles, gaps_out, ways_out
 from physgraph_usd.forces.self_contact import SelfContact
-from physgraph_usd.level import Level
+from physgraph_usd.level import Level, Placed
 
 BOTH = np.ones((2, 2), bool)
 LIFT = 0.3 * EDGE
@@ -178,7 +178,7 @@ class TestMoves:
     def test_never_more_crossings_than_before(self, name: str, size: float, seed: int):
         level, promise, base = crossed_strip(name)
         noise = torch.randn(base.shape, generator=torch.Generator().manual_seed(seed))
-        x = promise.move(base, base + size * 0.3 * EDGE * noise * level.free)
+        x = promise.move(Placed(base), base + size * 0.3 * EDGE * noise * level.free)
         before, after = (len(crossings(Soup.of(level, at))) for at in (base, x))
         assert promise.view.crossings(x).count == after
         assert after <= before
@@ -191,14 +191,14 @@ class TestMoves:
         garments = [named(square(4), each) for each in "AB"]
         levels, (level, base) = levels_of(*garments, dtype=torch.float64), pair(name)
         noise = torch.as_tensor(np.random.default_rng(4).normal(size=(len(base), 3)))
-        x = promise_of(levels, garments).move(base, base + size * EDGE * noise)
+        x = promise_of(levels, garments).move(Placed(base), base + size * EDGE * noise)
         assert 0 <= len(crossings(Soup.of(level, x))) <= len(crossings(Soup.of(level, base)))
 
     @pytest.mark.parametrize("name", ["flat", "curved", "folded", "rolled"])
     def test_what_is_safe_is_gone_to_itself(self, name: str):
         _, promise, base = crossed_strip(name)
         x = base + 1e-4 * torch.sin(100 * base)
-        assert promise.move(base, x) is x
+        assert promise.move(Placed(base), x) is x
 
     def test_only_what_is_near_what_would_cross_is_held_back(self):
         """A smooth wave that pushes the upper half of a fold through the lower one in one corner."""
@@ -207,7 +207,7 @@ class TestMoves:
         wanted = base.clone()
         wanted[upper, 1] -= 0.014
         assert len(crossings(Soup.of(level, wanted))) > 0
-        x = promise.move(base, wanted)
+        x = promise.move(Placed(base), wanted)
         assert len(crossings(Soup.of(level, x))) == 0
         moved = (x - wanted).norm(dim=1) > 1e-7
         assert 0 < int(moved.sum()) < 0.6 * level.vertex_count
@@ -223,7 +223,7 @@ class TestMoves:
         x, promise = base.clone(), promise_of(levels, garments)
         x[half:, 1] += 0.001
         assert 0 < promise.view.crossings(x).count <= promise.view.crossings(base).count
-        assert promise.move(base, x) is x
+        assert promise.move(Placed(base), x) is x
 
     def test_one_tangle_that_would_cross_more_holds_up_no_other(self):
         """Of two pairs of sheets one is pushed deeper, the other drawn out."""
@@ -235,7 +235,7 @@ class TestMoves:
         wanted[number == 1, 1] -= 0.004
         wanted[number == 3, 1] += 0.012
         promise = promise_of(levels, garments)
-        x = promise.move(base, wanted)
+        x = promise.move(Placed(base), wanted)
         before, asked, after = (promise.view.mesh.between(promise.view.crossings(at)) for at in (base, wanted, x))
         assert asked[0, 1] > before[0, 1] > 0
         assert after[0, 1] <= before[0, 1]

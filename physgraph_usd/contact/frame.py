@@ -16,7 +16,7 @@ from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact, Spheres
 from ..integrate.base import Preconditioner
 from ..integrate.metric import Metric
-from ..level import Level
+from ..level import Level, Placed, unhindered
 from .apart import drawn_apart
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
@@ -84,16 +84,18 @@ class LevelContact:
         tangles = None if self.promise is None else self.promise.view.tangles(x, order=order)
         return tangles is not None and (order or not bool(tangles.hopeless.all()))
 
-    def laid_back(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+    def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
+        """Where a level begins [m], seams closed: what crosses here, crossed in the input or at the level below."""
+        return Placed(self.closed(x))
+
+    def laid_back(self, x: Placed) -> Placed:
         """Positions in which pieces that went through cloth lie on their side again [m], where less crosses then."""
         if self.promise is None or not self.crosses(x):
             return x
         out = drawn_apart(self.promise.view.mesh, x, gap=self.promise.view.gap)[0]
-        return x if out is x else self.closed(out)
+        return x if out is x else Placed(self.closed(out))
 
-    def without_hope(
-        self, x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"]
-    ) -> Float[Tensor, "vertices 3"]:
+    def without_hope(self, x: Placed, start: Placed) -> Placed:
         """Positions x [m], back at the start where a tangle did not come apart, and on the way there beside it."""
         tangles = None if self.promise is None else self.promise.view.tangles(x)
         if self.promise is None or tangles is None or not bool(tangles.hopeless.any()):
@@ -104,7 +106,7 @@ class LevelContact:
             wider = mesh.grown(back, 1)
             share = torch.where(wider & ~back, 1.0 - (ring + 1.0) / (BLENDED + 1.0), share)
             back = wider
-        return self.closed(x + share.unsqueeze(1) * (start - x))
+        return self.drawn(x, x + share.unsqueeze(1) * (start - x))
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """As `ClothView.remember`, where there is a promise."""
@@ -130,19 +132,17 @@ class LevelContact:
         """As `Promise.listed`; None without cloth."""
         return None if self.promise is None else self.promise.listed(x, known)
 
-    def moved(
-        self, x: Float[Tensor, "vertices 3"], wanted: Float[Tensor, "vertices 3"], listed: Listed | None = None
-    ) -> Float[Tensor, "vertices 3"]:
+    def moved(self, x: Placed, wanted: Float[Tensor, "vertices 3"], listed: Listed | None = None) -> Placed:
         """Positions as near to wanted ones as is safe [m], seams closed."""
         wanted = self.closed(wanted)
-        return wanted if self.promise is None else self.promise.move(x, wanted, listed=listed)
+        return unhindered(wanted) if self.promise is None else self.promise.move(x, wanted, listed=listed)
 
-    def drawn(self, x: Float[Tensor, "vertices 3"], wanted: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+    def drawn(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """The same where tangles may come to cross more for a while."""
         wanted = self.closed(wanted)
-        return wanted if self.promise is None else self.promise.draw(x, wanted)
+        return unhindered(wanted) if self.promise is None else self.promise.draw(x, wanted)
 
-    def out_of_bodies(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], int]:
+    def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
         """Positions moved safely out of bodies [m], x itself where none had to be, and the passes made."""
         passes, bodies = 0, self.bodies
         for _ in range(PUSHES if bodies is not None else 0):
@@ -254,7 +254,7 @@ class FrameContact:
         """What is sewn together at a level, upsampled to given positions [m]."""
         return None if self._seams is None else self._seams.at(level, base)
 
-    def finish(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, "vertices 3"], dict[str, object]]:
+    def finish(self, x: Placed) -> tuple[Placed, dict[str, object]]:
         """Move the solved cloth out of bodies.
 
         Returns:

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..collide.sweep import Listed, joined, none_of
+from ..level import Placed
 from .along import along
 from .carry import carried
 from .cloth import ClothView
@@ -44,11 +45,11 @@ class Promise:
 
     def move(
         self,
-        start: Float[Tensor, "vertices 3"],
+        start: Placed,
         wanted: Float[Tensor, "vertices 3"],
         *,
         listed: Listed | None = None,
-    ) -> Float[Tensor, "vertices 3"]:
+    ) -> Placed:
         """Positions as near to what is wanted as is safe [m], ``wanted`` itself where nothing is in the way.
 
         In a tangle, round what crosses at the start, cloth may pass through itself, so long as no more of it crosses
@@ -69,16 +70,12 @@ class Promise:
             x = self._go(start, wanted, free, listed)
         return x
 
-    def draw(
-        self, start: Float[Tensor, "vertices 3"], wanted: Float[Tensor, "vertices 3"]
-    ) -> Float[Tensor, "vertices 3"]:
+    def draw(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """The same where tangles may come to cross more for a while, and garments are brought in their order."""
         tangles = self.view.tangles(start, order=True)
         return self._go(start, wanted, None if tangles is None else tangles.label, None)
 
-    def _go(
-        self, start: Tensor, aim: Tensor, tangle: Int[Tensor, " vertices"] | None, listed: Listed | None
-    ) -> Float[Tensor, "vertices 3"]:
+    def _go(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None, listed: Listed | None) -> Placed:
         """The same, with nothing promised to what is in a tangle against what is in the same.
 
         First goes what cloth in a place has in common of its ways, in ever smaller places: layers that move together
@@ -87,7 +84,7 @@ class Promise:
         given = {"floor": self.floor, "tangle": tangle, "listed": listed}
         parts, moves = self.view.parts, (aim != start).any(dim=1, keepdim=True)
         if not len(in_the_way(start, aim, parts, **given).value):
-            return aim
+            return Placed(aim)
         x, met = start, none_of(start)
         for width in (*WIDTHS, *(0.0,) * GOES):
             at, rest = x.double(), aim.double() - x.double()
@@ -99,4 +96,4 @@ class Promise:
             x, met = moved.x, joined(met, moved.met)
             if not width and not bool(moved.short.any()):
                 break
-        return aim if torch.equal(x, aim) else x
+        return Placed(aim) if torch.equal(x, aim) else x

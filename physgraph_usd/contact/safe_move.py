@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..collide.parts import Parts
 from ..collide.sweep import Listed, ListedAndSwept, Pairs, joined, none_of
+from ..level import Placed
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
@@ -42,7 +43,7 @@ class Moved:
         met: Pairs that were in the way.
     """
 
-    x: Float[Tensor, "vertices 3"]
+    x: Placed
     share: Float[Tensor, " vertices"]
     met: Pairs
 
@@ -96,7 +97,7 @@ def safe_move(
         known, share = share, _spread(shorter, way, parts)
         asked = share < known
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
-    return Moved(x, share, met)
+    return Moved(Placed(x), share, met)
 
 
 def in_the_way(

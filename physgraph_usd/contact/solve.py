@@ -13,7 +13,7 @@ from torch import Tensor
 from ..integrate.base import Carry, Integrator, System
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
-from ..level import Level
+from ..level import Level, Placed
 from .frame import LevelContact, Touch
 from .metric import SMOOTH, HeldMetric
 
@@ -41,7 +41,7 @@ def solve_touching(
     outward: Float[Tensor, " garments"],
     smoothing: Float[Tensor, "vertices 3"] | None,
     budget: Budget,
-) -> tuple[Float[Tensor, "vertices 3"], list[LevelReport], tuple[Touch, ...]]:
+) -> tuple[Placed, list[LevelReport], tuple[Touch, ...]]:
     """Solve one level from positions in which what is apart is on its side.
 
     Args:
@@ -60,7 +60,7 @@ def solve_touching(
     Raises:
         SolveError: The energy is not finite.
     """
-    x, reports = _drawn_out(make_system, integrator, view.closed(x), view=view, level=level, budget=budget)
+    x, reports = _drawn_out(make_system, integrator, view.begun(x), view=view, level=level, budget=budget)
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
         view, terms = view.terms(x)
@@ -102,12 +102,12 @@ def _serves(report: LevelReport, budget: Budget, made: int) -> bool:
 def _drawn_out(
     make_system: MakeSystem,
     integrator: Integrator,
-    x: Tensor,
+    x: Placed,
     *,
     view: LevelContact,
     level: Level,
     budget: Budget,
-) -> tuple[Tensor, list[LevelReport]]:
+) -> tuple[Placed, list[LevelReport]]:
     """Rounds of few steps in which contours shorten, at the cage and where the last level or frame left any."""
     cold, start = level.index == 0, x
     x = view.laid_back(x) if cold else x
@@ -124,11 +124,11 @@ def _drawn_out(
     return view.without_hope(x, start) if cold else x, reports
 
 
-def _fallen(move: Callable[[Tensor, Tensor], Tensor], system: System, x: Tensor, y: Tensor) -> Tensor:
+def _fallen(move: Callable[[Placed, Tensor], Placed], system: System, x: Placed, y: Tensor) -> Placed:
     """Where a safe move from x towards y ends, of a shorter way where cloth that is held up raises the energy [m]."""
     moved = move(x, y)
     if moved is y:
-        return y
+        return moved
     energy = system.energy_and_force(x)[0]
     most = energy + torch.finfo(x.dtype).eps * abs(energy)
     for _ in range(SHORTER):

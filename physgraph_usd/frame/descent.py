@@ -17,7 +17,7 @@ from ..integrate.base import Integrator, System
 from ..integrate.metric import Metric
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
-from ..level import Level
+from ..level import Level, Placed, unhindered
 from .level_forces import LevelForces
 from .start import Start
 from .values import Cage
@@ -49,7 +49,7 @@ class Problem:
     contact: FrameContact | None
     start: Start
     walked: Float[Tensor, "coarse 3"] | None
-    before: Float[Tensor, "vertices 3"] | None
+    before: Placed | None
     clean: bool
     tether: float | None
     outward: Float[Tensor, " garments"]
@@ -95,7 +95,7 @@ class Problem:
 
     def solved(
         self, index: int, x: Tensor, smoothing: Tensor | None, *, integrator: Integrator, budget: Budget
-    ) -> tuple[Tensor, list[LevelReport], ForceModule]:
+    ) -> tuple[Placed, list[LevelReport], ForceModule]:
         """Solve a level from where it is begun, in rounds where something is near; also gives its terms."""
         lasting, touched = self.forces[index], ()
         level, module = lasting.level, lasting.module(self.aim)
@@ -104,14 +104,14 @@ class Problem:
         alone = lasting.lasting_system(self.aim, tie) if self.lasting else lasting.system(module, tie)
         if view is not None:
             own = {"view": view, "level": level, "smoothing": smoothing, "outward": self.outward, "budget": budget}
-            x, reports, touched = solve_touching(partial(_system, lasting, alone, view), integrator, x, **own)
+            placed, reports, touched = solve_touching(partial(_system, lasting, alone, view), integrator, x, **own)
         else:
             x = x if smoothing is None else leave_saddle(alone, level, x + smoothing, outward=self.outward)
             x, report = solve_level(alone, integrator, x, level=index, budget=budget)
-            reports = [report]
+            placed, reports = unhindered(x), [report]
         if level is not self.forces[-1].level:
-            reports[-1].energies = module.energies(x)
-        return x, reports, ForceModule((*module.forces, *touched))
+            reports[-1].energies = module.energies(placed)
+        return placed, reports, ForceModule((*module.forces, *touched))
 
 
 def _system(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..contact.bodies import FrameBodies, Touching
 from ..contact.cloth import ClothContact
-from ..contact.frame import FrameContact
+from ..contact.frame import FrameContact, LevelContact
 from ..contact.seams import Seams
 from ..contact.settings import ContactSettings
 from ..errors import SolveError
@@ -25,7 +25,7 @@ from ..forces.guide import GuideMap
 from ..integrate.base import Integrator, System
 from ..integrate.choice import Choice, choose
 from ..integrate.solve import LevelReport
-from ..level import build_levels
+from ..level import Placed, build_levels, unhindered
 from ..mesh.subdivide import Refinement
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST, Garment, GarmentFrame, recentred
@@ -107,8 +107,8 @@ class Group:
         except SolveError as error:
             coarse = problem.cage.points
             raise SolveError(blame(self.garments, problem.forces[-1], coarse, error=error, at=given.at)) from error
-        result = self._scaled(given, problem.aim, x)
         view = problem.view(self.levels[-1])
+        result = self._scaled(given, problem.aim, x, view=view)
         clean = view is not None and not view.crosses(x)
         finished: dict[str, object] = {}
         if problem.contact is not None:
@@ -124,7 +124,7 @@ class Group:
         spent = (1e3 * np.diff([problem.began, prepared, solved, time.perf_counter()])).round(3).tolist()
         telemetry["milliseconds"] = dict(zip(("prepare", "solve", "measure"), spent, strict=True))
         world, origin = problem.cage.world, problem.cage.origin
-        points = self._followers.placed(result.double().cpu().numpy() + origin, world)
+        points = self._followers.placed(result, origin, world)
         crosses = np.zeros(len(points), bool) if crossing is None else crossing.cpu().numpy()
         own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
         return Solved(own[0], left, telemetry, own[1])
@@ -154,7 +154,7 @@ class Group:
         if contact is None:
             return list(wanted), {}
         begun, given = (self._tensor(np.concatenate(each) - origin) for each in (start, wanted))
-        moved, _ = contact.finish(contact.at(self.levels[-1]).moved(begun, given))
+        moved, _ = contact.finish(contact.at(self.levels[-1]).moved(Placed(begun), given))
         apart = (moved - given).double().cpu().numpy()
         pairs = zip(wanted, self.levels[-1].spans, strict=True)
         return [each + apart[span] for each, span in pairs], contact.measure(moved)[0]
@@ -262,7 +262,7 @@ class Group:
         own = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": seams}
         return FrameContact(self.levels, cage.points, bodies=bodies, cloth=cloth, **own, target=target)
 
-    def _descend(self, problem: Problem) -> tuple[Tensor, list[LevelReport], ForceModule, str]:
+    def _descend(self, problem: Problem) -> tuple[Placed, list[LevelReport], ForceModule, str]:
         """Solve level by level from the cage, or at the finest level alone, as warm frames are; also says why."""
         last = len(self.levels) - 1
         if problem.contact is not None and problem.before is not None and problem.clean:
@@ -271,15 +271,16 @@ class Group:
         integrator = self._integrator(choice)
         # What crosses in a cold frame is drawn apart at the cage.
         first = 0 if choice.nested or (not problem.warm and problem.crossed) else last
-        x, module = problem.aim if first or problem.walked is None else problem.walked, ForceModule(())
-        reports: list[LevelReport] = []
+        below, module = problem.aim if first or problem.walked is None else problem.walked, ForceModule(())
+        reports, placed = list[LevelReport](), None
         for index in range(first, last + 1):
-            x, smoothing = problem.begun(index, x, from_cage=index == first)
+            x, smoothing = problem.begun(index, below if placed is None else placed, from_cage=placed is None)
             budget = self._settings.budget(last - index, problem.began, more=choice.steps, warm=problem.warm)
             budget = replace(budget, steps=0) if problem.start.rests else budget
-            x, made, module = problem.solved(index, x, smoothing, integrator=integrator, budget=budget)
+            placed, made, module = problem.solved(index, x, smoothing, integrator=integrator, budget=budget)
             reports += made
-        return x, reports, module, choice.reason
+        assert placed is not None
+        return placed, reports, module, choice.reason
 
     def _choose(self, problem: Problem) -> Choice:
         """Which levels a frame is solved at, and by what."""
@@ -300,14 +301,14 @@ class Group:
             self._integrators[who] = choice.integrator(build)
         return self._integrators[who]
 
-    def _scaled(self, given: FrameInput, aim: Tensor, x: Tensor) -> Tensor:
-        """The result with its detail scaled as asked for, within bounds."""
+    def _scaled(self, given: FrameInput, aim: Tensor, x: Placed, *, view: LevelContact | None) -> Placed:
+        """The result with its detail scaled as asked for, within bounds, as far as nothing newly crosses."""
         gain = np.concatenate([f.detail * g.detail_scale for f, g in zip(given.garments, self.garments, strict=True)])
         result = self._frames.scaled(aim, x, gain)
         if not bool((result.abs() <= FARTHEST).all()):
             said = f"the refined cloth is not finite or beyond {FARTHEST:g} m; lower physgraph:refine:detail"
             raise SolveError(f"{named(self.garments, given.at)}: {said} or detailScale")
-        return result
+        return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
     def _left(self, problem: Problem, x: Tensor, *, clean: bool) -> State:
         """What the next frame starts from."""

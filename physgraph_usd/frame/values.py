@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..contact.bodies import Touching
+from ..level import Placed
 from ..scene import GarmentFrame
 
 
@@ -70,9 +71,9 @@ class State:
     fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
 
-    def about(self, origin: np.ndarray) -> Float[Tensor, "vertices 3"] | None:
+    def about(self, origin: np.ndarray) -> Placed | None:
         """Fine positions about an origin [m], float64, where cloth walks; else None."""
-        return None if self.fine is None else self.fine - torch.as_tensor(origin).to(self.fine)
+        return None if self.fine is None else Placed(self.fine - torch.as_tensor(origin).to(self.fine))
 
 
 @dataclass(frozen=True, eq=False)
