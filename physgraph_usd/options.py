@@ -1,4 +1,7 @@
-"""Everything that `refine_shot` can be told, and what it refuses."""
+"""Everything that `refine_shot` can be told, and what it refuses.
+
+The solver is imported where it is needed: what a batch has finished before is passed over without it.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,17 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .contact.settings import ContactSettings
 from .errors import UsageError
-from .integrate import method_named
-from .integrate.weights import weights_hash
-from .solve_settings import SolveSettings
 from .usd.atomic import ASSET_PATHS
 
+if TYPE_CHECKING:
+    from .contact.settings import ContactSettings
+    from .solve_settings import SolveSettings
+
+AUTO = "auto"
+"""The integrator that is chosen frame by frame; always known."""
 TEMPORAL = ("tether", "warm", "off")
 POTENTIALS = ("continuum", "paper")
 MODES = ("over", "sibling")
@@ -76,7 +81,7 @@ class RefineOptions:
     garments: Sequence[str] = ()
     colliders: Sequence[str] = ()
     level: int | None = None
-    integrator: str = "auto"
+    integrator: str = AUTO
     weights: Path | None = None
     steps: int = 12
     tolerance: float = 2e-3
@@ -117,6 +122,8 @@ class RefineOptions:
         }
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         if self.weights:
+            from .integrate.weights import weights_hash
+
             values["weights"] = {"file": str(self.weights), "sha256": weights_hash(self.weights)}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
@@ -130,12 +137,17 @@ class RefineOptions:
 
     def contact_settings(self) -> ContactSettings:
         """The part that concerns contact."""
+        from .contact.settings import ContactSettings
+
         return ContactSettings(
             CONTACTS[self.contact], cloth=SELF_CONTACTS[self.self_contact], measured=self.report is not None
         )
 
     def solve_settings(self) -> SolveSettings:
         """The part that concerns the solver."""
+        from .integrate import method_named
+        from .solve_settings import SolveSettings
+
         return SolveSettings(
             method=method_named(self.integrator, self.weights),
             steps=self.steps,
@@ -152,7 +164,10 @@ class RefineOptions:
         Raises:
             UsageError: An option is wrong.
         """
-        method_named(self.integrator, self.weights)
+        if self.integrator != AUTO or self.weights is not None:
+            from .integrate import method_named
+
+            method_named(self.integrator, self.weights)
         for name, value, known in (
             ("temporal", self.temporal, TEMPORAL),
             ("potential", self.potential, POTENTIALS),

@@ -18,6 +18,7 @@ from .contact.passed import told
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
 from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .farm import connected, shots_at_once
+from .finished import Job, check_jobs, finished, in_order, made_from, may_be_done, skipped, taken_as_done
 from .frames import FrameFolder, Outcome, frames_folder, kept_for
 from .history import told_broken
 from .integrate.metric import FACTOR
@@ -34,13 +35,12 @@ from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
 from .usd.atomic import check_place
 from .usd.chunk import Chunk, chunk_of
-from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
-from .usd.provenance import FAILED, UNSETTLED, asset_path, file_hashes, is_result_of, write_root
+from .usd.files import check_targets, files_of
+from .usd.provenance import FAILED, UNSETTLED, is_result_of, write_root
 from .usd.reader import Shot, open_shot
 from .usd.stage import shot_name
 from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
-from .version import __version__, code_digest
 from .words import counted
 
 try:
@@ -73,13 +73,15 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     """
     out = Path(out)
     check_jobs([(shot, out, options)])
-    if skipped := _skipped(shot, out, options):
-        return skipped
+    if there := skipped(shot, out, options):
+        return there
     if not options.dry_run:
         _check_places(out, options)
     with _run(str(shot), options, out=out) as (opened, report):
-        if options.dry_run or _is_done(opened, out, options, report):
+        if options.dry_run:
             return report
+        if may_be_done(out, options) and is_result_of(out, made_from(opened, out, options), settled=options.strict):
+            return taken_as_done(report, out)
         _check_new(out, options)
         _refine(opened, out, options, report)
         if options.root is not None:
@@ -176,10 +178,6 @@ def _refine(opened: Shot, out: Path | None, options: RefineOptions, report: Refi
     return layer
 
 
-Job = tuple[str | Path, Path, RefineOptions]
-"""A shot, the layer to write and options."""
-
-
 def refine_shots(
     jobs: Sequence[Job], *, workers: int, refine: Callable[..., RefineReport] = refine_shot
 ) -> Iterator[RefineReport | PhysGraphError]:
@@ -199,51 +197,13 @@ def refine_shots(
     check_jobs(jobs)
     scheduler = jobs[0][2].scheduler if jobs else None
     chunks, at_once = (workers, shots_at_once(scheduler, workers)) if scheduler else (1, workers)
-    skipped = [_skipped(*job) for job in jobs]
+    found = [finished(*job) for job in jobs]
     alone = [
         (shot, out, dataclasses.replace(options, workers=chunks, progress=None))
-        for (shot, out, options), there in zip(jobs, skipped, strict=True)
+        for (shot, out, options), there in zip(jobs, found, strict=True)
         if there is None
     ]
-    return _in_order(skipped, call_each(refine, alone, workers=at_once))
-
-
-def _in_order(
-    skipped: Sequence[RefineReport | None], done: Generator[RefineReport | PhysGraphError, None, None]
-) -> Iterator[RefineReport | PhysGraphError]:
-    with closing(done):
-        for there in skipped:
-            yield next(done) if there is None else there
-
-
-def _skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
-    """The report of a shot whose layer is there already and is to be left, or None."""
-    if not options.skip_existing or not out.is_file():
-        return None
-    LOG.info("skipped: %s is there", out, extra={"shot": str(shot)})
-    return RefineReport(str(shot), out, options.plain(), options.told_sources(), skipped=True)
-
-
-def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
-    """Refuse options that no shot could be refined with, and to write over what is read or written by any of the jobs.
-
-    Args:
-        jobs: Shot, layer to write and options of each.
-        also: What else is to be written.
-
-    Raises:
-        UsageError: With the value, and the file.
-    """
-    targets = [*also]
-    inputs: set[Path] = set()
-    for shot, out, options in jobs:
-        options.check()
-        for what, path in (("the layer", out), ("the root", options.root)):
-            if path is not None:
-                check_suffix(what, Path(path), LAYER_SUFFIXES)
-        targets += options.targets(out)
-        inputs |= files_of(shot) | {Path(file) for file in (options.weights,) if file}
-    check_targets(targets, inputs)
+    return in_order(found, call_each(refine, alone, workers=at_once))
 
 
 def _check_places(out: Path, options: RefineOptions) -> None:
@@ -264,18 +224,6 @@ def _check_new(out: Path, options: RefineOptions) -> None:
 def _check_none(path: Path, options: RefineOptions) -> None:
     if path.is_file() and not (options.overwrite or is_of_failure(path)):
         raise UsageError(f"{path} exists; choose another name or replace it by --overwrite")
-
-
-def _is_done(opened: Shot, out: Path, options: RefineOptions, report: RefineReport) -> bool:
-    """Whether a run to go on with has made everything there is to make, from the same files; the report says so."""
-    made = options.resume and all(path.is_file() for _, path in options.targets(out))
-    if not made or frames_folder(out).exists():
-        return False
-    if not is_result_of(out, _provenance(opened, out, options), settled=options.strict):
-        return False
-    report.warn(f"{out} is taken as done: the same files, options and version made it")
-    report.out = out
-    return True
 
 
 def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
@@ -409,7 +357,7 @@ def _write_layer(
     """Solve and write all frames; returns the layer where it is in memory."""
     chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
     times, leads = _to_solve(opened, chunk, options)
-    began, provenance = clock.perf_counter(), _provenance(opened, out, options)
+    began, provenance = clock.perf_counter(), made_from(opened, out, options)
     known = len(opened.warnings)  # What is said of the shot itself has been.
     made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite, "chunk": chunk}
     refinements = Refiner.subdivide(opened.scene, solver.levels)
@@ -580,18 +528,6 @@ def _write_failure(report: RefineReport, options: RefineOptions) -> None:
         with suppress(LayerError):
             if options.overwrite or not file.exists() or is_of_failure(file):
                 report.write(file)
-
-
-def _provenance(opened: Shot, out: Path | None, options: RefineOptions) -> dict[str, Any]:
-    folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
-    return {
-        "version": __version__,
-        "code": code_digest(),
-        "options": options.plain(),
-        "shot": None if opened.view.root.anonymous else asset_path(opened.path, folder, absolute=absolute),
-        "inputs": file_hashes(opened.stage, folder, absolute=absolute),
-        "unsaved": list(opened.unsaved) or None,
-    }
 
 
 def _peak_memory_mb() -> float | None:

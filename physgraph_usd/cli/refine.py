@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -60,8 +60,8 @@ def refine(
     Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
     comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
     """
+    from ..finished import check_jobs
     from ..interrupts import signals_raise
-    from ..shot import check_jobs
 
     jobs = _jobs(ctx, shots, out)
     layers = [layer for _, layer, _ in jobs]
@@ -139,10 +139,24 @@ def _say_failed(rows: Sequence[Row]) -> None:
 
 
 def _results(jobs: Sequence[Job], saying: Saying) -> Iterator[RefineReport | PhysGraphError]:
-    """What became of each job: one in this process, several in processes of their own."""
+    """What became of each job: one in this process, several in processes of their own.
+
+    What was finished before is passed over without the solver, whose import takes seconds.
+    """
+    from ..finished import check_jobs, finished, in_order
+
+    check_jobs(jobs)
+    found = [finished(*job) for job in jobs]
+    yield from in_order(found, _solved([job for job, there in zip(jobs, found, strict=True) if there is None], saying))
+
+
+def _solved(jobs: Sequence[Job], saying: Saying) -> Generator[RefineReport | PhysGraphError, None, None]:
+    """What becomes of the jobs that are not finished."""
+    if not jobs:
+        return
     from ..shot import refine_shots
 
-    if len(jobs) == 1:
+    if not saying.several:
         try:
             yield _refine_shown(*jobs[0], saying=saying)
         except PhysGraphError as error:

@@ -1,0 +1,138 @@
+"""What a run need not do: its layer is there and is to be left, or the same files, options and version made it.
+
+It is decided without the solver, whose libraries take seconds to import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Protocol
+
+from .errors import PhysGraphError
+from .frames import frames_folder
+from .options import RefineOptions
+from .report import LOG, RefineReport
+from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
+from .usd.provenance import asset_path, file_hashes, is_result_of, mute_refined, unsaved_layers
+from .usd.stage import open_stage
+from .usd.view import Stage, StageView
+from .version import __version__, code_digest
+
+Job = tuple[str | Path, Path, RefineOptions]
+"""A shot, the layer to write and options."""
+
+
+class Source(Protocol):
+    """A shot that is open.
+
+    Attributes:
+        path: Its name.
+        stage: It, without refined layers.
+        view: The stage as it was handed over.
+        unsaved: Names of the layers whose content is in no file.
+    """
+
+    path: str
+    stage: Stage
+    view: StageView
+    unsaved: tuple[str, ...]
+
+
+class _Opened:
+    """A shot's stage, opened for its files alone."""
+
+    def __init__(self, shot: str) -> None:
+        self.path, (self.stage, _) = shot, open_stage(shot)
+        self.view = StageView.of(self.stage)
+        mute_refined(self.stage)
+        self.unsaved = unsaved_layers(self.stage)
+
+
+def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
+    """The report of a shot that need not be refined, or None.
+
+    Args:
+        shot: Input file.
+        out: Its layer.
+        options: With ``skip_existing`` the layer is left where it is there, with ``resume`` where all that is to be
+            written is there and the layer's record says that it was made from the same.
+    """
+    if there := skipped(shot, out, options):
+        return there
+    if options.dry_run or not may_be_done(out, options):
+        return None
+    try:
+        wanted = made_from(_Opened(str(shot)), out, options)
+    except PhysGraphError:  # which the run itself will tell
+        return None
+    if not is_result_of(out, wanted, settled=options.strict):
+        return None
+    return taken_as_done(RefineReport(str(shot), None, options.plain(), options.told_sources()), out)
+
+
+def skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
+    """The report of a shot whose layer is there already and is to be left, or None."""
+    if not options.skip_existing or not out.is_file():
+        return None
+    LOG.info("skipped: %s is there", out, extra={"shot": str(shot)})
+    return RefineReport(str(shot), out, options.plain(), options.told_sources(), skipped=True)
+
+
+def may_be_done(out: Path, options: RefineOptions) -> bool:
+    """Whether a run to go on with left everything that there is to make, and no frames."""
+    made = options.resume and all(path.is_file() for _, path in options.targets(out))
+    return made and not frames_folder(out).exists()
+
+
+def taken_as_done(report: RefineReport, out: Path) -> RefineReport:
+    """The report of a run whose layer is there."""
+    report.warn(f"{out} is taken as done: the same files, options and version made it")
+    report.out = out
+    return report
+
+
+def made_from(opened: Source, out: Path | None, options: RefineOptions) -> dict[str, Any]:
+    """What decides a layer, for its record: version and code, options, the shot and the hashes of its files."""
+    folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
+    return {
+        "version": __version__,
+        "code": code_digest(),
+        "options": options.plain(),
+        "shot": None if opened.view.root.anonymous else asset_path(opened.path, folder, absolute=absolute),
+        "inputs": file_hashes(opened.stage, folder, absolute=absolute),
+        "unsaved": list(opened.unsaved) or None,
+    }
+
+
+def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
+    """Refuse options that no shot could be refined with, and to write over what is read or written by any of the jobs.
+
+    Args:
+        jobs: Shot, layer to write and options of each.
+        also: What else is to be written.
+
+    Raises:
+        UsageError: With the value, and the file.
+    """
+    targets = [*also]
+    inputs: set[Path] = set()
+    for shot, out, options in jobs:
+        options.check()
+        for what, path in (("the layer", out), ("the root", options.root)):
+            if path is not None:
+                check_suffix(what, Path(path), LAYER_SUFFIXES)
+        targets += options.targets(out)
+        left = options.skip_existing and out.is_file()  # and not opened: nothing that is there is replaced
+        inputs |= ({Path(shot)} if left else files_of(shot)) | {Path(file) for file in (options.weights,) if file}
+    check_targets(targets, inputs)
+
+
+def in_order(
+    found: Sequence[RefineReport | None], done: Generator[RefineReport | PhysGraphError, None, None]
+) -> Iterator[RefineReport | PhysGraphError]:
+    """What became of each job: the report of one that was finished before, else the next that is done."""
+    with closing(done):
+        for there in found:
+            yield next(done) if there is None else there
