@@ -19,7 +19,7 @@ demo: $(VENV)/.demo
 	@mkdir -p $(DEMO)
 	@shot=$$($(BIN)/physgraph-usd sample sleeve -o $(DEMO) --overwrite) && \
 	$(BIN)/physgraph-usd refine $$shot -o $(DEMO)/sleeve.refined.usdc --report $(DEMO)/sleeve.json --overwrite >/dev/null && \
-	$(BIN)/physgraph-usd preview $(DEMO)/sleeve.refined.usdc --shot $$shot -o $(DEMO)/sleeve.png >/dev/null && \
+	$(BIN)/physgraph-usd preview $(DEMO)/sleeve.refined.usdc --shot $$shot -o $(DEMO)/sleeve.png --overwrite >/dev/null && \
 	printf '\nshot     %s\nlayer    %s\nreport   %s\npicture  %s\n' \
 		$$shot $(DEMO)/sleeve.refined.usdc $(DEMO)/sleeve.json $(DEMO)/sleeve.png
 

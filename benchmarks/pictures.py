@@ -28,7 +28,7 @@ def main() -> None:
             shot = write_sample(name, Path(folder))
             layer = Path(folder) / "refined.usdc"
             refine_shot(shot, layer, RefineOptions(frames=(time - 12.0, time)))
-            say(str(preview(layer, out / f"{name}.png", times=[time], size=(1280, 640))))
+            say(str(preview(layer, out / f"{name}.png", times=[time], size=(1280, 640), overwrite=True)))
 
 
 if __name__ == "__main__":

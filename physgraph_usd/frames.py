@@ -7,6 +7,7 @@ whole under its name and for no other reason; until then one run holds it.
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -19,14 +20,16 @@ import numpy as np
 
 from .errors import LayerError, UsageError
 from .lock import LOCK, FolderLock
-from .usd.atomic import temporary_path
+from .usd.atomic import make_file, temporary_path, write_text
 from .words import counted
 
 RUN = "run.json"
 """The file that says what decides the frames."""
-_DONE, _FAILED, _TEMPORARY = ".npz", ".failed.npz", ".tmp"
+_DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
 _BEFORE = ".before"
+_OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
+"""Names of finished frames, of what says what decides them, and of both while they are written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +162,15 @@ class FrameFolder:
         if not self.kept:
             self._clear()
         self._run = json.dumps(wanted, indent=2) + "\n"
-        (self.folder / RUN).write_text(self._run, encoding="utf-8")
+        write_text(self.folder / RUN, self._run)
 
     def _check_ours(self) -> None:
+        """Refuse a folder with anything in it that we did not write: what is ours in it goes once the layer stands."""
         names = {file.name for file in self.folder.glob("*")}
-        if names and not names & {RUN, LOCK}:
-            raise UsageError(f"{self.folder} is no folder of finished frames; choose another name for the layer")
+        others = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
+        if others or (names and not names & {RUN, LOCK}):
+            said = f"; {others[0]} is none of ours" if others else ""
+            raise UsageError(f"{self.folder} is no folder of finished frames{said}; choose another name for the layer")
 
     def _found(self) -> list[int]:
         """Numbers of the whole frames that are there."""
@@ -207,7 +213,7 @@ class FrameFolder:
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
                 raise LayerError(f"{self.folder} is another run's by now")
-            with temporary.open("wb") as stream:
+            with make_file(temporary) as stream:
                 np.savez(stream, **arrays)
             temporary.replace(file)
         except OSError as error:
@@ -239,7 +245,7 @@ class FrameFolder:
     def _clear(self) -> None:
         """Remove our files but the one that is held."""
         for file in self.folder.glob("*"):
-            if file.name == RUN or file.name.endswith(_DONE) or file.name.endswith(_TEMPORARY):
+            if file.name == RUN or _OURS.fullmatch(file.name):
                 file.unlink(missing_ok=True)
 
     def __enter__(self) -> FrameFolder:

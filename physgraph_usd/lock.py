@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from .errors import LayerError
-from .usd.atomic import HOST
+from .usd.atomic import HOST, NO_LINK, check_no_link
 
 LOCK = "run.lock"
 """The file that is held; it says by whom."""
@@ -37,12 +37,14 @@ class FolderLock:
 
         Raises:
             LayerError: Another run holds it.
+            UsageError: The file that is held is a link.
             OSError: The folder cannot be made or written.
         """
         self._file = folder / LOCK
         while True:
             folder.mkdir(exist_ok=True)
-            self._handle = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
+            check_no_link(self._file)
+            self._handle = os.open(self._file, os.O_RDWR | os.O_CREAT | NO_LINK, 0o666)
             if not _held(self._handle):
                 who = os.read(self._handle, 200).decode(errors="replace") or "another run"
                 os.close(self._handle)
@@ -67,7 +69,7 @@ class FolderLock:
 def is_held(folder: Path) -> bool:
     """Whether a run is at work in a folder."""
     try:
-        handle = os.open(folder / LOCK, os.O_RDWR)
+        handle = os.open(folder / LOCK, os.O_RDWR | NO_LINK)
     except OSError:
         return False
     try:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from .errors import StageError, UsageError
+from .errors import LayerError, StageError, UsageError
 from .raycast import BACKGROUND, Surface, View, draw, encode_color, fit_view
-from .usd.atomic import check_place
+from .usd.atomic import check_place, make_file, prepare_target, publish, temporary_path
 from .usd.files import check_targets, files_of
 from .usd.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
 
@@ -43,6 +44,7 @@ def preview(
     times: Sequence[float] | None = None,
     size: tuple[int, int] = (1280, 640),
     camera: tuple[float, float] | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Draw coarse beside fine, or a plain shot alone.
 
@@ -53,12 +55,14 @@ def preview(
         times: Time codes to draw; the last sample for a PNG and all samples for a GIF when None.
         size: Width and height [pixels].
         camera: Azimuth and elevation [degrees]; (25, 10) when None.
+        overwrite: Whether a picture that is there may be replaced.
 
     Returns:
         The picture written.
 
     Raises:
-        UsageError: When the suffix is unknown, a PNG is asked for several times, or the picture is one of the shot's.
+        UsageError: When the suffix is unknown, a PNG is asked for several times, or the picture exists, is a link or is
+            one of the shot's.
         LayerError: When nothing can be written there.
         StageError: When a stage cannot be opened or shows no mesh.
     """
@@ -68,17 +72,25 @@ def preview(
     below = shot_of(layer) if shot is None else Path(shot)
     check_targets([("the picture", out)], files_of(layer) | (files_of(below) if below else set()))
     check_place(out)
+    prepare_target(out, overwrite=overwrite)
     panels = _panels(layer, below)
     codes = _times(panels, times, out.suffix.lower())
     for panel in panels:
         panel.stage.bake(tuple(code for code in codes if code is not None))
     views = _frame(panels, codes, size, camera or (25.0, 10.0))
     pictures = [_compose(panels, code, size, views) for code in codes]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if out.suffix.lower() == STILL:
-        pictures[0].save(out, optimize=True)
-    else:
-        _save_loop(pictures, out, panels[0].stage.rate, codes)
+    temporary = temporary_path(out, suffix=out.suffix)
+    try:
+        with make_file(temporary) as stream:
+            if out.suffix.lower() == STILL:
+                pictures[0].save(stream, "PNG", optimize=True)
+            else:
+                _save_loop(pictures, stream, panels[0].stage.rate, codes)
+        publish(temporary, out)
+    except OSError as error:
+        raise LayerError(f"cannot write {out}: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
     return out
 
 
@@ -213,7 +225,7 @@ def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lin
         pen.text((left, place), line, FAINT, font, anchor="ls")
 
 
-def _save_loop(pictures: list[Image.Image], out: Path, rate: float, codes: list[float | None]) -> None:
+def _save_loop(pictures: list[Image.Image], stream: BinaryIO, rate: float, codes: list[float | None]) -> None:
     """Write a GIF with one palette for all frames and the shot's own speed."""
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, 4).astype(int)]
     strip = Image.new("RGB", (chosen[0].width, sum(p.height for p in chosen)))
@@ -223,7 +235,8 @@ def _save_loop(pictures: list[Image.Image], out: Path, rate: float, codes: list[
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     gap = float(np.median(np.diff([c for c in codes if c is not None]))) if len(codes) > 1 else 1.0
     frames[0].save(
-        out,
+        stream,
+        "GIF",
         save_all=True,
         append_images=frames[1:],
         duration=max(20, round(1000.0 * gap / rate)),

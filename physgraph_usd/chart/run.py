@@ -95,7 +95,8 @@ def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
     there = next((file for file in files if file.exists()), None)
     if there is not None and not overwrite and not files[-1].exists():
         raise UsageError(f"{there} exists; choose another folder or replace it by --overwrite")
-    check_place(files[0])
+    for file in files:
+        check_place(file)
 
 
 def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:

@@ -150,6 +150,7 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 @click.option("--time", "times", type=float, multiple=True, metavar="T", help="Time code to draw; repeatable.")
 @click.option("--size", type=PictureSize(), default="1280x640", help="Pixels.")
 @click.option("--camera", type=(float, float), metavar="AZIMUTH ELEVATION", help="Where to look from, in degrees.")
+@overwrite_option
 def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
     """Draw the coarse cloth beside the fine cloth of LAYER and print the picture's path.
 

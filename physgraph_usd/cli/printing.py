@@ -46,10 +46,14 @@ class Saying:
 
         Raises:
             OSError: The file cannot be written.
+            UsageError: The file is a link.
         """
+        from ..usd.atomic import check_no_link
+
         logger, on_stderr = logging.getLogger(LOGGER), _OnStderr(_LEVELS[min(self.verbose, 2)], self.several)
         handlers: list[logging.Handler] = [on_stderr]
         if self.log_file is not None:
+            check_no_link(self.log_file)
             into_file = _IntoFile(self.log_file, encoding="utf-8")
             into_file.setLevel(_LEVELS[max(min(self.verbose, 2), 1)])
             into_file.setFormatter(logging.Formatter(_LINE, defaults={"shot": "-"}))

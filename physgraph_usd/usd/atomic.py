@@ -13,9 +13,12 @@ import socket
 import tempfile
 from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from ..errors import LayerError, UsageError
 
+NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+"""Flag of `os.open` that follows no link; Windows has none."""
 ASSET_PATHS = ("relative", "absolute")
 """How one file may name another: from its own folder, or from the root of the file system."""
 HOST = re.sub(r"[^\w-]", "_", socket.gethostname()) or "host"
@@ -43,9 +46,10 @@ def prepare_target(target: Path, *, overwrite: bool) -> None:
         overwrite: Whether an existing file may be replaced.
 
     Raises:
-        UsageError: The target exists and may not be replaced, or is a folder.
+        UsageError: The target exists and may not be replaced, or is a folder or a link.
         LayerError: The folder cannot be made.
     """
+    check_no_link(target)
     if target.is_dir():
         raise UsageError(f"{target} is a folder; name a layer such as {target / 'refined.usdc'}")
     if target.exists() and not overwrite:
@@ -91,6 +95,28 @@ def _is_other_process(pid: int) -> bool:
     return True
 
 
+def check_no_link(target: Path) -> None:
+    """Refuse a link, for what it leads to is nothing that was named; one to a device, such as a terminal, is none.
+
+    Raises:
+        UsageError: The target is a link to a file or a folder, or to nothing.
+    """
+    if target.is_symlink() and (target.is_file() or target.is_dir() or not target.exists()):
+        raise UsageError(f"{target} is a link to {os.readlink(target)}; name that, or remove the link")
+
+
+def make_file(path: Path) -> BinaryIO:
+    """Open a file for writing, emptied where it is there.
+
+    Args:
+        path: The file; a link is not followed.
+
+    Raises:
+        OSError: It is a link, or cannot be written.
+    """
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | NO_LINK, 0o666), "wb")
+
+
 def write_text(target: Path, text: str) -> None:
     """Write a text, whole or not at all; its folder is made where it is not there.
 
@@ -104,7 +130,8 @@ def write_text(target: Path, text: str) -> None:
     temporary = temporary_path(target, suffix="")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(text, encoding="utf-8")
+        with make_file(temporary) as stream:
+            stream.write(text.encode())
         publish(temporary, target)
     except OSError as error:
         raise LayerError(f"cannot write {target}: {error.strerror}") from error
@@ -120,9 +147,10 @@ def check_place(target: Path) -> None:
         target: A file to write later; its folder may be missing.
 
     Raises:
-        UsageError: The target is a folder, or a file stands where a folder is needed.
+        UsageError: The target is a folder or a link, or a file stands where a folder is needed.
         LayerError: The folder cannot be written.
     """
+    check_no_link(target)
     folder = next(each for each in target.absolute().parents if each.exists())
     if target.is_dir() or not folder.is_dir():
         raise UsageError(f"cannot write {target}: it is a folder, or {folder} is none")
