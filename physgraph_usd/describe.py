@@ -18,6 +18,7 @@ from .report import RefineReport, of_a_kind
 from .resolution import LevelChoice, carries_none, choose_levels, sample_frames
 from .scene import Frame, Garment, GarmentFrame
 from .strain import strained_parts, stretched
+from .untagged import bodies_beside, command_of, proposal, told_beside
 from .usd.reader import Shot
 from .usd.stage import GarmentSource
 from .usd.survey import survey
@@ -49,6 +50,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options)).plain()
     known = [carries_none(garment.path, choice) for garment, choice in zip(opened.scene.garments, choices, strict=True)]
     known += _strained(opened, report, frames)
+    known += [_unfelt(opened, report, frames)] if options.contact != "off" else []
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
@@ -114,26 +116,41 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
             for garment in opened.scene.garments
         },
         "warnings": [*of_a_kind(warnings)],
+        **_command(opened, report, options),
     }
 
 
-def describe_meshes(shot: str | Stage, problem: str) -> dict[str, Any]:
-    """What can be said of a stage that could not be opened for refining: its meshes, and why not.
+def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
+    """The command with what the garments touch and do not feel, where they do."""
+    unfelt = dict.fromkeys(path for garment in report.garments for path in garment.get("unfelt", ()))
+    if not unfelt:
+        return {}
+    return {"command": command_of(opened.path, options.garments, [*opened.colliders, *unfelt])}
+
+
+def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> dict[str, Any]:
+    """What can be said of a stage that could not be opened for refining: its meshes, why not, and what may do.
 
     Raises:
         StageError: The file cannot be opened at all.
     """
-    found = survey(shot)
+    found, command = survey(shot), ""
+    if not options.garments and not any(mesh.garment for mesh in found.meshes):
+        cloth = [mesh for mesh in found.meshes if mesh.is_open and not mesh.problem]
+        cloth.sort(key=lambda mesh: -mesh.faces)
+        command = proposal(shot, [mesh.path for mesh in cloth], options.frames)
     return {
         "shot": found.path,
         "metres_per_unit": found.metres_per_unit,
         "problem": problem,
+        **({"command": command} if command else {}),
         "meshes": [
             {
                 "path": mesh.path,
                 "garment": mesh.garment,
                 "points": mesh.points,
                 "faces": mesh.faces,
+                "form": "open" if mesh.is_open else "closed",
                 "samples": len(mesh.times),
                 "problem": mesh.problem or "none",
                 "notices": [str(notice) for notice in mesh.notices],
@@ -183,6 +200,14 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),
     }
+
+
+def _unfelt(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> str:
+    """Add to the report the closed meshes that garments touch and do not feel; returns a warning, or ""."""
+    beside = bodies_beside(opened, frames)
+    for garment in report.garments:
+        garment["unfelt"] = [each.path for each in beside if garment["path"] in each.shares]
+    return told_beside(beside)
 
 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:

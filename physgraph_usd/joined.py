@@ -27,7 +27,8 @@ from .mesh.lanes import start_warp
 from .options import RefineOptions
 from .pipeline import Refiner
 from .scene import Frame
-from .usd.reader import Shot, open_shot
+from .untagged import open_with_colliders
+from .usd.reader import Shot
 from .usd.seams import Look, Points, Seam, between
 from .usd.stage import is_there
 from .usd.stitch import SEAM_BOUND
@@ -197,7 +198,7 @@ def _looking(stack: ExitStack, shot: Path, options: Mapping[str, Any], meshes: M
     plain = {name: value for name, value in options.items() if name not in ("frames", "run_up", "weights")}
     made_with = RefineOptions(**plain)
     given = {name: getattr(made_with, name) for name in ("garments", "colliders", "level", "overrides", "rest_frame")}
-    opened = stack.enter_context(closing(open_shot(str(shot), **given)))
+    opened = stack.enter_context(closing(open_with_colliders(str(shot), **given)))
     paths = [str(source.path) + ("_refined" if made_with.mode == "sibling" else "") for source in opened.sources]
     levels = [_level_of(opened, index, meshes.get(path)) for index, path in enumerate(paths)]
     looking = Looking(opened, made_with, levels)

@@ -42,7 +42,8 @@ class RefineOptions:
     Attributes:
         frames: First and last time code, or None for all of the shot.
         garments: Prim paths, globs or collections; empty finds applied schemas.
-        colliders: Prim paths, globs or collections; empty finds applied schemas.
+        colliders: Prim paths, globs or collections; "auto" for what the shot names and closed meshes that garments
+            touch; empty finds applied schemas.
         level: Subdivisions; -1 chooses, None takes the stage's.
         integrator: A name of `integrate.METHODS`.
         weights: Weights for a learned integrator in place of those that ship, or None.

@@ -33,11 +33,12 @@ from .processes import call_each, memory_is_named
 from .report import LOG, SIGNALLED, RefineReport, is_of_failure
 from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
+from .untagged import AUTO, open_with_colliders
 from .usd.atomic import check_place
 from .usd.chunk import Chunk, chunk_of
 from .usd.files import check_targets, files_of
 from .usd.provenance import FAILED, UNSETTLED, is_result_of, write_root
-from .usd.reader import Shot, open_shot
+from .usd.reader import Shot
 from .usd.stage import shot_name
 from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
@@ -169,7 +170,8 @@ def _refine(opened: Shot, out: Path | None, options: RefineOptions, report: Refi
     began = clock.perf_counter()
     if not kernels_are_kept():
         LOG.info("kernels are compiled, once on this machine: some 15 s; physgraph-usd warm-up does it ahead")
-    solver = _ShotSolver(opened.path, [garment["level"] for garment in report.garments], options)
+    named = dataclasses.replace(options, colliders=opened.colliders) if AUTO in options.colliders else options
+    solver = _ShotSolver(opened.path, [garment["level"] for garment in report.garments], named)
     solver.adopt(opened)
     layer = _write_layer(opened, solver, out, options, report=report)
     report.seconds["total"] = report.seconds["open"] + clock.perf_counter() - began
@@ -264,12 +266,12 @@ def inspect_shot(shot: str | Path | Stage, **given: Any) -> dict[str, Any]:
         with closing(_open(source, options)) as opened:
             return describe(opened, options)
     except StageError as error:
-        return describe_meshes(source, str(error)) | {"exit_code": error.exit_code}
+        return describe_meshes(source, str(error), options) | {"exit_code": error.exit_code}
 
 
 def _open(shot: str | Stage, options: RefineOptions) -> Shot:
     """Open a shot with the options that concern reading."""
-    return open_shot(
+    return open_with_colliders(
         shot,
         garments=options.garments,
         colliders=options.colliders,

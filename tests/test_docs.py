@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from pxr import UsdGeom, Vt
 from stages import GARMENT_API, add_sheet, new_stage, save
 
 from physgraph_usd.cli import main
@@ -49,6 +50,10 @@ def folder(tmp_path: Path, page: Path) -> Path:
     stage = new_stage(tmp_path / "shot.usda", metres=0.05)
     add_sheet(stage, "/World/Coat", times=tuple(map(float, range(1, count + 1))), size=(3, 2))
     stage.GetPrimAtPath("/World/Coat").AddAppliedSchema(GARMENT_API)
+    body = UsdGeom.Mesh.Define(stage, "/World/Body")
+    body.CreateFaceVertexCountsAttr(Vt.IntArray([3] * 4))
+    body.CreateFaceVertexIndicesAttr(Vt.IntArray([0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 2]))
+    body.CreatePointsAttr(Vt.Vec3fArray([(0, 0, -4), (3, 0, -4), (0, 2, -4), (0, 0, -1)]))
     shot = save(stage)
     for name in ("seq", "c", "publish", "build"):
         (tmp_path / name).mkdir()

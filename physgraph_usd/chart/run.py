@@ -19,10 +19,11 @@ from ..options import RefineOptions
 from ..resolution import choose_levels, sample_frames
 from ..scene import Frame, Scene
 from ..shot import MOST_LANES, prepare_device
+from ..untagged import open_with_colliders
 from ..usd.atomic import check_place
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import file_hashes
-from ..usd.reader import Shot, open_shot
+from ..usd.reader import Shot
 from ..version import __version__
 from .journal import NAME as JOURNAL
 from .journal import Journal
@@ -67,7 +68,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
     prepare_device(options.device)
     folder = Path(folder)
     _check_folder(folder, shot, overwrite=options.overwrite)
-    opened = open_shot(
+    opened = open_with_colliders(
         str(shot),
         garments=options.garments,
         colliders=options.colliders,

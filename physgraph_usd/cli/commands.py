@@ -23,6 +23,7 @@ from .options import (
     overwrite_option,
     scene_options,
     shot_argument,
+    tag_collider_option,
 )
 from .printing import outline, tell
 from .refine import refine
@@ -80,7 +81,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, **options: Any) -> 
 @shot_argument
 @out_option("OUT", "Layer to write.")
 @garment_option
-@collider_option
+@tag_collider_option
 @click.option("--preset", metavar="FABRIC", help=f"Fabric of the garments: {', '.join(PRESETS)}.")
 @click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
 @click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
@@ -110,6 +111,8 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
     from ..tune.session import TuneSession
 
     with closing(TuneSession(shot, **options)) as session:
+        if session.warning:
+            click.echo(f"warning: {session.warning}", err=True)
         serve(session, port=port, say=click.echo)
 
 

@@ -50,8 +50,15 @@ asset_paths_option = _layer(
 garment_option = _scene(
     "--garment", "garments", multiple=True, metavar="PATH", help="Prim path, glob or collection; repeatable."
 )
-collider_option = _scene(
+tag_collider_option = _scene(
     "--collider", "colliders", multiple=True, metavar="PATH", help="Prim path, glob or collection; repeatable."
+)
+collider_option = _scene(
+    "--collider",
+    "colliders",
+    multiple=True,
+    metavar="PATH|auto",
+    help="Prim path, glob or collection; auto: closed meshes that garments touch, too; repeatable.",
 )
 config_option = _said(
     "--config",

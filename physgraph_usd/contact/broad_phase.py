@@ -37,7 +37,7 @@ class Parts:
             together: False solves every garment apart.
         """
         self._garments, self._together = tuple(garments), together
-        self._edges = [_mean_edge(garment) for garment in garments]
+        self._edges = [mean_edge(garment) for garment in garments]
 
     def of(self, frames: Sequence[GarmentFrame]) -> list[tuple[int, ...]]:
         """Numbers of the garments that are solved together, in order.
@@ -181,10 +181,10 @@ class Bodies:
 
 def reach_of(garment: Garment, frame: GarmentFrame) -> float:
     """How far from the cage's bounds a body counts as near [m]: its offset and the move expected of the cloth."""
-    return frame.offset + REACH * _mean_edge(garment)
+    return frame.offset + REACH * mean_edge(garment)
 
 
-def _mean_edge(garment: Garment) -> float:
+def mean_edge(garment: Garment) -> float:
     """Mean edge of the cage [m], 0 without edges."""
     ends = garment.mesh.half_edges.edges
     lengths = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)

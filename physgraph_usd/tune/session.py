@@ -24,7 +24,7 @@ from ..mesh.subdivide import Refinement
 from ..resolution import choose_levels, sample_frames
 from ..scene import Frame, State
 from ..shot import prepare_device
-from ..usd.reader import open_shot
+from ..untagged import AUTO, bodies_beside, open_with_colliders, told_beside
 from ..usd.schema import AUTO_LEVEL, GARMENT
 from ..usd.tag import fabric_values, tag
 from .solver import FrameSolver
@@ -65,6 +65,7 @@ class TuneSession:
         time: The one that is solved next.
         levels: Subdivisions of each garment.
         contact: Whether cloth feels bodies and cloth.
+        warning: What the cloth touches and does not feel, with the option that names it; or "".
         values: What `save` authors, by prim path and the schema's short names.
     """
 
@@ -95,12 +96,16 @@ class TuneSession:
         if self.out.exists() and not overwrite:
             raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
         self._overwrite, self._named = overwrite, (tuple(garments), tuple(colliders))
-        self.shot = self._opened = open_shot(shot, garments=garments, colliders=colliders)
+        self.shot = self._opened = open_with_colliders(shot, garments=garments, colliders=colliders)
+        if AUTO in colliders:
+            self._named = self._named[0], self.shot.colliders
         scene = self.shot.scene
         self.garments = tuple(garment.path for garment in scene.garments)
         self.times: tuple[float | None, ...] = scene.times or (None,)
         self.time, self.contact = self.times[0], True
-        choices = choose_levels(scene, sample_frames(scene, self.shot.frame))
+        frames = sample_frames(scene, self.shot.frame)
+        self.warning = told_beside(bodies_beside(self.shot, frames))
+        choices = choose_levels(scene, frames)
         self.levels = [choice.level for choice in choices]
         # A level that is chosen from the fabric would be chosen anew from what is tried.
         chosen = zip(scene.garments, self.levels, strict=True)

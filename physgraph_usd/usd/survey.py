@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pxr import Usd
 
+from ..colliders.orient import pieces_of
 from ..errors import StageError
 from .cage import read_cage
 from .find import has_schema, instance_roots
@@ -28,6 +29,7 @@ class MeshReport:
         instanced: Whether it is inside an instance.
         points: Number of points; 0 when they cannot be read.
         faces: Number of faces that would be refined.
+        is_open: Whether most of its faces are in pieces that are not closed.
         times: Authored time codes of points and transforms, not those of a skeleton.
         problem: Why it could not be refined; "" when it could.
         notices: What refining would tell about it.
@@ -39,6 +41,7 @@ class MeshReport:
     instanced: bool
     points: int = 0
     faces: int = 0
+    is_open: bool = False
     times: tuple[float, ...] = ()
     problem: str = ""
     notices: tuple[Notice, ...] = ()
@@ -94,9 +97,21 @@ def survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
     try:
         with pxr_errors(f"cannot read <{path}>"):
             times = garment_times(prim)
-            count = PointReader(prim, times[0] if times else None).count
+            points = PointReader(prim, times[0] if times else None)
+            count = points.count
             cage = read_cage(prim, count, times)
+            placed = points.read(times[0] if times else None, cage.mesh.half_edges.edges)[0]
+            pieces = pieces_of(placed, cage.mesh.triangulate(placed).triangles)
             odd = check_placement(prim, metres, times)
     except StageError as error:
         return MeshReport(path, *kind, points=count, problem=str(error))
-    return MeshReport(path, *kind, count, len(cage.kept_faces), times, "", (*cage.notices, *odd))
+    return MeshReport(
+        path,
+        *kind,
+        count,
+        len(cage.kept_faces),
+        len(pieces.open) > len(pieces.closed),
+        times,
+        "",
+        (*cage.notices, *odd),
+    )

@@ -1,0 +1,144 @@
+"""Closed meshes that garments touch and that nothing names as colliders: found, named, and taken by ``auto``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from shlex import join
+from typing import Any
+
+import numpy as np
+
+from .colliders.mesh import MeshBody
+from .colliders.pose import MeshPose
+from .contact.broad_phase import bounds_of
+from .contact.nearby import NEAR, share_at, smallest_body
+from .errors import StageError
+from .mesh.lanes import start_warp
+from .resolution import sample_frames
+from .scene import Frame
+from .usd.reader import Shot, open_shot
+from .usd.untagged import meshes_beside
+from .usd.view import Stage
+
+AUTO = "auto"
+"""In place of a collider: all that the shot names, and closed meshes that garments touch."""
+MOST_NAMED, MOST_ASKED = 4, 32
+
+
+@dataclass(frozen=True)
+class Beside:
+    """A closed mesh that a garment touches and does not feel.
+
+    Attributes:
+        path: The mesh.
+        shares: For each garment that touches it, the share of its vertices that is in it or near it, in the first frame
+            looked at where any is.
+    """
+
+    path: str
+    shares: Mapping[str, float]
+
+    @property
+    def garment(self) -> str:
+        """Path of the garment that touches it most."""
+        return max(self.shares, key=lambda path: self.shares[path])
+
+
+def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
+    """Closed meshes that are neither garments nor colliders and that garments overlap or lie within `NEAR` of.
+
+    Args:
+        shot: An open shot.
+        frames: A few of its frames, of which the first, the middle and the last are looked at.
+
+    Returns:
+        What was found, the one that most of a garment touches first.
+
+    Raises:
+        StageError: USD cannot read the files any more.
+    """
+    looked = list(dict.fromkeys(frames[k] for k in (0, len(frames) // 2, -1) if frames))
+    boxes = [bounds_of(np.concatenate([own.points for own in frame.garments])) for frame in looked]
+    boxes = [box + np.array([[-NEAR], [NEAR]]) for box in boxes]
+    least, found = smallest_body(shot.scene.garments), []
+    for path, poses in meshes_beside(shot, [frame.time for frame in looked], boxes, least=least):
+        start_warp()
+        body = MeshBody(device="cpu", lanes=1)
+        for index, pose in poses:
+            cages = zip(shot.scene.garments, looked[index].garments, strict=True)
+            shares = {g.path: share_at(body, pose, g, own.points) for g, own in cages if isinstance(pose, MeshPose)}
+            touched = {path: share for path, share in shares.items() if share}
+            if touched:
+                found.append(Beside(path, touched))
+                break
+    return sorted(found, key=lambda each: -max(each.shares.values()))
+
+
+def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequence[str] = (), **given: Any) -> Shot:
+    """Open a shot, where `AUTO` among the colliders stands for the meshes of `bodies_beside`.
+
+    Args:
+        shot: As `open_shot` takes it.
+        colliders: As `open_shot` takes them, or `AUTO` among them.
+        given: Its other options.
+
+    Raises:
+        UsageError: When an option cannot be used.
+        StageError: When the stage cannot be read.
+    """
+    if AUTO not in colliders:
+        return open_shot(shot, colliders=colliders, **given)
+    with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **given)) as first:
+        beside = bodies_beside(first, sample_frames(first.scene, first.frame))
+        named = [*first.colliders, *(each.path for each in beside)]
+    return open_shot(shot, colliders=named, **given)
+
+
+def told_beside(found: Sequence[Beside]) -> str:
+    """One warning that says what touches cloth unfelt and what to type, or ""."""
+    if not found:
+        return ""
+    each = [f"<{each.path}> ({each.shares[each.garment]:.0%} of <{each.garment}>)" for each in found[:MOST_NAMED]]
+    each += [f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
+    several = len(found) > 1
+    return (
+        f"cloth is inside or within {1e3 * NEAR:.0f} mm of {'closed meshes' if several else 'a closed mesh'} that it "
+        f"does not feel, for {'they are no colliders' if several else 'it is no collider'}: {', '.join(each)}; "
+        f"give --collider {AUTO}, or by name {join(_options('--collider', [one.path for one in found[:MOST_NAMED]]))}"
+    )
+
+
+def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:
+    """The command for a shot in which nothing is marked: open meshes that lie on closed ones are its garments.
+
+    Args:
+        shot: The shot.
+        meshes: Its open meshes, the largest first.
+        frames: First and last time code, or None.
+
+    Returns:
+        The command, or "" where there are none, or they cannot be read together.
+    """
+    try:
+        with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
+            found = bodies_beside(opened, sample_frames(opened.scene, opened.frame))
+            lying = {path for each in found for path in each.shares}
+            garments = [garment.path for garment in opened.scene.garments if garment.path in lying]
+            return command_of(opened.path, garments, [each.path for each in found]) if found else ""
+    except StageError:
+        return ""
+
+
+def command_of(shot: str, garments: Iterable[str], colliders: Iterable[str]) -> str:
+    """The command that refines a shot's garments with colliders."""
+    out = str(Path(shot).with_suffix(".refined.usdc"))
+    words = ["physgraph-usd", "refine", shot, "-o", out]
+    return join([*words, *_options("--garment", garments), *_options("--collider", colliders)])
+
+
+def _options(name: str, values: Iterable[str]) -> list[str]:
+    return [word for value in values for word in (name, value)]

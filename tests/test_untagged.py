@@ -1,0 +1,144 @@
+"""Closed meshes that cloth touches and that nothing names as colliders are named, and taken by ``auto``."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from pxr import Gf, Usd, UsdGeom, Vt
+from shots import refine
+from stages import COLLIDER_API, GARMENT_API, add_sheet, add_skeleton, author, bind_skin, new_stage, save, vec3
+
+from physgraph_usd.cli import main
+from physgraph_usd.shot import inspect_shot
+from physgraph_usd.tune.session import TuneSession
+
+COUNTS = [4] * 6
+FACES = [0, 2, 3, 1, 4, 5, 7, 6, 0, 1, 5, 4, 2, 6, 7, 3, 0, 4, 6, 2, 1, 3, 7, 5]
+
+
+def corners(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
+    """The corners of a box, x fastest."""
+    return np.array([[x, y, z] for z in (low[2], high[2]) for y in (low[1], high[1]) for x in (low[0], high[0])])
+
+
+UNDER = corners((-1.0, 0.0, -3.0), (5.0, 3.0, -0.4))
+"""Under the sheet, which comes down to -0.3 units: 10 mm where a unit is 10 cm."""
+
+
+def add_box(stage: Usd.Stage, path: str = "/World/body", points: np.ndarray = UNDER, *, faces: int = 6) -> UsdGeom.Mesh:
+    """A box without a mark."""
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(COUNTS[:faces]))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray(FACES[: 4 * faces]))
+    mesh.CreatePointsAttr(vec3(points))
+    return mesh
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Usd.Stage:
+    """A sheet of 40 by 30 cm."""
+    stage = new_stage(tmp_path / "shot.usda", metres=0.1)
+    add_sheet(stage)
+    return stage
+
+
+def test_it_is_named_with_what_to_type(stage: Usd.Stage, tmp_path: Path):
+    add_box(stage)
+    shot = save(stage)
+    found = inspect_shot(shot)
+    warning = next(said for said in found["warnings"] if "does not feel" in said)
+    assert "</World/body> (" in warning
+    assert warning.endswith("give --collider auto, or by name --collider /World/body")
+    assert found["command"].endswith("--collider /World/body")
+    assert warning in refine(Path(shot), tmp_path / "a.usdc", dry_run=True).warnings
+    with closing(TuneSession(shot)) as session:
+        assert session.warning == warning
+
+
+def test_the_command_that_is_printed_runs(stage: Usd.Stage):
+    sheet = UsdGeom.Mesh(stage.GetPrimAtPath("/World/cloth"))
+    sheet.GetPrim().RemoveAppliedSchema(GARMENT_API)
+    add_box(stage)
+    found = inspect_shot(save(stage))
+    assert [mesh["form"] for mesh in found["meshes"]] == ["open", "closed"]
+    words = shlex.split(found["command"])
+    assert words[-4:] == ["--garment", "/World/cloth", "--collider", "/World/body"]
+    done = CliRunner().invoke(main, [*words[1:], "--level", "0", "--frames", "1:1"])
+    assert done.exit_code == 0, done.output
+    assert "does not feel" not in done.output
+
+
+def test_auto_takes_it_and_what_is_marked(stage: Usd.Stage, tmp_path: Path):
+    add_box(stage)
+    add_box(stage, "/World/marked", UNDER + np.array([8.0, 0.0, 0.0])).GetPrim().AddAppliedSchema(COLLIDER_API)
+    report = refine(Path(save(stage)), tmp_path / "a.usdc", colliders=["auto"], level=0, frames=(1.0, 1.0))
+    assert report.garments[0]["colliders"] == ["/World/body", "/World/marked"]
+    assert report.options["colliders"] == ["auto"]
+    assert list(report.frames[0]["garments"][0]["contact"]["bodies"]) == ["/World/body"]
+    assert not any("does not feel" in said for said in report.warnings)
+
+
+def away(stage: Usd.Stage) -> None:
+    add_box(stage, points=UNDER - np.array([0.0, 0.0, 1.0]))
+
+
+def sky(stage: Usd.Stage) -> None:
+    add_box(stage, points=corners((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0)))
+
+
+def button(stage: Usd.Stage) -> None:
+    add_box(stage, points=corners((1.0, 1.0, 0.0), (2.0, 2.0, 1.0)))
+
+
+def open_box(stage: Usd.Stage) -> None:
+    add_box(stage, faces=5)
+
+
+def switched_off(stage: Usd.Stage) -> None:
+    prim = add_box(stage).GetPrim()
+    prim.AddAppliedSchema(COLLIDER_API)
+    author(prim, "physgraph:collider:enabled", False, kind="bool")
+
+
+def invisible(stage: Usd.Stage) -> None:
+    add_box(stage).CreateVisibilityAttr("invisible")
+
+
+def copy_of_a_collider(stage: Usd.Stage) -> None:
+    add_box(stage).GetPrim().AddAppliedSchema(COLLIDER_API)
+    add_box(stage, "/World/copy")
+
+
+CASES = [away, sky, button, open_box, switched_off, invisible, copy_of_a_collider]
+
+
+@pytest.mark.parametrize("add", CASES, ids=lambda add: add.__name__)
+def test_what_cloth_does_not_lie_on_is_not_named(stage: Usd.Stage, add):
+    add(stage)
+    found = inspect_shot(save(stage))
+    assert not any("does not feel" in said for said in found["warnings"])
+    assert "command" not in found
+
+
+def test_nothing_is_said_without_contact(stage: Usd.Stage, tmp_path: Path):
+    add_box(stage)
+    report = refine(Path(save(stage)), tmp_path / "a.usdc", dry_run=True, contact="off")
+    assert not any("does not feel" in said for said in report.warnings)
+
+
+def test_a_body_is_where_its_skeleton_brings_it(stage: Usd.Stage):
+    """Bound, it is beside the cloth; its joint brings it under it at time code 2."""
+    add_skeleton(stage, "/World/rig", (1.0, 2.0, 3.0))
+    body = add_box(stage, "/World/rig/body", UNDER + np.array([30.0, 0.0, 0.0]))
+    bind_skin(body, "/World/rig", joints=[1] * 8)
+    animation = stage.GetPrimAtPath("/World/rig/skel/anim")
+    for time, x in ((1.0, 2.0), (2.0, -28.0), (3.0, 2.0)):
+        animation.GetAttribute("translations").Set(Vt.Vec3fArray([(0, 0, 0), (x, 0, 0)]), time)
+        animation.GetAttribute("rotations").Set(Vt.QuatfArray([Gf.Quatf(1.0)] * 2), time)
+    said = [each for each in inspect_shot(save(stage))["warnings"] if "does not feel" in each]
+    assert [each.count("</World/rig/body>") for each in said] == [1]
