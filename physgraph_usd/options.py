@@ -50,6 +50,8 @@ class RefineOptions:
         steps: Most steps at the finest level.
         tolerance: Stop when the cloth would move less than this, RMS, in local edge lengths.
         budget_ms: Milliseconds a frame, or None.
+        frame_limit: Seconds after which a frame stops where it stands, as one that did not settle; None for 20 times
+            what the shot's frames take, never under two minutes.
         device: "cpu" or "cuda".
         overrides: "</Prim>.attribute=value" or "attribute=value", as ``--set`` takes them.
         mode: "over" or "sibling".
@@ -87,6 +89,7 @@ class RefineOptions:
     steps: int = 12
     tolerance: float = 2e-3
     budget_ms: float | None = None
+    frame_limit: float | None = None
     device: str = "cpu"
     overrides: Sequence[str] = ()
     mode: str = "over"
@@ -154,6 +157,7 @@ class RefineOptions:
             steps=self.steps,
             tolerance=self.tolerance,
             budget_ms=self.budget_ms,
+            frame_limit=self.frame_limit,
             temporal=self.temporal,
             potential=self.potential,
             contact=self.contact_settings(),
@@ -187,6 +191,8 @@ class RefineOptions:
             raise UsageError(f"run-up of {self.run_up} frames: give 0 or more")
         if self.budget_ms is not None and not self.budget_ms > 0:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
+        if self.frame_limit is not None and not self.frame_limit > 0:
+            raise UsageError(f"frame limit of {self.frame_limit:g} s: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time as clock
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
@@ -16,6 +17,7 @@ from .contact.bodies import Touching
 from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
+from .deadline import ends_after, is_over
 from .errors import GarmentError
 from .frame.group import Group
 from .frame.values import FrameInput, join, split
@@ -26,6 +28,11 @@ from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State, out_of_bounds, refuse_far
 from .solve_settings import SolveSettings
 from .strain import has_collapsed, size_left
+
+LIMIT, LEAST_LIMIT, LIMIT_PER_VERTEX = 20.0, 120.0, 0.01
+"""A frame stops where it stands after so many times the median of the shot's frames, but never before so many seconds
+and so many a fine vertex: the slowest cold frames of the samples and shots take 0.6 ms a vertex on one core, and the
+first frame of a machine may compile kernels, some 15 s. No ordinary frame is to end by the clock."""
 
 
 class Refiner:
@@ -76,6 +83,7 @@ class Refiner:
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
         self._last: list[Known | None] = [None] * len(scene.garments)
         self._before: list[Known | None] = [None] * len(scene.garments)
+        self._seconds: list[float] = []  # What frames took that came to their end.
         self._unsolved = set[int]()  # Garments whose last result is no solution.
         self._time: float | None = None
         self._walked: tuple[list[np.ndarray | None], float] | None = None
@@ -169,6 +177,22 @@ class Refiner:
             GarmentError: A position is out of bounds.
             SolveError: A term of the potential is not finite.
         """
+        began = clock.perf_counter()
+        with ends_after(self._limit):
+            state = self._solve(frame, wanted)
+        if not any("time_limit" in entry for entry in state.telemetry):
+            self._seconds.append(clock.perf_counter() - began)
+        return state
+
+    @property
+    def _limit(self) -> float:
+        """Seconds after which a frame stops where it stands."""
+        if self._settings.frame_limit is not None:
+            return self._settings.frame_limit
+        count = sum(chain[-1].mesh.vertex_count for chain in self.refinements if chain)
+        return max(LEAST_LIMIT + LIMIT_PER_VERTEX * count, LIMIT * median(self._seconds or [0.0]))
+
+    def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> State:
         refuse_far(self._scene, frame)
         gap = self._is_gap(frame.time)
         if gap:
@@ -288,6 +312,7 @@ class Refiner:
         entry |= {"start": "cold: the time between samples is too long"} if gap else {}
         entry |= {} if cage is None else {"start": f"cold: the cage walked here from time code {cage[1]:g}"}
         entry |= {} if broken is None else {"broken_before": broken}
+        entry |= {"time_limit": float(f"{self._limit:.3g}")} if is_over() else {}
         own = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         for place, (index, each) in enumerate(zip(part, frames, strict=True)):
             self._before[index] = last[place]

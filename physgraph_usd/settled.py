@@ -10,7 +10,7 @@ from typing import Any
 from .integrate.solve import FAR
 from .words import counted
 
-COLLAPSED = "collapsed"
+COLLAPSED, LIMITED = "collapsed", "time limit"
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Unsettled:
     Attributes:
         level: The level at which it did not.
         remaining_move: RMS of H0^-1 F there, in local edge lengths; None where there was nothing to solve.
-        stopped: Why its steps ended, as `LevelReport` says it, or `COLLAPSED`.
+        stopped: Why its steps ended, as `LevelReport` says it, `COLLAPSED` or `LIMITED`.
         size: Of the cage over its rest shape's, where it has collapsed.
     """
 
@@ -50,6 +50,9 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
     if "collapsed" in entry:
         return Unsettled(0, None, COLLAPSED, float(entry["collapsed"]))
     last = {each["level"]: each for each in entry.get("levels", ())}
+    if "time_limit" in entry:
+        level = max(last, default=0)
+        return Unsettled(level, float(last[level]["remaining_move"]) if last else None, LIMITED)
     finest = max(last, default=0)
     for level in sorted(last, reverse=True):
         remaining, stopped = float(last[level]["remaining_move"]), str(last[level]["stopped"])
@@ -86,9 +89,12 @@ def told_unsettled(found: Sequence[Mapping[str, Any]]) -> list[str]:
     for path, each in groupby(found, key=lambda entry: str(entry["path"])):
         entries = list(each)
         collapsed = [entry for entry in entries if entry["stopped"] == COLLAPSED]
-        moving = [entry for entry in entries if entry["stopped"] != COLLAPSED]
+        limited = [entry for entry in entries if entry["stopped"] == LIMITED]
+        moving = [entry for entry in entries if entry["stopped"] not in {COLLAPSED, LIMITED}]
         moving.sort(key=lambda entry: -entry["remaining_move"])
         said += _told(path, moving, "the frame did not settle: {}; more --steps may help", others="nor did")
+        reached = "the frame was not solved to its end: it reached its limit of time; see --frame-limit"
+        said += _told(path, limited, reached, others="nor was it")
         remedy = "cache that frame again, or leave it out with --frames"
         said += _told(path, collapsed, f"{{}}; the frame is upsampled, not solved: {remedy}", others="so it is at")
     return said

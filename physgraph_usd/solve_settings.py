@@ -42,6 +42,7 @@ class SolveSettings:
         steps: Most steps at the finest level; each level below it may take four times as many.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
         budget_ms: Milliseconds a frame, or None.
+        frame_limit: Seconds after which a frame stops where it stands; None for a multiple of what frames take.
         temporal: "tether", "warm" or "off".
         tether: Tether stiffness [1/s^2].
         potential: "continuum" or "paper".
@@ -54,6 +55,7 @@ class SolveSettings:
     steps: int = 12
     tolerance: float = 2e-3
     budget_ms: float | None = None
+    frame_limit: float | None = None
     temporal: str = "tether"
     tether: float = 2000.0
     potential: str = "continuum"

@@ -249,6 +249,8 @@ class TestOptions:
             ("tolerance", float("nan")),
             ("budget_ms", 0.0),
             ("budget_ms", float("nan")),
+            ("frame_limit", 0.0),
+            ("frame_limit", float("nan")),
             ("level", -2),
             ("level", 99),
             ("frames", (5.0, 1.0)),

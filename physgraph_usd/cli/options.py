@@ -102,6 +102,13 @@ solve_options = together(
     _solver("--steps", type=click.IntRange(min=0), metavar="N", default=12, help="Most steps at the finest level."),
     _solver("--tolerance", type=float, metavar="T", default=2e-3, help="Stop when cloth moves less, in edge lengths."),
     _solver("--budget-ms", type=float, metavar="MS", help="Stop after this time per frame."),
+    _solver(
+        "--frame-limit",
+        type=float,
+        metavar="SECONDS",
+        help="A frame that takes longer stops where it stands and counts as not settled; default: 20 times what the "
+        "shot's frames take, never under two minutes.",
+    ),
     _solver("--device", metavar="cpu|cuda", default="cpu", help="Where to compute."),
     _solver(
         "--potential", type=click.Choice(["continuum", "paper"]), default="continuum", help="Which form of the energy."

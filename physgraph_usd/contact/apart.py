@@ -15,6 +15,7 @@ from torch import Tensor
 from ..collide.crossings import Crossings, crossings
 from ..colliders.mesh import MeshSurface
 from ..colliders.pose import MeshPose
+from ..deadline import is_over
 from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
 
@@ -42,7 +43,7 @@ def drawn_apart(
     start = _look(mesh, x)
     best = (x, start)
     for least in WIDER:
-        if not best[1].count:
+        if not best[1].count or is_over():
             break
         found = _in_passes(mesh, x, start, gap=max(gap, least * float(mesh.level.spacing.mean())))
         best = found if found[1].count < best[1].count else best

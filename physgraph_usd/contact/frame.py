@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.sweep import Listed
+from ..deadline import is_over
 from ..forces.contact import Contact
 from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact, Spheres
@@ -149,7 +150,7 @@ class LevelContact:
             assert bodies is not None
             bodies, out, more = projected(self._letting_through(bodies, x), x)
             start, x, passes = x, self.moved(x, out), passes + more
-            if out is start or x is out:
+            if out is start or x is out or is_over():
                 break
         return x, passes
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..collide.sweep import Listed, joined, none_of
+from ..deadline import is_over
 from ..level import Placed
 from .along import along
 from .carry import carried
@@ -94,6 +95,6 @@ class Promise:
                 way = along(at, rest, met, free=moves & parts.level.free)
             moved = safe_move(x, self.view.closed((at + way).to(aim)), parts, **given)
             x, met = moved.x, joined(met, moved.met)
-            if not width and not bool(moved.short.any()):
+            if is_over() or (not width and not bool(moved.short.any())):
                 break
         return Placed(aim) if torch.equal(x, aim) else x

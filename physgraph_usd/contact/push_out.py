@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..deadline import is_over
 from .bodies import LevelBodies, kept
 from .corners import lift_over
 from .measure import DEEP
@@ -40,7 +41,7 @@ def projected(
         if count < least:
             best, least, stalled = out, count, 0
         stalled += 1
-        if not count or stalled > STALLED:
+        if not count or stalled > STALLED or is_over():
             break
         bodies, lifted = _over_corners(bodies, out, faces)
         out, passes = no_farther(lifted, first, LIFT * level.spacing), passes + 1

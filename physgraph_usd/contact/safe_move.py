@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..collide.parts import Parts
 from ..collide.sweep import Listed, ListedAndSwept, Pairs, joined, none_of
+from ..deadline import is_over
 from ..level import Placed
 
 KEPT = 0.2
@@ -94,7 +95,8 @@ def safe_move(
         corner = more.corners.long().reshape(-1)
         least.scatter_reduce_(0, corner, BACK * more.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < SHORTENINGS else torch.where(least < 1.0, 0.0, share)
-        known, share = share, _spread(shorter, way, parts)
+        # When the time is over all stays where it is.
+        known, share = share, torch.zeros_like(share) if is_over() else _spread(shorter, way, parts)
         asked = share < known
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
     return Moved(Placed(x), share, met)
@@ -125,7 +127,7 @@ def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertice
     while True:
         new = late.scatter_reduce(0, second, late[first] - within, "amax")
         new = new.scatter_reduce(0, first, new[second] - within, "amax")
-        if not bool((new > late + LEAST * within.mean()).any()):
+        if is_over() or not bool((new > late + LEAST * within.mean()).any()):
             break
         late = new
     return torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))

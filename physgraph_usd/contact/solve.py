@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..deadline import is_over
 from ..integrate.base import Carry, Integrator, System
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, solve_level
@@ -114,7 +115,7 @@ def _drawn_out(
     reports: list[LevelReport] = []
     short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0)
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
-        if not view.comes_apart(x, order=cold):
+        if is_over() or not view.comes_apart(x, order=cold):
             break
         view, terms = view.terms(x, order=cold)
         system = make_system(terms, x, None)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
+from ..deadline import is_over
 from ..errors import SolveError
 from .base import Carry, Integrator, System, resumed
 
@@ -41,7 +42,7 @@ class Budget:
     def is_spent(self) -> bool:
         """Whether no step may begin any more, whatever the cloth's state."""
         late = self.deadline is not None and time.perf_counter() >= self.deadline
-        return late or (self.cancelled is not None and self.cancelled())
+        return late or is_over() or (self.cancelled is not None and self.cancelled())
 
     def is_far(self, remaining_move: float) -> bool:
         """Whether so much remaining move takes extra steps; never where the tolerance is 0."""

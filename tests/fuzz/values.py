@@ -196,6 +196,7 @@ def _asked(draft: Draft) -> None:
         "overrides": [(f"{name}={number}",), (f"/World/cloth.{name}={number}",), ("nonsense",), ("x=1", "level=1")],
         "tolerance": [*ODD_DOUBLES],
         "budget_ms": [*ODD_DOUBLES],
+        "frame_limit": [*ODD_DOUBLES],
         "steps": [-1, 0, 1],
         "device": ["", "cuda", "cpu:1", "mps"],
         "mode": ["", "over"],

@@ -1,0 +1,29 @@
+"""The time at which a frame's solve ends wherever it is: the loops of the solve ask, and stop where they stand.
+
+Cloth that walks is where a safe move ended, at any time, so what is written then is valid though it is not at rest.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+_ENDS: ContextVar[float] = ContextVar("ends", default=math.inf)
+
+
+@contextmanager
+def ends_after(seconds: float) -> Iterator[None]:
+    """Let what is called in the context end after some time [s], or by an earlier deadline around it."""
+    token = _ENDS.set(min(_ENDS.get(), time.perf_counter() + seconds))
+    try:
+        yield
+    finally:
+        _ENDS.reset(token)
+
+
+def is_over() -> bool:
+    """Whether the time is over; never outside of `ends_after`."""
+    return time.perf_counter() >= _ENDS.get()
