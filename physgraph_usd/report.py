@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .plain_json import to_json
 from .usd.atomic import write_text
 from .version import __version__
 
@@ -139,7 +140,7 @@ class RefineReport:
 
     def to_json(self) -> str:
         """The report as JSON."""
-        return json.dumps(self.to_dict(), indent=2, default=str)
+        return to_json(self.to_dict(), default=str)
 
     def write(self, path: Path) -> None:
         """Write the report as JSON, whole or not at all.

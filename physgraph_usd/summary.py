@@ -10,6 +10,7 @@ from typing import Any
 
 from .errors import PhysGraphError, UsageError
 from .frames import kept_for
+from .plain_json import to_json
 from .report import DONE, FAILED, FORMAT, IN_PART, RefineReport
 from .usd.atomic import check_place, write_text
 from .version import __version__
@@ -101,7 +102,7 @@ def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
         LayerError: The file cannot be written.
     """
     plain: dict[str, Any] = {"format": FORMAT, "version": __version__, "exit_code": exit_code}
-    write_text(path, json.dumps(plain | {"shots": [asdict(row) for row in rows]}, indent=2) + "\n")
+    write_text(path, to_json(plain | {"shots": [asdict(row) for row in rows]}) + "\n")
 
 
 def check_summary(path: Path, *, overwrite: bool) -> None:

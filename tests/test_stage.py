@@ -66,13 +66,12 @@ def test_a_rate_without_end_is_refused(tmp_path: Path, rate: float) -> None:
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0])
-def test_a_rate_that_is_none_is_told_and_a_moving_sheet_still_read(tmp_path: Path, rate: float) -> None:
+def test_a_rate_that_is_none_is_refused_by_name(tmp_path: Path, rate: float) -> None:
     stage = new_stage(tmp_path / "s.usda")
     add_sheet(stage)
     stage.GetRootLayer().pseudoRoot.SetInfo("timeCodesPerSecond", rate)
-    shot = open_shot(save(stage))
-    assert shot.scene.times == (1.0, 2.0, 3.0)
-    assert any("timeCodesPerSecond" in notice.message for notice in shot.warnings)
+    with pytest.raises(StageError, match=r"timeCodesPerSecond of the stage is .*such as 24"):
+        open_shot(save(stage))
 
 
 def broken_files(folder: Path) -> dict[str, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import statistics
 from collections.abc import Iterator, Sequence
@@ -12,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from ..plain_json import to_json
 from .journal import Journal
 from .methods import DEFAULT
 from .reference import Reference
@@ -177,7 +177,7 @@ class Chart:
 
     def write(self, folder: Path) -> None:
         """Write ``chart.json`` and ``chart.csv``."""
-        (folder / "chart.json").write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+        (folder / "chart.json").write_text(to_json(self.to_dict()) + "\n", encoding="utf-8")
         terms = sorted({name for point in self.points for name in point.energies})
         with (folder / "chart.csv").open("w", encoding="utf-8", newline="") as file:
             rows = [_flat(point, terms) for name in self.methods for point in self.curve(name)]

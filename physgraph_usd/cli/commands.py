@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from contextlib import closing
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from typing import Any
 import click
 
 from ..fabric import PRESETS
+from ..plain_json import to_json
 from .options import (
     asset_paths_option,
     collider_option,
@@ -73,7 +73,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, **options: Any) -> 
 
     values, _ = values_for(ctx, shot, refine)
     found = inspect_shot(shot, **{name: values[name] for name in options if name != "config"})
-    click.echo(json.dumps(found, indent=2) if as_json else "\n".join(outline(found)))
+    click.echo(to_json(found) if as_json else "\n".join(outline(found)))
     sys.exit(found.get("exit_code", DONE))
 
 
@@ -128,7 +128,7 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
 
     problems = validate_layer(layer, shot)
     if as_json:
-        click.echo(json.dumps([asdict(problem) for problem in problems], indent=2))
+        click.echo(to_json([asdict(problem) for problem in problems]))
     else:
         for problem in problems:
             click.echo(problem)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import pickle
@@ -25,6 +24,7 @@ from ..integrate.network import Physgraph, PhysgraphConfig
 from ..integrate.paper_network import PaperConfig, PaperNetwork
 from ..integrate.quasi_newton import QuasiNewton
 from ..integrate.weights import make_network
+from ..plain_json import to_json
 from .bundle import Bundle, deal
 from .patches import Patch, PatchConfig, make_patches
 from .unroll import Twin, detached, unrolled
@@ -147,7 +147,7 @@ class Trainer:
                 losses = []
                 self.curve.append(row)
                 if say:
-                    say(json.dumps(row))
+                    say(to_json(row, indent=None))
                 if keep:
                     self.save(keep)
 

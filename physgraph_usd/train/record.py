@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import platform
 import shlex
 import tomllib
@@ -18,6 +17,7 @@ from ..errors import UsageError
 from ..integrate.network import VECTORS, PhysgraphConfig
 from ..integrate.paper_network import PaperConfig
 from ..integrate.weights import save_network
+from ..plain_json import to_json
 from ..version import __version__
 from .loop import TrainConfig, Trainer
 from .patches import PatchConfig, describe
@@ -78,7 +78,7 @@ def run_training(
     trainer.train(say=note, keep=checkpoint)
     digest = save_network(trainer.averaged(), weights)
     card = card_of(trainer, digest, config_file=config_file, out=out)
-    weights.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+    weights.with_suffix(".json").write_text(to_json(card) + "\n", encoding="utf-8")
     return weights
 
 

@@ -36,6 +36,7 @@ from .skinning import Bake
 from .stage import (
     GarmentSource,
     Notice,
+    check_metadata,
     open_stage,
     pxr_errors,
     quiet,
@@ -228,6 +229,7 @@ def open_shot(
     with pxr_errors(f"cannot read {path}"), quiet():
         unsaved = unsaved_layers(stage)
         refuse_refined(stage)
+        check_metadata(stage)
         prims = _find(stage, garments, notices)
         refuse_refined(stage, [prim.GetPath() for prim in prims])
         check_overrides(asked, [prim.GetPath() for prim in prims])

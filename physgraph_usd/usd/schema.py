@@ -43,8 +43,9 @@ class Property:
             ``doc``. The schema files have none: an ancestor, a material or ``--set`` may give what the prim does not.
         unit: SI unit, "" when it has none.
         minimum: Least value allowed, or None; of a primvar, of each of its values.
-        maximum: Greatest value allowed, or None. The stiffest preset is some hundred times the softest; paint may go a
-            hundred times farther.
+        maximum: Greatest value allowed, or None. A sheet of steel is inside those of the fabric; beyond them energies
+            leave the range of numbers. The stiffest preset is some hundred times the softest; paint may go a hundred
+            times farther.
         doc: What it is, for the schema's documentation.
         label: Display name.
         group: Display group.
@@ -84,29 +85,37 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     """Rows of the fabric values; what a material leaves out is the garment's to take from elsewhere."""
 
     def row(
-        name: str, label: str, fallback: float | None, *, unit: str, least: float, soft: tuple[float, float], doc: str
+        name: str,
+        label: str,
+        fallback: float | None,
+        *,
+        unit: str,
+        ends: tuple[float, float],
+        soft: tuple[float, float],
+        doc: str,
     ) -> Property:
         taken = fallback if fallbacks else None
-        return Property(schema, MATERIAL + name, "float", taken, unit, least, None, doc + SI, label, FABRIC, soft)
+        return Property(schema, MATERIAL + name, "float", taken, unit, *ends, doc + SI, label, FABRIC, soft)
 
     return (
         row(
-            "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, unit="N/m", least=1e-3, soft=(1.0, 1e4),
+            "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, unit="N/m", ends=(1e-3, 1e9), soft=(1.0, 1e4),
             doc="In-plane stiffness E h: Young's modulus of the sheet.",
         ),
         row(
-            "shearStiffness", "Shear Stiffness", None, unit="N/m", least=0.0, soft=(0.1, 1e4),
+            "shearStiffness", "Shear Stiffness", None, unit="N/m", ends=(0.0, 1e9), soft=(0.1, 1e4),
             doc="Shear stiffness G h; authoring it selects the triangle membrane.",
         ),
         row(
-            "bendStiffness", "Bending Stiffness", _JERSEY.bend, unit="N m", least=0.0, soft=(1e-7, 1e-2),
+            "bendStiffness", "Bending Stiffness", _JERSEY.bend, unit="N m", ends=(0.0, 1e5), soft=(1e-7, 1e-2),
             doc="Bending stiffness E h^3 / 12 (1 - nu^2).",
         ),
         row(
-            "density", "Density", _JERSEY.density, unit="kg/m^2", least=1e-4, soft=(0.01, 2.0), doc="Mass per area.",
+            "density", "Density", _JERSEY.density, unit="kg/m^2", ends=(1e-4, 1e5), soft=(0.01, 2.0),
+            doc="Mass per area.",
         ),
         row(
-            "thickness", "Thickness", _JERSEY.thickness, unit="m", least=1e-6, soft=(1e-4, 1e-2),
+            "thickness", "Thickness", _JERSEY.thickness, unit="m", ends=(1e-6, 1.0), soft=(1e-4, 1e-2),
             doc="Thickness of the cloth.",
         ),
     )  # fmt: skip
@@ -136,12 +145,12 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     *_material(GARMENT_API, fallbacks=True),
     Property(
-        GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, None,
+        GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, 1e12,
         "How firmly the mean of the fine cloth follows the coarse animation." + SI,
         "Guide Stiffness", REFINEMENT, (10.0, 1e6),
     ),
     Property(
-        GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, None,
+        GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, 10.0,
         "Distance kept from colliders." + SI, "Contact Offset", CONTACT, (1e-4, 3e-2),
     ),
     Property(
@@ -184,7 +193,7 @@ PROPERTIES: tuple[Property, ...] = (
         "Whether garments collide with this prim.", "Collide", COLLISION, uniform=True,
     ),
     Property(
-        COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, None,
+        COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, 10.0,
         "Distance kept from this collider, added to the garment's." + SI, "Collider Offset", COLLISION, (0.0, 3e-2),
     ),
     Property(

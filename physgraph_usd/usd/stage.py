@@ -26,6 +26,8 @@ MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 STANDARD_GRAVITY = 9.81
 """Magnitude of gravity when no physics scene gives one [m/s^2]."""
+MOST_GRAVITY = 1e5
+"""Gravity beyond which a magnitude is a mistake [m/s^2]."""
 FALLBACK_METRES_PER_UNIT = 0.01
 """What USD says an unauthored metersPerUnit means [m]."""
 TRAVERSAL = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
@@ -138,6 +140,36 @@ def root_metadata(stage: Usd.Stage, key: str) -> object | None:
     return None
 
 
+def check_metadata(stage: Usd.Stage) -> None:
+    """Refuse units, rates and a range that are no numbers of their kind: the layer repeats them, and they scale all.
+
+    Raises:
+        StageError: With what is authored and what to author.
+    """
+    for key, (what, positive) in _NUMBERS.items():
+        value = root_metadata(stage, key)
+        number = float(value) if isinstance(value, int | float) else math.nan
+        if value is not None and not (math.isfinite(number) and (number > 0 or not positive)):
+            raise StageError(f"{key} of the stage is {in_brief(value)}, which is no {what}, in its root layer")
+    for layer in stage.GetUsedLayers():
+        if not layer.timeCodesPerSecond > 0:
+            name, rate = layer.GetDisplayName(), layer.timeCodesPerSecond
+            raise StageError(f"timeCodesPerSecond of @{name}@ is {rate:g}; author the shot's rate, such as 24")
+
+
+_RATE = "rate; author one above 0, such as 24"
+_TIME = "time code; author one or remove it"
+_NUMBERS = {
+    "metersPerUnit": ("length; author one above 0, such as 0.01 for centimetres", True),
+    "kilogramsPerUnit": ("mass; author one above 0, such as 1", True),
+    "timeCodesPerSecond": (_RATE, True),
+    "framesPerSecond": (_RATE, True),
+    "startTimeCode": (_TIME, False),
+    "endTimeCode": (_TIME, False),
+}
+"""Stage metadata that are numbers: what each is and what to author, and whether it must be above zero."""
+
+
 def metres_per_unit(stage: Usd.Stage) -> tuple[float, list[Notice]]:
     """Length of one stage unit [m], and what is odd about it; never raises."""
     authored = root_metadata(stage, "metersPerUnit")
@@ -172,11 +204,6 @@ def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
     metres, notices = metres_per_unit(stage)
     mass = root_metadata(stage, "kilogramsPerUnit")
     kilograms = float(mass) if isinstance(mass, int | float) and math.isfinite(mass) and mass > 0 else 1.0
-    if mass is not None and kilograms != mass:
-        notices.append(Notice("", None, f"kilogramsPerUnit is {mass!r}, which is no mass; 1 assumed"))
-    rate = root_metadata(stage, "timeCodesPerSecond")
-    if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
-        notices.append(Notice("", None, f"timeCodesPerSecond is {rate!r}; time codes are kept, speeds mean nothing"))
     up, odd = up_vector(stage)
     pull, odd_pull = gravity(stage, up, metres)
     return Units(metres, kilograms, up, pull), notices + odd + odd_pull
@@ -203,8 +230,8 @@ def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray
         length = float(np.linalg.norm(np.array(towards, float))) if isinstance(towards, Gf.Vec3f) else math.nan
         number = strength if isinstance(strength, int | float) else math.nan
         direction = np.array(towards, dtype=np.float64) / length if 0 < length < math.inf else direction
-        magnitude = number * metres if 0 <= number < math.inf else magnitude
-        odd = {"Direction": (towards, length < math.inf), "Magnitude": (strength, number < math.inf)}
+        magnitude = number * metres if 0 <= number * metres <= MOST_GRAVITY else magnitude
+        odd = {"Direction": (towards, length < math.inf), "Magnitude": (strength, number * metres <= MOST_GRAVITY)}
         notices = [
             Notice(str(physics.GetPath()), None, f"physics:gravity{name} is {in_brief(value)}; the earth's is assumed")
             for name, (value, usable) in odd.items()

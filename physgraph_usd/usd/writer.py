@@ -264,7 +264,7 @@ class _RefinedMesh:
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         rest = None if source.skinned or not source.times else _refined_default(prim, fine)
         normals = VertexNormals(fine.fine, left_handed=left)
-        rate = _rate(shot.stage) if velocities or source.velocities else None
+        rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
         self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
         self._heat = HeatTrack(stream, target, normals.vertex_count, still=not source.times)
@@ -331,12 +331,6 @@ def _garments_in(shot: Shot, chunk: Chunk | None) -> list[int]:
         return [*every]
     first = shot.scene.times[0]
     return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(chunk.times)]
-
-
-def _rate(stage: Usd.Stage) -> float:
-    """Time codes per second; USD's fallback of 24 where the stage's cannot be a rate."""
-    rate = stage.GetTimeCodesPerSecond()
-    return rate if rate > 0 else 24.0
 
 
 def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:
