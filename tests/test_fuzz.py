@@ -49,7 +49,8 @@ def test_mutants_end_in_a_layer_or_a_named_error(bases: Path, tmp_path: Path, pa
 
 def test_a_loose_point_does_not_hold_up_the_last_resort(bases: Path, tmp_path: Path):
     """Rings round what crosses never reach it; they grew without end."""
-    outcome = attempt(40414, KINDS, bases, tmp_path / "loose")
+    kind = next(kind for kind in KINDS if kind.name == "odd: points at one place")
+    outcome = attempt(40414, (kind,), bases, tmp_path / "loose")
     assert outcome.said == ["shot 'bodies'", "/World/cloth: 2 pairs at one place, 1 loose points, 6 faces"]
     assert outcome.result == "done"
 

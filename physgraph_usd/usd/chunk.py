@@ -70,9 +70,12 @@ def read_chunk(layer: Sdf.Layer) -> Chunk | None:
     told = (read_record(layer) or {}).get(CHUNK)
     if not isinstance(told, Mapping):
         return None
-    run_up = {
-        float(time): {str(path): np.asarray(value) for path, value in dict(points).items()}
-        for time, points in dict(told.get(_RUN_UP, {})).items()
-    }
-    times, every = (tuple(float(time) for time in told.get(name, ())) for name in (_TIMES, _ALL))
+    try:
+        run_up = {
+            float(time): {str(path): np.asarray(value) for path, value in dict(points).items()}
+            for time, points in dict(told.get(_RUN_UP, {})).items()
+        }
+        times, every = (tuple(float(time) for time in told.get(name, ())) for name in (_TIMES, _ALL))
+    except (TypeError, ValueError):  # Somebody else wrote it.
+        return None
     return Chunk(times, every, run_up)

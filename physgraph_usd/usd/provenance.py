@@ -25,6 +25,14 @@ CONTENTS = "contents"
 """Entry of the record: a digest of what the layer holds, since who copies a record copies no layer."""
 FAILED, UNSETTLED = "failed", "unsettled"
 """Entries of the record: time codes without a sample, and how many were written though they did not settle."""
+_LIST = (Vt.StringArray, list)
+_TYPES: dict[str, Any] = {
+    "garments": _LIST,
+    "variants": _LIST,
+    "shot": str,
+    "left_out": Mapping,
+    "chunk": Mapping,
+}
 _COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
 
 
@@ -86,12 +94,17 @@ def is_only_ours(layer: Sdf.Layer) -> bool:
 
 
 def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
-    """The record of a layer that we wrote, or None; a damaged file has none."""
+    """The record of a layer that says it is ours, or None; a damaged file has none.
+
+    Anybody can write one: entries that are read and are of another type than ours are left out.
+    """
     try:
         record = layer.customLayerData.get(RECORD)
     except USD_ERRORS:
         return None
-    return dict(record) if isinstance(record, Mapping) else None
+    if not isinstance(record, Mapping):
+        return None
+    return {key: value for key, value in record.items() if isinstance(value, _TYPES.get(key, object))}
 
 
 def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False) -> bool:
