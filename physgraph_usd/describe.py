@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .contact.crowding import Crowding, CrowdingMeter
 from .errors import GarmentError, StageError
 from .estimate import cannot_fit, estimate
 from .integrate import LEARNED
@@ -26,13 +27,16 @@ from .usd.times import within
 from .usd.view import Stage
 
 
-def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> list[str]:
+def begin_report(
+    report: RefineReport, opened: Shot, options: RefineOptions, *, before_a_run: bool = False
+) -> list[str]:
     """Fill in a report before the first frame: choose the levels, and look for what a few frames give away.
 
     Args:
         report: An empty one.
         opened: The shot.
         options: The run's options.
+        before_a_run: Whether to look how crowded the cages are, which decides what a frame takes.
 
     Returns:
         What the user should know.
@@ -47,7 +51,8 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
         for part in parts
     ]
-    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options)).plain()
+    looked = _crowding(opened, frames, options) if before_a_run else ()
+    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=looked).plain()
     known = [carries_none(garment.path, choice) for garment, choice in zip(opened.scene.garments, choices, strict=True)]
     known += _strained(opened, report, frames)
     known += [_unfelt(opened, report, frames)] if options.contact != "off" else []
@@ -98,7 +103,7 @@ def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found, as plain values."""
     report = RefineReport(opened.path, None, options.plain())
-    warnings = begin_report(report, opened, options)
+    warnings = begin_report(report, opened, options, before_a_run=True)
     large = too_large(opened, report, options)
     return {
         "shot": opened.path,
@@ -200,6 +205,19 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),
     }
+
+
+def _crowding(opened: Shot, frames: Sequence[Frame], options: RefineOptions) -> list[Crowding]:
+    """How crowded the cages are in the frames that are looked at, without what is switched off."""
+    if not all(len(garment.mesh.triangulate(garment.rest).triangles) for garment in opened.scene.garments):
+        return []
+    meter = CrowdingMeter(opened.scene)
+    found = [meter.measure(frame) for frame in frames]
+    if options.contact == "off":
+        found = [dataclasses.replace(each, inside=0.0, touches=False) for each in found]
+    if options.self_contact == "off":
+        found = [dataclasses.replace(each, crossings=0.0, near=0.0) for each in found]
+    return found
 
 
 def _unfelt(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> str:

@@ -20,6 +20,8 @@ SCHEMA = Path(__file__).with_name("report.schema.json")
 DONE, FAILED, IN_PART = 0, 1, 3
 SIGNALLED = 128
 """Added to a signal's number, as shells report it."""
+NOTICE = 25
+"""Level of what a run says without being asked and is nothing wrong, between logging's INFO and WARNING."""
 LOG = logging.getLogger("physgraph_usd")
 """Where warnings and progress go, for the whole package."""
 MOST_ALONE = 3

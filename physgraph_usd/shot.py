@@ -30,7 +30,7 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .processes import call_each, memory_is_named
-from .report import LOG, SIGNALLED, RefineReport, is_of_failure
+from .report import LOG, NOTICE, SIGNALLED, RefineReport, is_of_failure
 from .resolution import too_coarse
 from .settled import told_contact, told_unsettled, unsettled_frames
 from .untagged import AUTO, open_with_colliders
@@ -51,6 +51,8 @@ except ImportError:  # Windows has none.
 MOST_LANES = 4
 """Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
 SLOWER = "cholespy is not installed: matrices are factorised by scipy, which is slower"
+TIMED_FRAMES, LONG_RUN = 3, 60.0
+"""Frames after which a run says when it will end, where that is so far away [s]."""
 DEFAULTS = RefineOptions()
 Outcomes = Generator[Outcome, None, None]
 
@@ -143,7 +145,7 @@ def _run(
     began = clock.perf_counter()
     try:
         with signals_raise(), memory_is_named(), closing(_open(shot, options)) as opened:
-            warnings = begin_report(report, opened, options)
+            warnings = begin_report(report, opened, options, before_a_run=options.dry_run)
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
                 raise large
@@ -245,11 +247,12 @@ def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
         _check_none(report, options)
 
 
-def inspect_shot(shot: str | Path | Stage, **given: Any) -> dict[str, Any]:
+def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any) -> dict[str, Any]:
     """What would be refined, with what, from where, and every defect found.
 
     Args:
         shot: The stage to read, a file or open.
+        timed: Whether to solve two frames in the middle of the shot, for what a run takes on this machine.
         given: Options of `RefineOptions` that concern reading.
 
     Returns:
@@ -264,9 +267,27 @@ def inspect_shot(shot: str | Path | Stage, **given: Any) -> dict[str, Any]:
     source = str(shot) if isinstance(shot, Path) else shot
     try:
         with closing(_open(source, options)) as opened:
-            return describe(opened, options)
+            found = describe(opened, options)
+            return found | ({"timed": _timed(opened, found, options)} if timed and "problem" not in found else {})
     except StageError as error:
         return describe_meshes(source, str(error), options) | {"exit_code": error.exit_code}
+
+
+def _timed(opened: Shot, found: dict[str, Any], options: RefineOptions) -> dict[str, float]:
+    """Wall time of a frame from nothing, of the one after it, and of the whole shot by these [s]."""
+    prepare_device(options.device)
+    levels = [garment["level"] for garment in found["garments"]]
+    own = {"device": options.device, "lanes": min(MOST_LANES, max(1, os.cpu_count() or 1))}
+    refiner = Refiner(opened.scene, options.solve_settings(), levels=levels, **own)
+    times, spent = list(opened.scene.times) or [None], []
+    middle = (len(times) - 1) // 2
+    for time in times[middle : middle + 2]:
+        began = clock.perf_counter()
+        refiner.solve(opened.frame(time))
+        spent.append(clock.perf_counter() - began)
+    whole = spent[0] + spent[-1] * (len(times) - 1)
+    seconds = {"first_frame_seconds": spent[0], "seconds_a_frame": spent[-1], "whole_shot_seconds": whole}
+    return {name: float(f"{value:.3g}") for name, value in seconds.items()}
 
 
 def _open(shot: str | Stage, options: RefineOptions) -> Shot:
@@ -387,10 +408,12 @@ def _write_frames(
     report: RefineReport,
 ) -> None:
     """Write each frame as it comes, then close the layer."""
-    written, shot = 0.0, {"shot": report.shot}
+    written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
     for done, outcome in enumerate(solved, start=1):
         written += _take(outcome, writer, report)
         LOG.info("frame %d of %d: time code %s", done, count, _time_name(outcome.time), extra=shot)
+        if done == TIMED_FRAMES < count and (said := ending(clock.perf_counter() - began, count, options.workers)):
+            LOG.log(NOTICE, "%s", said, extra=shot)
         LOG.debug("%s", outcome.record, extra=shot)
         if options.progress:
             options.progress(done, count)
@@ -403,6 +426,23 @@ def _write_frames(
     report.seconds["write"] = written
     report.warn(*map(str, writer.notices), *_of_frames(report))
     say_what_was(report)
+
+
+def ending(seconds: float, count: int, workers: int) -> str:
+    """When a run will end, or "" where that is soon.
+
+    Args:
+        seconds: What the first `TIMED_FRAMES` frames took [s].
+        count: Frames of the run.
+        workers: Processes that share them; the first one's frames are the first to come.
+    """
+    own = -(-count // workers) - TIMED_FRAMES
+    left = own * seconds / TIMED_FRAMES
+    if left < LONG_RUN:
+        return ""
+    at = clock.strftime("%H:%M", clock.localtime(clock.time() + left))
+    about = f"{left / 60.0:.0f} min" if left < 5400.0 else f"{left / 3600.0:.1f} h"
+    return f"{TIMED_FRAMES} of {count} frames in {seconds:.0f} s: all in about {about} more, at {at}"
 
 
 def _frames(

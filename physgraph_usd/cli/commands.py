@@ -62,9 +62,10 @@ def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
 @shot_argument
 @scene_options
 @config_option
+@click.option("--time", "timed", is_flag=True, help="Also solve two frames, and say what the whole shot takes.")
 @json_option
 @click.pass_context
-def inspect(ctx: click.Context, shot: str, *, as_json: bool, **options: Any) -> None:
+def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **options: Any) -> None:
     """Print what would be refined, with what, from where, and every defect found in SHOT.
 
     Exits with 1 when SHOT cannot be refined as asked, with 2 when what was named is not there.
@@ -72,7 +73,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, **options: Any) -> 
     from ..shot import inspect_shot
 
     values, _ = values_for(ctx, shot, refine)
-    found = inspect_shot(shot, **{name: values[name] for name in options if name != "config"})
+    found = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})
     click.echo(to_json(found) if as_json else "\n".join(outline(found)))
     sys.exit(found.get("exit_code", DONE))
 

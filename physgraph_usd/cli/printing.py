@@ -19,7 +19,9 @@ from ..words import counted
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
 LOGGER = "physgraph_usd"
-_LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
+NOTICE = 25
+"""`report.NOTICE`, whose module imports much."""
+_LEVELS = (NOTICE, logging.INFO, logging.DEBUG)
 _CLEAR_LINE = "\r\033[K"
 _LINE = "%(asctime)s %(levelname)s %(shot)s: %(message)s"
 
@@ -58,6 +60,7 @@ class Saying:
             into_file.setLevel(_LEVELS[max(min(self.verbose, 2), 1)])
             into_file.setFormatter(logging.Formatter(_LINE, defaults={"shot": "-"}))
             handlers.append(into_file)
+        logging.addLevelName(NOTICE, "NOTICE")
         before = logger.level
         logger.setLevel(min(handler.level for handler in handlers))
         for handler in handlers:

@@ -65,7 +65,7 @@ class TuneSession:
         time: The one that is solved next.
         levels: Subdivisions of each garment.
         contact: Whether cloth feels bodies and cloth.
-        warning: What the cloth touches and does not feel, with the option that names it; or "".
+        warning: What the cloth touches and does not feel, or "".
         values: What `save` authors, by prim path and the schema's short names.
     """
 
@@ -95,18 +95,16 @@ class TuneSession:
         self.out = Path(out) if out is not None else Path(shot).with_suffix(".tuned.usda")
         if self.out.exists() and not overwrite:
             raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
-        self._overwrite, self._named = overwrite, (tuple(garments), tuple(colliders))
         self.shot = self._opened = open_with_colliders(shot, garments=garments, colliders=colliders)
-        if AUTO in colliders:
-            self._named = self._named[0], self.shot.colliders
+        named = self.shot.colliders if AUTO in colliders else tuple(colliders)
+        self._overwrite, self._named = overwrite, (tuple(garments), named)
         scene = self.shot.scene
         self.garments = tuple(garment.path for garment in scene.garments)
         self.times: tuple[float | None, ...] = scene.times or (None,)
         self.time, self.contact = self.times[0], True
         frames = sample_frames(scene, self.shot.frame)
         self.warning = told_beside(bodies_beside(self.shot, frames))
-        choices = choose_levels(scene, frames)
-        self.levels = [choice.level for choice in choices]
+        self.levels = [choice.level for choice in choose_levels(scene, frames)]
         # A level that is chosen from the fabric would be chosen anew from what is tried.
         chosen = zip(scene.garments, self.levels, strict=True)
         self.values = {g.path: {"refine:level": float(k)} for g, k in chosen if g.level == AUTO_LEVEL}
@@ -222,13 +220,9 @@ class TuneSession:
             StageError: A garment lies in an instance.
             LayerError: It cannot be written.
         """
+        (_, bodies), over = self._named, self._overwrite
         written = tag(
-            self._opened.path,
-            self.out,
-            garments=self.garments,
-            colliders=self._named[1],
-            values=self.values,
-            overwrite=self._overwrite,
+            self._opened.path, self.out, garments=self.garments, colliders=bodies, values=self.values, overwrite=over
         )
         self._overwrite = True  # It is this session's own from here on.
         return written
