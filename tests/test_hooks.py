@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pxr import Plug, Sdf, Usd, UsdGeom
+import usdview_stub
+from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, FAST, cloth_shot, faults, refine
 
 import physgraph_usd as pg
@@ -139,6 +140,23 @@ class TestSolaris:
             editableStage=lambda: whole, editableLayer=lambda: edits, parm=parms.get, addWarning=said.append, said=said
         )
 
+    def test_what_the_nodes_layer_held_is_there_beside_the_refined_cloth(self, node: Any, file: Path):
+        """Among it the cage, of which no sample is left between the fine ones."""
+        edits, whole = node.editableLayer(), node.editableStage()
+        edits.customLayerData = {"host": "data"}
+        edits.comment = "mine"
+        Sdf.CreatePrimInLayer(edits, "/World/lamp").specifier = Sdf.SpecifierDef
+        Sdf.CreatePrimInLayer(edits, CLOTH)
+        below = Sdf.Layer.FindOrOpen(str(file))
+        Sdf.CopySpec(below, f"{CLOTH}.points", edits, f"{CLOTH}.points")
+        Sdf.AttributeSpec(edits.GetPrimAtPath(CLOTH), "note", Sdf.ValueTypeNames.String).default = "mine"
+        importlib.import_module("refine_lop").cook(node)
+        assert whole.GetPrimAtPath("/World/lamp")
+        assert (edits.comment, edits.customLayerData["host"]) == ("mine", "data")
+        assert dict(edits.customLayerData)["physgraph"]["garments"]
+        assert edits.GetAttributeAtPath(f"{CLOTH}.note").default == "mine"
+        assert {count(whole, time) for time in (1.0, 2.0, 3.0)} == {FINE}
+
     def test_the_nodes_layer_holds_the_refined_cloth(self, node: Any):
         report = importlib.import_module("refine_lop").cook(node)
         assert count(node.editableStage()) == FINE
@@ -159,6 +177,7 @@ class TestUsdview:
 
     @pytest.fixture
     def actions(self) -> Any:
+        usdview_stub.install()
         return importlib.import_module("physgraph_usdview.actions").Actions()
 
     def test_the_current_frame_is_refined_over_the_stage_and_taken_off_again(self, api: Any, actions: Any, file: Path):
@@ -200,12 +219,17 @@ class TestUsdview:
         assert CLOTH in api.said[-1]
         assert count(api.stage) == COARSE
 
-    def test_usd_finds_the_plug_in(self):
-        (found,) = Plug.Registry().RegisterPlugins(str(PLUGINS / "usdview")) or [
-            Plug.Registry().GetPluginWithName("physgraph_usdview")
+    def test_its_menu_is_there_as_usdview_loads_plug_ins(self, api: Any):
+        """By the real plug-in registry; the container's base and the menu are a stand-in: usd-core has no usdview."""
+        (menu,) = usdview_stub.menus(PLUGINS / "usdview").values()
+        assert [title for _, title, _ in menu] == [
+            "Refine Current Frame",
+            "Show Depth in Bodies",
+            "Show Crossings",
+            "Show Coarse Cloth",
         ]
-        assert found.name == "physgraph_usdview"
-        assert "physgraph_usdview.container.PhysGraphContainer" in found.metadata["Types"]
+        menu[0][2](api)
+        assert count(api.stage) > FINE
 
 
 def test_versions_of_the_packages_are_the_packages():

@@ -5,11 +5,16 @@
 
 Spare parameters of the node, all optional: ``garments`` (paths, separated by blanks), ``frames`` (first and last one),
 ``level``. The node has to cook once, not each frame: all frames are in the layer.
+
+The animation has to be on the stage with all its samples, as a Sublayer LOP brings it from a file. A live SOP Import holds one
+sample, that of the frame at which it cooked: the cloth would stand still. Cache it, or write it to a file first.
 """
 
 from __future__ import annotations
 
 from typing import Any
+
+from pxr import Sdf
 
 import physgraph_usd as pg
 
@@ -28,10 +33,32 @@ def cook(node: Any) -> pg.RefineReport:
     """
     reports: list[pg.RefineReport] = []
     layer = pg.refine_stage(node.editableStage(), _options(node), on_report=reports.append)
-    node.editableLayer().TransferContent(layer)
+    _add(layer.pseudoRoot, node.editableLayer())
     for warning in reports[0].warnings:
         node.addWarning(warning)
     return reports[0]
+
+
+def _add(source: Sdf.PrimSpec, target: Sdf.Layer) -> None:
+    """Add what lies at and below a spec to a layer that keeps all else.
+
+    A sublayer would be weaker than what the layer says of the cage itself. Attributes are replaced whole: coarse
+    samples between fine ones would have other topology.
+    """
+    there = target.GetPrimAtPath(source.path)
+    if there is None:
+        Sdf.CopySpec(source.layer, source.path, target, source.path)
+        return
+    kept = there.ListInfoKeys() if source.path == Sdf.Path.absoluteRootPath else ("apiSchemas",)
+    for key in source.ListInfoKeys():
+        if key == "customLayerData":
+            there.SetInfo(key, dict(target.customLayerData) | dict(source.layer.customLayerData))
+        elif key not in ("specifier", "typeName") and not (there.HasInfo(key) and key in kept):
+            there.SetInfo(key, source.GetInfo(key))
+    for spec in source.properties:
+        Sdf.CopySpec(source.layer, spec.path, target, spec.path)
+    for child in source.nameChildren:
+        _add(child, target)
 
 
 def _options(node: Any) -> pg.RefineOptions:
