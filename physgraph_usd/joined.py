@@ -32,6 +32,7 @@ from .usd.reader import Shot
 from .usd.seams import Look, Points, Seam, between
 from .usd.stage import is_there
 from .usd.stitch import SEAM_BOUND
+from .usd.stitch import check_seams as look_at_seams
 from .usd.stitch import stitch as stitch_layers
 from .usd.track import to_local
 
@@ -73,6 +74,25 @@ def stitch(
     given = {"frames": frames, "seam_bound": seam_bound, "clips": clips, "root": root, "overwrite": overwrite}
     with ExitStack() as stack:
         return stitch_layers(chunks, out, **given, look_with=partial(_looking, stack))
+
+
+def check_seams(chunks: Sequence[str | Path], *, of: Path | None = None, seam_bound: float = SEAM_BOUND) -> list[Seam]:
+    """Look at the seams of chunks that follow one another, as `usd.stitch.check_seams` does, in the shot.
+
+    Args:
+        chunks: As for `stitch`.
+        of: One of them, to look at its own seams alone.
+        seam_bound: As for `stitch`.
+
+    Returns:
+        The seams, in order.
+
+    Raises:
+        UsageError: Chunks are not of one shot, version and set of options.
+        LayerError: A chunk cannot be read, or a seam moves too far.
+    """
+    with ExitStack() as stack:
+        return look_at_seams(chunks, of=of, seam_bound=seam_bound, look_with=partial(_looking, stack))
 
 
 def joined(outcomes: Iterable[Outcome], look: Join, tell: Callable[[str], object]) -> Iterator[Outcome]:

@@ -201,7 +201,7 @@ class TestRefine:
     def test_every_option_is_one_of_the_call(self) -> None:
         from physgraph_usd.options import RefineOptions
 
-        own = {"shots", "out", "summary", "config", "verbose", "log_file"}
+        own = {"shots", "out", "summary", "config", "verbose", "log_file", "seam_bound", "openjd"}
         declared = {parameter.name for parameter in refine.params} - own
         assert declared == {field.name for field in fields(RefineOptions)} - {"sources"}
 

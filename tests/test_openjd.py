@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from shots import cloth_shot, faults, refine, sample_times
+from shots import CLOTH, cloth_shot, command, faults, refine, sample_times
 
 pytest.importorskip("openjd.cli", reason="needs openjd-cli, which runs the templates")
 TEMPLATE = Path(__file__).resolve().parents[1] / "plugins" / "openjd" / "refine.yaml"
@@ -42,13 +43,37 @@ def test_its_tasks_are_chunks_of_consecutive_frames(tmp_path: Path):
     assert "Total steps: 2" in done.stdout
 
 
+def test_its_reader_finds_progress_and_status_of_a_chunk(tmp_path: Path):
+    """By the filter that farms' sessions read a task's output with; parameters left empty are none."""
+    from openjd.sessions._action_filter import ActionMessageKind, ActionMonitoringFilter
+
+    told: list[tuple[Any, Any]] = []
+    reader = ActionMonitoringFilter(session_id="s", callback=lambda kind, value, *_: told.append((kind, value)))
+    shot = cloth_shot(tmp_path / "shot.usdc", times=TIMES[:4])
+    empty = [word for option in ("--garment", "--collider", "--level") for word in (option, "")]
+    line = ["--frames", "1-2", "--run-up", "1", *empty, "--openjd", "--steps", "1"]
+    done = command("refine", shot, "-o", tmp_path / "c.usdc", *line)
+    assert done.returncode == 0, done.stderr
+    for text in done.stderr.splitlines():
+        record = logging.makeLogRecord({"msg": text, "levelno": logging.INFO, "session_id": "s"})
+        reader.filter(record)
+    assert [value for kind, value in told if kind is ActionMessageKind.PROGRESS] == [50.0, 100.0]
+    assert [str(value)[:13] for kind, value in told if kind is ActionMessageKind.STATUS] == [
+        "1 of 2 frames",
+        "2 of 2 frames",
+    ]
+
+
 @pytest.mark.slow
 def test_a_job_makes_one_layer_and_a_second_run_of_it_solves_nothing_again(tmp_path: Path):
     shot = cloth_shot(tmp_path / "shot.usdc", times=TIMES)
     (tmp_path / "c").mkdir()
-    runs = [openjd("run", TEMPLATE, "--step", "Stitch", "--run-dependencies", *parameters(tmp_path)) for _ in range(2)]
+    asked = parameters(tmp_path, Garment=CLOTH, Level="1")
+    runs = [openjd("run", TEMPLATE, "--step", "Stitch", "--run-dependencies", *asked) for _ in range(2)]
     assert [done.returncode for done in runs] == [0, 0], runs
     assert [done.stdout.count("is taken as done") for done in runs] == [0, 2]
+    assert "openjd_progress: 100.0" in runs[0].stdout
+    assert "openjd_status: seam at 5: " in runs[0].stdout
     assert sorted(file.name for file in (tmp_path / "c").iterdir()) == ["chunk.1-4.usdc", "chunk.5-8.usdc"]
     layer = tmp_path / "out" / "fine.usdc"
     assert faults(layer, shot) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from shots import CLOTH, EDGE, cloth_shot, command, faults, fine, refine, sample
 from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageError
-from physgraph_usd.joined import stitch
+from physgraph_usd.joined import check_seams, stitch
 from physgraph_usd.usd.chunk import read_chunk
 from physgraph_usd.usd.provenance import read_record
 from physgraph_usd.usd.stitch import SEAM_BOUND
@@ -334,3 +335,37 @@ class TestClips:
             with pytest.raises(PhysGraphError):
                 stitch(chunks, tmp_path / "clips.usda", clips=True, seam_bound=bound)
         assert not list(tmp_path.iterdir())
+
+
+class TestSeamsBeforeAllIsThere:
+    """The first two chunks of a job tell how far a seam moves."""
+
+    def test_a_pair_is_looked_at_and_nothing_is_written(self, runs: Runs, tmp_path: Path):
+        there = sorted(runs.chunks[0].parent.iterdir())
+        (seam,) = check_seams(runs.chunks[:2])
+        (whole, *_) = stitch(runs.chunks, tmp_path / "joined.usdc")
+        assert seam == whole
+        done = command("stitch", *runs.chunks[:2], "--check-seams", "--seam-bound", 0.2 * seam.rms)
+        assert (done.returncode, "is allowed: refine with --run-up" in done.stderr) == (1, True), done.stderr
+        assert sorted(runs.chunks[0].parent.iterdir()) == there
+
+    def test_a_chunk_is_looked_at_beside_those_of_its_folder(self, runs: Runs, tmp_path: Path):
+        for name in (runs.chunks[0], runs.chunks[2], runs.chunks[3]):
+            shutil.copy(name, tmp_path)
+        (tmp_path / "other.usda").write_text("#usda 1.0\n")
+        first, _, third, fourth = (tmp_path / name.name for name in runs.chunks)
+        assert check_seams([tmp_path], of=first) == []
+        assert [seam.after for seam in check_seams([tmp_path], of=third)] == [37.0]
+        assert [seam.after for seam in check_seams([tmp_path], of=fourth)] == [37.0]
+
+
+def test_warnings_of_usd_itself_stay_off_the_terminal(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0, 4.0))
+    layer = Sdf.Layer.FindOrOpen(str(shot))
+    layer.subLayerPaths.append("gone.usda")
+    layer.Save()
+    chunks = refine_chunks(shot, tmp_path, ((1.0, 2.0), (3.0, 4.0)), run_up=2)
+    told = capfd.readouterr().err
+    stitch(chunks, tmp_path / "joined.usdc")
+    stitch(chunks, tmp_path / "clips.usda", clips=True)
+    assert "_ReportErrors" not in told + capfd.readouterr().err

@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from ..errors import UsageError
 from ..fabric import PRESETS
 from ..plain_json import to_json
 from .options import (
@@ -34,7 +35,8 @@ from .types import FrameRange, PictureSize
 
 @click.command()
 @click.argument("chunks", nargs=-1, required=True, metavar="CHUNK...", type=click.Path(path_type=Path))
-@out_option("LAYER", "Layer to write.")
+@out_option("LAYER", "Layer to write.", required=False)
+@click.option("--check-seams", is_flag=True, help="Look at the seams of those there, and write nothing.")
 @click.option("--frames", type=FrameRange(), help="Time codes that must be there.  [default: all of the shot]")
 @click.option(
     "--seam-bound",
@@ -46,14 +48,20 @@ from .types import FrameRange, PictureSize
 @click.option("--clips", is_flag=True, help="Play the chunks as value clips instead of copying them into one file.")
 @click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot.")
 @overwrite_option
-def stitch(chunks: tuple[Path, ...], out: Path, **options: Any) -> None:
+def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, seam_bound: float, **options: Any) -> None:
     """Join each CHUNK of a shot, as refine --run-up writes them, into one layer and print its path.
 
     A folder stands for all layers in it. How far each seam moves goes to stderr.
     """
-    from ..joined import stitch as join
+    from .. import joined
 
-    for seam in join(chunks, out, **options):
+    if check_seams:
+        for seam in joined.check_seams(chunks, seam_bound=seam_bound):
+            click.echo(seam, err=True)
+        return
+    if out is None:
+        raise UsageError("give a layer to write by -o, or --check-seams")
+    for seam in joined.stitch(chunks, out, seam_bound=seam_bound, **options):
         click.echo(seam, err=True)
     click.echo(out)
 

@@ -47,16 +47,34 @@ asset_paths_option = _layer(
     default="relative",
     help="How files written name other files.",
 )
+
+
+def _each(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> tuple[str, ...]:
+    """The words of all values: a farm's parameter holds several paths, or none."""
+    return tuple(word for value in values for word in value.split())
+
+
 garment_option = _scene(
-    "--garment", "garments", multiple=True, metavar="PATH", help="Prim path, glob or collection; repeatable."
+    "--garment",
+    "garments",
+    multiple=True,
+    callback=_each,
+    metavar="PATH",
+    help="Prim path, glob or collection; repeatable.",
 )
 tag_collider_option = _scene(
-    "--collider", "colliders", multiple=True, metavar="PATH", help="Prim path, glob or collection; repeatable."
+    "--collider",
+    "colliders",
+    multiple=True,
+    callback=_each,
+    metavar="PATH",
+    help="Prim path, glob or collection; repeatable.",
 )
 collider_option = _scene(
     "--collider",
     "colliders",
     multiple=True,
+    callback=_each,
     metavar="PATH|auto",
     help="Prim path, glob or collection; auto: closed meshes that garments touch, too; repeatable.",
 )
@@ -178,6 +196,13 @@ farm_options = together(
         help="Write --frames as a chunk for stitch, which joins it to the one before over the N frames before it.",
     ),
     _farm(
+        "--seam-bound",
+        type=click.FloatRange(min=0),
+        metavar="EDGES",
+        help="With --run-up: fail where a seam to a chunk beside it, in the same folder, moves more (see stitch).",
+    ),
+    _farm("--openjd", is_flag=True, help="Say progress in the lines that OpenJD reads."),
+    _farm(
         "--scheduler",
         metavar="ADDRESS",
         help="Solve on the workers of this Dask scheduler (extra farm); --workers is the number of chunks of a shot.",
@@ -203,11 +228,12 @@ said_options = together(
 )
 
 
-def out_option(metavar: str, help_text: str) -> Decorator:
+def out_option(metavar: str, help_text: str, *, required: bool = True) -> Decorator:
     """Declare ``-o``, where a command writes.
 
     Args:
         metavar: What the help shows for the value.
         help_text: The option's line in the help.
+        required: Whether it must be there.
     """
-    return _files("-o", "--out", required=True, type=click.Path(path_type=Path), metavar=metavar, help=help_text)
+    return _files("-o", "--out", required=required, type=click.Path(path_type=Path), metavar=metavar, help=help_text)

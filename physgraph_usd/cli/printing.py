@@ -35,12 +35,14 @@ class Saying:
         log_file: A file to append to, with each frame at least, or None.
         in_lines: Say progress in lines, into files and pipes too.
         several: Name the shot in each line.
+        openjd: Say progress in the lines that OpenJD reads.
     """
 
     verbose: int = 0
     log_file: Path | None = None
     in_lines: bool = False
     several: bool = False
+    openjd: bool = False
 
     @contextmanager
     def logged(self) -> Iterator[None]:
@@ -81,13 +83,16 @@ class Saying:
     @contextmanager
     def progress(self, label: str) -> Iterator[Callable[[int, int], None]]:
         """A bar of finished frames, on a terminal alone, or lines of them."""
-        hidden = self.in_lines or self.verbose > 0 or not sys.stderr.isatty()
+        hidden = self.in_lines or self.openjd or self.verbose > 0 or not sys.stderr.isatty()
         with click.progressbar(length=1, label=label, file=sys.stderr, hidden=hidden) as bar:
 
             def show(done: int, total: int) -> None:
                 bar.length = total
                 bar.update(done - bar.pos)
-                if self.in_lines:
+                if self.openjd:
+                    say(f"openjd_progress: {100.0 * done / total:.1f}", err=True)
+                    say(f"openjd_status: {done} of {counted(total, 'frame')}, {_left(bar.eta)}", err=True)
+                elif self.in_lines:
                     tell(bar.pct, bar.eta, f"{done} of {counted(total, 'frame')}")
 
             yield show
@@ -149,8 +154,11 @@ def tell(part: float, seconds: float, what: str) -> None:
         seconds: How long the rest may take [s].
         what: What is done.
     """
-    left = f"about {seconds / 60.0:.0f} min left" if seconds > 90.0 else f"about {seconds:.0f} s left"
-    say(f"{part:4.0%}  {left:20s}  {what}", err=True)
+    say(f"{part:4.0%}  {_left(seconds):20s}  {what}", err=True)
+
+
+def _left(seconds: float) -> str:
+    return f"about {seconds / 60.0:.0f} min left" if seconds > 90.0 else f"about {seconds:.0f} s left"
 
 
 def outline(value: Any, indent: str = "") -> Iterator[str]:

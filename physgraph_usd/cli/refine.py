@@ -35,7 +35,19 @@ if TYPE_CHECKING:
     from ..summary import Row
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
-NOT_OF_THE_CALL = {"shots", "out", "report", "root", "progress", "summary", "config", "verbose", "log_file"}
+NOT_OF_THE_CALL = {
+    "shots",
+    "out",
+    "report",
+    "root",
+    "progress",
+    "summary",
+    "config",
+    "verbose",
+    "log_file",
+    "seam_bound",
+    "openjd",
+}
 """Options of the command that `RefineOptions` has not, or has one for each shot."""
 
 Job = tuple[str, Path, "RefineOptions"]
@@ -66,13 +78,26 @@ def refine(
     jobs = _jobs(ctx, shots, out)
     layers = [layer for _, layer, _ in jobs]
     verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
-    saying = Saying(verbose, log_file, in_lines, several=len(jobs) > 1)
+    saying = Saying(verbose, log_file, in_lines, several=len(jobs) > 1, openjd=ctx.params["openjd"])
     also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
     if also:
         check_jobs(jobs, also=also)
     with signals_raise(), _folder_of(layers, out, dry_run=dry_run), saying.logged():
         code = _refine_each(jobs, saying, summary=None if dry_run else summary)
+        if not dry_run:
+            _check_seams(layers, ctx.params["seam_bound"], openjd=saying.openjd)
     sys.exit(code)
+
+
+def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -> None:
+    """Say how far the seams of chunks to those beside them move, and fail where one moves too far."""
+    if bound is None:
+        return
+    from ..joined import check_seams
+
+    for layer in filter(Path.exists, layers):
+        for seam in check_seams([layer.parent], of=layer, seam_bound=bound):
+            say(f"{'openjd_status: ' if openjd else ''}{seam}", err=True)
 
 
 def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:

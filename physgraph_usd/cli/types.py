@@ -34,8 +34,10 @@ class RefineLevel(click.ParamType):
 
     name = "level"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Turn the text into a level."""
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | None:
+        """Turn the text into a level; none, as of a farm's parameter that was left empty, is the default."""
+        if value == "":
+            return None
         if value == "auto":
             return -1
         if not str(value).isdecimal():

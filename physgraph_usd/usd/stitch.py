@@ -35,7 +35,7 @@ from .provenance import (
     write_root,
 )
 from .seams import Look, Points, Seam, between
-from .stage import check_there, is_there, pxr_errors
+from .stage import check_there, is_there, pxr_errors, quiet
 from .stream import LayerStream
 from .times import within
 from .track import extent_of
@@ -122,11 +122,8 @@ def stitch(
         LayerError: A chunk cannot be read, a seam moves too far, or the layer cannot be written or is invalid.
     """
     out = Path(out)
-    with pxr_errors("cannot read the chunks", LayerError):
-        files = dict.fromkeys(file for named in chunks for file in _layers_in(Path(named)))
-        parts = sorted(map(_open, files), key=lambda part: part.chunk.times)
-        if not parts:
-            raise UsageError(f"there are no chunks to stitch in {', '.join(map(str, chunks)) or 'no files'}")
+    with pxr_errors("cannot read the chunks", LayerError), quiet():
+        parts = _parts(chunks)
         shot = _check_alike(parts)
         _check_frames(parts, frames)
         inputs = {part.file for part in parts} | files_of(shot)
@@ -134,7 +131,7 @@ def stitch(
         check_targets([(f"the {what}", path) for what, path in targets.items()], inputs)
         if root is not None:
             prepare_target(Path(root), overwrite=overwrite)
-        joints = _joints(parts, shot, look_with)
+        joints = _joints(list(pairwise(parts)), shot, look_with)
         seams = [seam for joint in joints for seam in joint.seams]
         _check_seams(parts, seams, seam_bound)
         write = _write_clips if clips else _write_layer
@@ -143,6 +140,63 @@ def stitch(
             absolute = Path(str(parts[0].record["shot"])).is_absolute()
             write_root(Path(root), layer=out, shot=shot, absolute=absolute, overwrite=overwrite)
     return seams
+
+
+def check_seams(
+    chunks: Sequence[str | Path],
+    *,
+    of: Path | None = None,
+    seam_bound: float = SEAM_BOUND,
+    look_with: LookWith | None = None,
+) -> list[Seam]:
+    """Look at the seams of chunks that follow one another, and write nothing: others may still be missing.
+
+    Args:
+        chunks: As for `stitch`.
+        of: One of them, to look at its own seams alone; what else is in its folder need not be of the shot.
+        seam_bound: As for `stitch`.
+        look_with: As for `stitch`.
+
+    Returns:
+        The seams, in order.
+
+    Raises:
+        UsageError: Chunks are not of one shot, version and set of options.
+        LayerError: A chunk cannot be read, or a seam moves too far.
+    """
+    with pxr_errors("cannot read the chunks", LayerError), quiet():
+        parts = _parts(chunks, strict=of is None)
+        if of is not None:
+            parts = [part for part in parts if recorded_shot(part.layer) == recorded_shot(_open(of).layer)]
+        pairs = [pair for pair in pairwise(parts) if _follow(*pair) and (of is None or of in [x.file for x in pair])]
+        seams = []
+        for pair in pairs:
+            joints = _joints([pair], _check_alike(pair), look_with)
+            own = [seam for joint in joints for seam in joint.seams]
+            _check_seams(pair, own, seam_bound)
+            seams += own
+    return seams
+
+
+def _follow(before: _Part, after: _Part) -> bool:
+    """Whether no frame of the shot lies between two chunks."""
+    every = after.chunk.every
+    return before.chunk.times[-1:] == every[: every.index(after.chunk.times[0])][-1:]
+
+
+def _parts(chunks: Sequence[str | Path], *, strict: bool = True) -> list[_Part]:
+    """The chunks by their frames; what is none is refused, or left out."""
+    files = dict.fromkeys(file for named in chunks for file in _layers_in(Path(named)))
+    parts = []
+    for file in files:
+        try:
+            parts.append(_open(file))
+        except LayerError:
+            if strict:
+                raise
+    if not parts:
+        raise UsageError(f"there are no chunks to stitch in {', '.join(map(str, chunks)) or 'no files'}")
+    return sorted(parts, key=lambda part: part.chunk.times)
 
 
 def _targets(parts: Sequence[_Part], out: Path, *, clips: bool) -> dict[str, Path]:
@@ -248,14 +302,16 @@ def _spans(times: Sequence[float], every: Sequence[float]) -> str:
     return ", ".join(map(_span, runs))
 
 
-def _joints(parts: Sequence[_Part], shot: Path, look_with: LookWith | None) -> list[_Joint]:
+def _joints(pairs: Sequence[tuple[_Part, _Part]], shot: Path, look_with: LookWith | None) -> list[_Joint]:
     """Join each two chunks that follow one another."""
     look: Look | None = None
     joints = []
-    for before, after in pairwise(parts):
+    for before, after in pairs:
         both = _both(before, after)
         if look is None and look_with is not None and both:
-            meshes = {path: points_count(part.layer, path) for part in parts for path in part.garments()}
+            meshes = {
+                path: points_count(part.layer, path) for pair in pairs for part in pair for path in part.garments()
+            }
             look = look_with(shot, _options(before), meshes)
         joints.append(_joint(before, after, both, look))
     return joints

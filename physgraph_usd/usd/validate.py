@@ -14,7 +14,7 @@ from ..errors import LayerError
 from . import layer_rules
 from .provenance import read_record, recorded_shot
 from .rules import RULES, Fine, Problem, subsets
-from .stage import USD_ERRORS, check_there, is_there, pxr_errors, reason_of
+from .stage import USD_ERRORS, check_there, is_there, pxr_errors, quiet, reason_of
 from .validators import PLUGIN
 from .variants import same_variants
 from .view import StageView
@@ -70,8 +70,9 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
     paths = _garments(layer)
     # Only the garments are composed: a set around them may be large.
     mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
-    problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
-    composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
+    with quiet():
+        problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
+        composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
     problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
     for path in paths:
         fault = layer_rules.is_mesh(path, composed)

@@ -6,8 +6,8 @@
 Spare parameters of the node, all optional: ``garments`` (paths, separated by blanks), ``frames`` (first and last one),
 ``level``. The node has to cook once, not each frame: all frames are in the layer.
 
-The animation has to be on the stage with all its samples, as a Sublayer LOP brings it from a file. A live SOP Import holds one
-sample, that of the frame at which it cooked: the cloth would stand still. Cache it, or write it to a file first.
+The animation has to be on the stage with all its samples, as a Sublayer LOP brings it from a file. A live SOP Import
+holds one sample, that of the frame at which it cooked, and the cloth would stand still: write it to a file first.
 """
 
 from __future__ import annotations
