@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -63,10 +64,29 @@ class LevelChoice:
 
     @property
     def advice(self) -> str:
-        """The level that would do and what it costs; time grows at most as vertices do (`benchmarks.levels`)."""
-        have, want = self.vertices
-        cost = f"{want:,} vertices, up to {want / max(have, 1):.0f} times the time"
-        return f"level {self.needed} resolves them: {cost}" + (f" ({LIMIT} is the most)" * (self.needed > LIMIT))
+        """As `finer` says it."""
+        return finer(self.level, self.needed, self.edge)
+
+
+def finer(level: int, needed: int, edge: float) -> str:
+    """What to do about a mesh that is too coarse: the same wherever a run or a look at a shot says so.
+
+    Args:
+        level: The garment's number of subdivisions.
+        needed: The least level that resolves its shortest waves; at most ``level`` where folds alone tell.
+        edge: Mean rest edge at its level [m].
+
+    Returns:
+        The level and what it costs, where there is one; time grows at most as vertices do (`benchmarks.levels`).
+    """
+    target = min(max(needed, level + 1), LIMIT)
+    if target <= level:
+        return f"raise bendStiffness: level {LIMIT} is the finest"
+    step = target - level
+    said = f"use --level {target}, with edges of {1e3 * edge / 2**step:.1f} mm, for up to {4**step} times the time"
+    return (
+        said + (" (the finest, and not all of what is needed)" if needed > LIMIT else "") + ", or raise bendStiffness"
+    )
 
 
 def sample_frames(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[Frame]:
@@ -118,7 +138,10 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     needed = math.ceil(math.log2(max(edge * EDGES_PER_WAVE / max(wave, SHORTEST_WAVE * edge), 1.0)))
     level, reason = garment.level, f"as authored or asked for; {said}"
     if level == AUTO:
-        level, reason = min(needed, MOST), f"auto: {said}" + (f", {MOST} is the most that it takes" * (needed > MOST))
+        level, reason = (
+            min(needed, MOST),
+            f"auto: {said}" + (f", which takes no more than level {MOST}" * (needed > MOST)),
+        )
     fine = edge / 2**level
     choice = LevelChoice(
         level, reason, wave, fine, needed, (fine_count(garment.mesh, level), fine_count(garment.mesh, needed))
@@ -146,8 +169,7 @@ def carries_none(path: str, choice: LevelChoice) -> str:
     wave, edge = 1e3 * choice.wavelength, 1e3 * choice.edge
     return (
         f"<{path}>: its fabric can fold in waves of {wave:.1f} mm; level {choice.level} has edges of {edge:.1f} mm, "
-        f"a fifth of a wave is {wave / EDGES_PER_WAVE:.1f} mm: folds may be of the mesh's own size; {choice.advice}; "
-        "or raise bendStiffness"
+        f"a fifth of a wave is {wave / EDGES_PER_WAVE:.1f} mm: folds may be of the mesh's own size; {choice.advice}"
     )
 
 
@@ -160,21 +182,23 @@ def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
     return float((np.abs(angle) > SHARP_FOLD).mean())
 
 
-def too_coarse(path: str, level: int, shares: Mapping[float | None, float]) -> str:
+def too_coarse(garment: Mapping[str, Any], shares: Mapping[float | None, float]) -> str:
     """A warning where the mesh was too coarse for the folds, or "".
 
     Args:
-        path: The garment.
-        level: Its number of subdivisions.
+        garment: Its entry in a report: path, level, the level needed, wavelength and edge.
         shares: Share of sharp folds at each time code.
     """
     if not shares or max(shares.values()) <= SHARP_SHARE:
         return ""
     worst = max(shares, key=lambda time: shares[time])
     at = "" if worst is None else f" at time code {worst:g}"
+    path, level, needed, edge = (garment[name] for name in ("path", "level", "level_needed", "fine_edge_mm"))
+    known = needed > level and garment["wavelength_mm"] < FEWEST_EDGES * edge  # `carries_none` has said what to do.
+    remedy = "" if known else f"; {finer(level, needed, 1e-3 * edge)}"
     return (
-        f"<{path}>{at}: {shares[worst]:.0%} of the edges fold by more than 45 degrees: level {level} is too coarse for "
-        f"this fabric and shows wrinkles of the mesh's own size; use level {level + 1} or raise bendStiffness"
+        f"<{path}>{at}: {shares[worst]:.0%} of the edges fold by more than 45 degrees: edges of {edge:.1f} mm, level "
+        f"{level}, are too coarse for this fabric and show wrinkles of the mesh's own size{remedy}"
     )
 
 

@@ -549,7 +549,7 @@ def _coarse_garments(report: RefineReport) -> list[str]:
     for index, garment in enumerate(report.garments):
         entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
         shares = {time: entry["sharp_folds"] for time, entry in entries.items() if "sharp_folds" in entry}
-        said.append(too_coarse(garment["path"], garment["level"], shares))
+        said.append(too_coarse(garment, shares))
     return [warning for warning in said if warning]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +20,13 @@ from physgraph_usd.resolution import (
     AUTO,
     EDGES_PER_WAVE,
     LEAST_STRAIN,
+    LIMIT,
     MOST,
     SHARP_SHARE,
     LevelChoice,
     carries_none,
     choose_levels,
+    finer,
     sample_frames,
     sharp_folds,
     too_coarse,
@@ -79,7 +82,7 @@ def test_cloth_that_is_not_compressed_counts_as_one_per_cent():
 def test_no_more_than_the_most():
     choice, _ = choose(0.3, fabric=replace(FABRIC, bend=1e-9))
     assert choice.level == MOST
-    assert "is the most" in choice.reason
+    assert "takes no more than level 4" in choice.reason
 
 
 def test_a_level_that_was_asked_for_is_kept():
@@ -95,7 +98,7 @@ def test_what_is_said_of_a_level_names_the_one_that_would_do_and_its_cost(level:
     assert choice.needed == enough.level == 2
     points = [len(build_levels([garment_of(MESH, REST)], [subdivide_times(MESH, n)])[-1].rest) for n in (level, 2)]
     assert choice.vertices == tuple(points)
-    said = f"level 2 resolves them: {points[1]:,} vertices, up to {points[1] / points[0]:.0f} times the time"
+    said = f"use --level 2, with edges of {1e3 * enough.edge:.1f} mm, for up to {4 ** max(2 - level, 0)} times the time"
     assert (said in choice.reason) == (level < 2)
     assert f"edges of {1e3 * choice.edge:.1f} mm resolve wrinkles of {5e3 * choice.edge:.1f} mm" in choice.reason
 
@@ -105,14 +108,16 @@ def test_a_warning_where_two_edges_are_longer_than_a_wave(bend: float):
     choice, _ = choose(0.1, level=1, fabric=replace(FABRIC, bend=bend))
     said = carries_none("/coat", choice)
     assert bool(said) == (choice.wavelength < 2 * choice.edge)
-    assert not said or f"level {choice.needed} resolves them" in said
+    assert not said or f"use --level {min(choice.needed, LIMIT)}," in said
 
 
 def test_auto_that_stops_short_says_so():
     choice, _ = choose(0.3, fabric=replace(FABRIC, bend=1e-9))
     assert f"resolve wrinkles of {5e3 * choice.edge:.1f} mm" in choice.reason
-    assert f"level {choice.needed} resolves them" in choice.reason
-    assert "(5 is the most)" in choice.reason
+    assert "which takes no more than level 4" in choice.reason
+    assert "use --level 5, with edges of" in choice.reason
+    assert "(the finest, and not all of what is needed)" in choice.reason
+    assert f"level {choice.needed}" not in choice.reason
 
 
 @pytest.mark.parametrize("kind", ["triangles", "quads"])
@@ -138,11 +143,25 @@ def test_sharp_folds_are_counted():
 
 
 def test_a_word_when_folds_are_too_sharp_for_the_mesh():
-    assert not too_coarse("/coat", 2, {})
-    assert not too_coarse("/coat", 2, {1.0: SHARP_SHARE})
-    said = too_coarse("/coat", 2, {1.0: 0.0, 7.0: 0.03, 9.0: 0.02})
-    assert "</coat> at time code 7" in said
-    assert "use level 3" in said
+    coat = {"path": "/coat", "level": 2, "level_needed": 2, "fine_edge_mm": 8.0, "wavelength_mm": 40.0}
+    assert not too_coarse(coat, {})
+    assert not too_coarse(coat, {1.0: SHARP_SHARE})
+    said = too_coarse(coat, {1.0: 0.0, 7.0: 0.034, 9.0: 0.02})
+    assert "</coat> at time code 7: 3% of the edges fold by more than 45 degrees: edges of 8.0 mm" in said
+    assert said.endswith(finer(2, 2, 8e-3))
+    assert "--level 3, with edges of 4.0 mm, for up to 4 times the time" in said
+
+
+@pytest.mark.parametrize(("level", "needed", "wave"), [(1, 3, 40.0), (1, 6, 40.0), (2, 0, 99.0), (5, 7, 40.0)])
+def test_before_and_after_the_run_one_level_is_named(level: int, needed: int, wave: float):
+    coat = {"path": "/coat", "level": level, "level_needed": needed, "fine_edge_mm": 8.0, "wavelength_mm": wave}
+    choice = LevelChoice(level, "", 1e-3 * wave, 8e-3, needed, (0, 0))
+    said = [choice.advice, too_coarse(coat, {1.0: 0.1}), too_coarse(coat | {"wavelength_mm": 9.0}, {1.0: 0.1})]
+    levels = {found for each in said for found in re.findall(r"--level (\d)", each)}
+    assert levels <= {str(min(max(needed, level + 1), LIMIT))}
+    assert ("raise bendStiffness: level 5 is the finest" in said[0]) == (level == LIMIT)
+    if needed > level:
+        assert "raise" not in said[2]  # What `carries_none` said before the run is not said again.
 
 
 def test_few_frames_are_read_first_and_last_among_them():

@@ -90,7 +90,7 @@ class TestDone:
         options: dict[str, Any] = {"overrides": (f"{BEND}=1e-6",), "level": 1}
         report = refine(shot, tmp_path / "fine.usdc", progress=lambda *_: seen.append(caplog.messages), **options)
         garment = inspect_shot(shot, **options)["garments"][0]
-        said = f"level {garment['level_needed']} resolves them: {garment['fine_points_needed']:,} vertices"
+        said = f"use --level {min(garment['level_needed'], 5)}, with edges of "
         assert any(said in message for message in seen[0])
         assert said in garment["level_reason"]
         assert report.garments[0] == garment

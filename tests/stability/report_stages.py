@@ -121,7 +121,8 @@ def s39_locking() -> Result:
         bend = 300.0 * 0.2 * (edges * 0.5 * EDGE / (2.0 * np.pi)) ** 2
         fabric = Fabric(300.0, bend, 0.187)
         state = solved(mesh, rest, wave(rest, squeeze=0.2), fabric=fabric, level=1, steps=40)
-        said = too_coarse("/World/Sheet", 1, {None: float(str(state.telemetry[0]["sharp_folds"]))})
+        sizes = {"level": 1, "level_needed": 2, "fine_edge_mm": 500.0 * EDGE, "wavelength_mm": 500.0 * EDGE * edges}
+        said = too_coarse({"path": "/World/Sheet"} | sizes, {None: float(str(state.telemetry[0]["sharp_folds"]))})
         warned += [edges] if said else []
     return Result(warned == [0.5, 1.0, 2.0, 3.0], f"warned at {', '.join(f'{each:g}' for each in warned)} edges a wave")
 
