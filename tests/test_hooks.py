@@ -7,7 +7,7 @@ import json
 import runpy
 import sys
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -116,6 +116,61 @@ class TestPyblish:
 
     def test_a_stage_without_garments_has_no_instance(self, run: Any):
         assert list(run(usdStage=Usd.Stage.CreateInMemory())) == []
+
+
+class TestAyon:
+    """The plug-ins under pyblish, which AYON runs; ayon-core's extractor is a stand-in."""
+
+    @pytest.fixture
+    def run(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+        """Publish with our plug-ins alone, as settings make them."""
+        monkeypatch.setattr(sys, "path", [*sys.path, str(PYBLISH)])
+        monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
+        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which make test installs")
+        util = importlib.import_module("pyblish.util")
+        own = {"order": api.ExtractorOrder, "staging_dir": lambda *_: str(tmp_path)}
+        core = SimpleNamespace(Extractor=type("Extractor", (api.InstancePlugin,), own))
+        monkeypatch.setitem(sys.modules, "ayon_core", ModuleType("ayon_core"))
+        monkeypatch.setitem(sys.modules, "ayon_core.pipeline", SimpleNamespace(publish=core))
+        names = {"collect_refined_cloth": "CollectRefinedCloth", "extract_refined_cloth": "ExtractRefinedCloth"}
+        files = [runpy.run_path(str(PLUGINS / "ayon" / f"{name}.py")) for name in names]
+        plugins = [file[name] for file, name in zip(files, names.values(), strict=True)]
+
+        def publish(settings: dict[str, Any], **data: Any) -> Any:
+            for name, value in settings.items():
+                monkeypatch.setattr(plugins[0], name, value)
+            context = api.Context()
+            context.data.update(data)
+            return util.publish(context, plugins=plugins)
+
+        return publish
+
+    def test_a_stage_becomes_a_representation(self, run: Any, stage: Usd.Stage, file: Path):
+        context = run({"level": "1", "garments": [CLOTH]}, usdStage=stage, folderPath="/shots/010", task="cloth")
+        assert [str(result["error"]) for result in context.data["results"] if result["error"]] == []
+        (instance,) = context
+        (made,) = instance.data["representations"]
+        assert (instance.data["folderPath"], instance.data["productName"], made["ext"]) == (
+            "/shots/010",
+            "usdCloth",
+            "usdc",
+        )
+        layer = Path(made["stagingDir"]) / made["files"]
+        assert faults(layer, file) == []
+        assert len(Sdf.Layer.FindOrOpen(str(layer)).QueryTimeSample(f"{CLOTH}.points", 2.0)) == FINE
+
+    def test_the_scenes_file_serves_where_it_is_usd(self, run: Any, file: Path):
+        assert len(run({}, currentFile=str(file))) == 1
+        assert len(run({}, currentFile="scene.mb")) == 0
+
+    def test_each_setting_is_an_attribute_of_the_plug_in(self, run: Any, monkeypatch: pytest.MonkeyPatch):
+        server = SimpleNamespace(BaseSettingsModel=object, SettingsField=lambda *_, **__: None)
+        monkeypatch.setitem(sys.modules, "ayon_server", ModuleType("ayon_server"))
+        monkeypatch.setitem(sys.modules, "ayon_server.settings", server)
+        found = runpy.run_path(str(PLUGINS / "ayon" / "settings.py"))
+        collector = runpy.run_path(str(PLUGINS / "ayon" / "collect_refined_cloth.py"))["CollectRefinedCloth"]
+        assert all(hasattr(collector, name) for name in found["CollectRefinedClothModel"].__annotations__)
+        assert list(found["PublishModel"].__annotations__) == ["CollectRefinedCloth"]
 
 
 class TestSolaris:
