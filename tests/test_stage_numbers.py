@@ -130,3 +130,18 @@ def test_json_is_what_every_parser_reads(tmp_path: Path):
         "b": [None, None, 1.5, [None]],
         "c": str(tmp_path),
     }
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, NAN, INF])
+@pytest.mark.parametrize("which", ["shot.usda", "fine.usda"])
+def test_validate_and_preview_name_a_rate_that_is_none(shot: Path, which: str, rate: float):
+    """USD looks for samples without end."""
+    fine = shot.with_name("fine.usda")
+    assert run("refine", shot, "-o", fine, "--velocities", *SMALL).exit_code == 0
+    layer = Sdf.Layer.FindOrOpen(str(shot.with_name(which)))
+    layer.timeCodesPerSecond = rate
+    layer.Save()
+    for command in (("validate", fine), ("preview", fine, "-o", shot.with_name("a.gif"))):
+        result = run(*command)
+        assert result.exit_code == 1, result.output
+        assert f"timeCodesPerSecond of @{which}@ is {rate:g}" in result.output

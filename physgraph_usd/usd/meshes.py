@@ -11,15 +11,13 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from ..errors import StageError
 from .find import has_schema, traverse
 from .provenance import recorded_shot
-from .stage import check_there, list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
+from .stage import bad_rate, check_there, list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
 from .times import garment_times, merge
 from .view import root_over
 
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh that says nothing of its own."""
 
-FALLBACK_RATE = 24.0
-"""Time codes per second of a stage that says nothing usable."""
 
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns Z up into Y up."""
@@ -54,7 +52,7 @@ class DrawnStage:
         over: A layer put over the shot, or None.
 
     Raises:
-        StageError: When a file cannot be opened.
+        StageError: When a file cannot be opened, or its rate is none.
     """
 
     def __init__(self, shot: Path, over: Path | None = None) -> None:
@@ -65,8 +63,9 @@ class DrawnStage:
         self._root = root_over(base, [layer.identifier for layer in layers])
         with pxr_errors(f"cannot open {shot}"), quiet():
             self.stage = Usd.Stage.Open(self._root)
-        rate = float(self.stage.GetTimeCodesPerSecond())
-        self.rate = rate if rate > 0 else FALLBACK_RATE
+        if said := bad_rate(self.stage):
+            raise StageError(f"cannot draw {shot}: {said}")
+        self.rate = float(self.stage.GetTimeCodesPerSecond())
         self._scale = metres_per_unit(self.stage)[0]
         self._turn = Z_UP if up_vector(self.stage)[0][2] == 1.0 else np.eye(3)
 

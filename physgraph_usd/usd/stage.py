@@ -151,10 +151,17 @@ def check_metadata(stage: Usd.Stage) -> None:
         number = float(value) if isinstance(value, int | float) else math.nan
         if value is not None and not (math.isfinite(number) and (number > 0 or not positive)):
             raise StageError(f"{key} of the stage is {in_brief(value)}, which is no {what}, in its root layer")
-    for layer in stage.GetUsedLayers():
-        if not layer.timeCodesPerSecond > 0:
+    if said := bad_rate(stage):
+        raise StageError(said)
+
+
+def bad_rate(stage: Usd.Stage) -> str:
+    """What is wrong with the time codes per second of a stage's layers, "" where nothing is: USD may not come back."""
+    for layer in sorted(stage.GetUsedLayers(), key=lambda layer: layer.anonymous):
+        if not 0 < layer.timeCodesPerSecond < math.inf:
             name, rate = layer.GetDisplayName(), layer.timeCodesPerSecond
-            raise StageError(f"timeCodesPerSecond of @{name}@ is {rate:g}; author the shot's rate, such as 24")
+            return f"timeCodesPerSecond of @{name}@ is {rate:g}; author the shot's rate, such as 24"
+    return ""
 
 
 _RATE = "rate; author one above 0, such as 24"

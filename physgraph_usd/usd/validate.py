@@ -14,7 +14,7 @@ from ..errors import LayerError
 from . import layer_rules
 from .provenance import read_record, recorded_shot
 from .rules import RULES, Fine, Problem, subsets
-from .stage import USD_ERRORS, check_there, is_there, pxr_errors, quiet, reason_of
+from .stage import USD_ERRORS, bad_rate, check_there, is_there, pxr_errors, quiet, reason_of
 from .validators import PLUGIN
 from .variants import same_variants
 from .view import StageView
@@ -43,6 +43,8 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
     lost = isinstance(below, str) and shot is None and not is_there(below)
     view = None if lost else _view(below)
     with pxr_errors(f"cannot read {layer} over {below}", LayerError):
+        if said := _bad_rate(opened, view):
+            return [Problem("error", "/", None, said, "time_scale")]
         opened = _played(opened)
         problems = check_layer(opened, view)
         if lost:
@@ -51,6 +53,13 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
         elif view is not None and not any(problem.rule == "composition" for problem in problems):
             problems += _own_validators(opened, view)
     return sorted(problems, key=lambda problem: problem.severity != "error")
+
+
+def _bad_rate(layer: Sdf.Layer, shot: StageView | None) -> str:
+    """What is wrong with the rate of a layer or of its shot, or ""."""
+    nothing = Usd.StagePopulationMask()
+    stages = [Usd.Stage.OpenMasked(layer, nothing)] + ([] if shot is None else [shot.open(mask=nothing)])
+    return next(filter(None, map(bad_rate, stages)), "")
 
 
 def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None = None) -> list[Problem]:
