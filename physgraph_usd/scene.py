@@ -20,6 +20,8 @@ squared areas, are finite in float32; the hierarchies that kernels build end the
 RESOLVED = 0.1
 """Part of an edge that single precision must tell apart where the farthest vertex is: about the garment's mean the
 solver's positions have 24 bits, and with less than that nothing of the cloth is left in them."""
+FALLS = 4.0
+"""Its sizes by which a garment may sink: a layer whose cloth is farther from its cage than one is invalid."""
 SPECK = 0.1
 """Size under which a garment's units are in doubt before its guide is [m]."""
 OUTGROWN = 1e3
@@ -202,7 +204,7 @@ def refuse_falling(scene: Scene, frame: Frame) -> None:
     Without pins, bodies and other garments it sinks by its weight over the guide's stiffness.
 
     Raises:
-        GarmentError: It would sink by more than its own size.
+        GarmentError: It would sink by `FALLS` times its own size.
     """
     if len(scene.garments) > 1:
         return
@@ -211,7 +213,7 @@ def refuse_falling(scene: Scene, frame: Frame) -> None:
         held = garment.colliders or (garment.pin > 0).any() or not len(own.points)
         size = max(SPECK, *(float(np.ptp(x, axis=0).max(initial=0.0)) for x in (own.points, garment.rest)))
         stiffness = own.guide * float(garment.guide_scale.mean())
-        if not held and weight > size * stiffness:
+        if not held and weight > FALLS * size * stiffness:
             sinks = "without end" if stiffness == 0 else f"by {weight / stiffness:.3g} m"
             said = f"nothing holds it up but a guide of {own.guide:g} N/m^3: it would sink {sinks}"
             raise GarmentError(garment.path, said, time=frame.time, remedy="raise physgraph:guide:stiffness, or pin it")
