@@ -92,7 +92,7 @@ def main(level: int, after: int, names: Sequence[str]) -> None:
 
 
 def run(
-    level: int, after: int, *, travel: float, glitch: Glitch | None = None
+    level: int, after: int, *, travel: float, glitch: Glitch | None = None, at: int = BEFORE
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
     """Refine all frames in order.
 
@@ -101,6 +101,7 @@ def run(
         after: Frames after the broken one.
         travel: Angle by which folds travel in a frame [rad].
         glitch: What breaks one frame, or None.
+        at: Which frame that is.
 
     Returns:
         Fine positions [m], shape (V, 3), and telemetry of each frame; where it failed those of the frame before.
@@ -108,15 +109,15 @@ def run(
     scene, ball = SHEET.scene(subdivisions=4)
     refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[level], lanes=2)
     told: list[tuple[np.ndarray, dict[str, Any]]] = []
-    for index in range(BEFORE + 1 + after):
+    for index in range(at + 1 + after):
         points = SHEET.draped(0.002, travel * index) + index * DRIFT
         frame = Frame(float(index), (GarmentFrame(points, PRESETS["jersey"]),), (ball,))
-        frame = glitch(frame) if glitch is not None and index == BEFORE else frame
+        frame = glitch(frame) if glitch is not None and index == at else frame
         try:
             state = refiner.solve(frame)
         except PhysGraphError:
             refiner.forget()
-            told.append(told[-1])
+            told.append(told[-1] if told else (points, {}))
             continue
         assert state.points[0] is not None
         told.append((state.points[0], dict(state.telemetry[0])))

@@ -33,6 +33,7 @@ class Known:
         points: Fine positions [m].
         state: What it leaves to the next.
         crossing: Which fine vertices belong to cloth that crosses cloth.
+        first: Whether it was solved with none before it.
     """
 
     time: float | None
@@ -43,6 +44,7 @@ class Known:
     points: np.ndarray
     state: State
     crossing: np.ndarray
+    first: bool = False
 
 
 def cage_moved(known: Known, now: GarmentFrame) -> float:
@@ -78,6 +80,46 @@ def came_back(
     near = sorted({*near, *before.near})
     away = max(cage_moved(last, now), bodies_moved(last, colliders, near))
     return away > edge and max(cage_moved(before, now), bodies_moved(before, colliders, near)) < BACK * away
+
+
+def jumped_in(
+    first: Known,
+    second: Known,
+    now: GarmentFrame,
+    colliders: Sequence[Pose | None],
+    *,
+    near: Sequence[int],
+    edge: float,
+) -> bool:
+    """Whether the input left its place in the first of three frames alone.
+
+    Args:
+        first: The first frame.
+        second: The one after it.
+        now: The garment in this frame, the third.
+        colliders: Poses of all bodies in this frame.
+        near: Those that the garment may touch.
+        edge: As for `came_back`.
+    """
+    near = sorted({*near, *first.near, *second.near})
+    away = max(cage_moved(first, second.frame), bodies_moved(first, second.colliders, near))
+    return away > edge and max(cage_moved(second, now), bodies_moved(second, colliders, near)) < BACK * away
+
+
+def told_jumped(path: str, jumped: Mapping[float | None, float | None]) -> list[str]:
+    """A warning where a garment's input jumps from the first frame to the second.
+
+    Args:
+        path: The garment.
+        jumped: Time code of the first frame, by that of the third.
+    """
+    return [
+        f"<{path}> at time code {first:g}: the garment or a body jumps from this first frame to the next; if it is "
+        f"broken, leave it out with --frames and take the rest shape from another with --rest FRAME. "
+        f"Time code {time:g} starts anew"
+        for time, first in jumped.items()
+        if time is not None and first is not None
+    ]
 
 
 def told_broken(path: str, broken: Mapping[float | None, float | None]) -> list[str]:

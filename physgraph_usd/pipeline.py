@@ -18,16 +18,16 @@ from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
 from .contact.heat import body_crossings, penetration_map
 from .contact.passed import Passed
 from .deadline import ends_after, is_over
-from .errors import GarmentError
+from .errors import GarmentError, SolveError
 from .frame.group import Group
 from .frame.values import FrameInput, join, split
-from .history import Known, bodies_moved, came_back
+from .history import Known, bodies_moved, came_back, jumped_in
 from .level import refine_garments
 from .mesh.subdivide import Refinement
 from .mesh.topology import edges_of
 from .scene import Frame, GarmentFrame, Scene, State, out_of_bounds, refuse_far
 from .solve_settings import SolveSettings
-from .strain import has_collapsed, size_left
+from .strain import has_collapsed, size_left, strayed
 
 LIMIT, LEAST_LIMIT, LIMIT_PER_VERTEX = 20.0, 120.0, 0.01
 """A frame stops where it stands after so many times the median of the shot's frames, but never before so many seconds
@@ -173,9 +173,11 @@ class Refiner:
             frame: The frame.
             wanted: For each garment, whether it is asked for; all when None.
 
+        Garments that could not be solved follow their cages, where others could.
+
         Raises:
             GarmentError: A position is out of bounds.
-            SolveError: A term of the potential is not finite.
+            SolveError: No garment could be solved: a term of the potential is not finite, or cloth left its cage.
         """
         began = clock.perf_counter()
         with ends_after(self._limit):
@@ -204,7 +206,25 @@ class Refiner:
         asked = [True] * count if wanted is None else list(wanted)
         points: list[np.ndarray | None] = [None] * count
         telemetry: list[dict[str, object]] = [{"start": "left out: the garment has no sample here"}] * count
-        reused = [False] * count
+        answers, reused = self._answers(frame, asked, gap=gap)
+        for index, (each, entry) in answers.items():
+            points[index], telemetry[index] = each, entry
+        self._time, self._walked = frame.time, None
+        for index, passed in enumerate(self._passed.look(frame)):
+            telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
+        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
+
+    def _answers(
+        self, frame: Frame, asked: Sequence[bool], *, gap: bool
+    ) -> tuple[dict[int, tuple[np.ndarray, dict[str, object]]], list[bool]]:
+        """Positions and telemetry of the garments asked for, by number; and for all whether they equal the last ones.
+
+        Raises:
+            SolveError: No garment could be solved.
+        """
+        found, reused = dict[int, tuple[np.ndarray, dict[str, object]]](), [False] * len(asked)
+        unsolved = dict[tuple[int, ...], SolveError]()
         for part in self._parts.of(frame.garments):
             same = self._same(part, frame, [self._last[index] for index in part])
             for index in part:
@@ -212,14 +232,15 @@ class Refiner:
             if not any(asked[index] for index in part):
                 continue
             self._unsolved -= {index for index in part if asked[index]}
-            for index, each, entry in zip(part, *self._answer(part, frame, same=same, gap=gap), strict=True):
-                if asked[index]:
-                    points[index], telemetry[index] = each, entry
-        self._time, self._walked = frame.time, None
-        for index, passed in enumerate(self._passed.look(frame)):
-            telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
-        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
-        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
+            try:
+                found |= zip(part, zip(*self._answer(part, frame, same=same, gap=gap), strict=True), strict=True)
+            except SolveError as error:
+                unsolved[part] = error
+        if unsolved and not found:
+            raise next(iter(unsolved.values()))
+        for part, error in unsolved.items():
+            found |= zip(part, zip(*self._upsampled(part, frame, error), strict=True), strict=True)
+        return {index: each for index, each in found.items() if asked[index]}, reused
 
     def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
         """Energy [J] of all garments at given world positions [m], what touches there found anew."""
@@ -281,6 +302,14 @@ class Refiner:
         entries: list[dict[str, object]] = [{"start": "reused: the input equals the last frame's"}] * len(part)
         return [each.points for each in (self._last[index] for index in part) if each is not None], entries
 
+    def _upsampled(
+        self, part: tuple[int, ...], frame: Frame, error: SolveError
+    ) -> tuple[list[np.ndarray], list[dict[str, object]]]:
+        """Garments that could not be solved, on their cages' smooth surface; the next frame starts from one before."""
+        self._unsolved.update(part)
+        points = self.group_of(part).upsampled([frame.garments[index] for index in part])
+        return points, [{"start": "not solved: it follows its cage", "not_solved": str(error)}] * len(part)
+
     def _solve_part(
         self, part: tuple[int, ...], frame: Frame, *, gap: bool
     ) -> tuple[list[np.ndarray], list[dict[str, object]]]:
@@ -288,9 +317,11 @@ class Refiner:
         frames = [frame.garments[index] for index in part]
         group, near = self.group_of(part), self._near(part, frames)
         last = [self._last[index] for index in part]
-        broken = self._broken(part, frame, near)
+        broken, jumped = self._broken(part, frame, near), self._jumped(part, frame, near)
         if broken is not None:
             last = [self._before[index] for index in part]
+        if jumped is not None:
+            last = [None] * len(part)
         known = [each for each in last if each is not None]
         state = None if gap or len(known) < len(part) else join([each.state for each in known])
         if state is not None and any(each.part != part for each in known):
@@ -304,6 +335,7 @@ class Refiner:
             if more <= set(near):
                 break
             near = tuple(sorted({*near, *more}))
+        self._refuse_strayed(part, frame, solved.points)
         entry = solved.telemetry
         if any(self._scene.garments[index].colliders for index in part):
             entry["near"] = [self._scene.colliders[each].path for each in near]
@@ -313,11 +345,23 @@ class Refiner:
         entry |= {} if cage is None else {"start": f"cold: the cage walked here from time code {cage[1]:g}"}
         entry |= {} if broken is None else {"broken_before": broken}
         entry |= {"time_limit": float(f"{self._limit:.3g}")} if is_over() else {}
+        entry |= (
+            {} if jumped is None else {"jumped_from": jumped, "start": "cold: the first frame is unlike the others"}
+        )
         own = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         for place, (index, each) in enumerate(zip(part, frames, strict=True)):
-            self._before[index] = last[place]
+            first = self._last[index] is None
+            self._before[index] = self._last[index] if broken is None else last[place]
             self._last[index] = Known(
-                frame.time, each, frame.colliders, near, part, solved.points[place], own[place], solved.crossing[place]
+                frame.time,
+                each,
+                frame.colliders,
+                near,
+                part,
+                solved.points[place],
+                own[place],
+                solved.crossing[place],
+                first,
             )
         return solved.points, [entry] * len(part)
 
@@ -338,6 +382,24 @@ class Refiner:
             if came_back(last, before, frame.garments[index], frame.colliders, near=near, edge=edge):
                 return last.time
         return None
+
+    def _jumped(self, part: tuple[int, ...], frame: Frame, near: Sequence[int]) -> float | None:
+        """Time code of the first frame, if garments' input jumped from there to the second and stays there."""
+        edge = float(self.group_of(part).levels[0].spacing.mean())
+        for index in part:
+            first, second = self._before[index], self._last[index]
+            if first is None or second is None or not first.first:
+                return None
+            if jumped_in(first, second, frame.garments[index], frame.colliders, near=near, edge=edge):
+                return first.time
+        return None
+
+    def _refuse_strayed(self, part: tuple[int, ...], frame: Frame, points: Sequence[np.ndarray]) -> None:
+        """Refuse cloth that is no more where its cage is."""
+        for index, fine in zip(part, points, strict=True):
+            if said := strayed(frame.garments[index].points, fine):
+                when = "" if frame.time is None else f" at time code {frame.time:g}"
+                raise SolveError(f"<{self._scene.garments[index].path}>{when}: {said}")
 
     def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
         """Where a garment is inside bodies whose bounds it meets, pushed by them or not, and where cloth crosses."""

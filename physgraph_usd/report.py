@@ -18,6 +18,8 @@ FORMAT = 1
 """Version of the JSON's format; another one where a reader of the last one could fail. See report.schema.json."""
 SCHEMA = Path(__file__).with_name("report.schema.json")
 DONE, FAILED, IN_PART = 0, 1, 3
+LEFT = 0.1
+"""Part of what crosses in the input that a strict run may leave."""
 SIGNALLED = 128
 """Added to a signal's number, as shells report it."""
 NOTICE = 25
@@ -31,7 +33,7 @@ _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error"
 _GARMENT: dict[str, Any] = dict.fromkeys(
     (
         "start", "levels", "milliseconds", "energy_joules", "strain", "sharp_folds", "chosen", "contact", "near",
-        "together", "collapsed", "passed_through", "broken_before", "time_limit",
+        "together", "collapsed", "passed_through", "broken_before", "jumped_from", "not_solved", "time_limit",
     )
 )  # fmt: skip
 _CONTACT: dict[str, Any] = dict.fromkeys(("bodies", "cloth", "repaired", "projected"))
@@ -97,28 +99,40 @@ class RefineReport:
 
     @property
     def exit_code(self) -> int:
-        """0 done, 1 it failed, 3 done in part: some frames failed, or where that is strict some did not settle.
+        """0 done, 1 it failed, 3 done in part, 128 and the signal's number where the run was interrupted.
 
-        128 and the signal's number where the run was interrupted.
+        In part is a run of which some frames failed or some garment was not solved in one; where that is strict also
+        one in which some did not settle, or that leaves more than a tenth of what crossed.
         """
         if self.signal is not None:
             return SIGNALLED + self.signal
         if self.error:
             return FAILED
         if not self.failed:
-            return IN_PART if self.unsettled and self.strict else DONE
+            unsolved = any(entry.get("error") for entry in self.unsettled)
+            return IN_PART if unsolved or (self.strict and (self.unsettled or self.leaves_crossings)) else DONE
         return FAILED if len(self.failed) == len(self.frames) else IN_PART
 
     @property
     def crossings(self) -> int | None:
         """Edges through faces that are left, of cloth and of bodies, in all frames; None where none were looked for."""
+        found = self._crossed("after")
+        return sum(found) if found else None
+
+    @property
+    def leaves_crossings(self) -> bool:
+        """Whether more than a tenth of the edges that pass through faces in the upsampled input are left."""
+        return sum(self._crossed("after")) > LEFT * sum(self._crossed("before"))
+
+    def _crossed(self, side: str) -> list[int]:
+        """Edges through faces of each measurement, "before" or "after"."""
         paths = [garment["path"] for garment in self.garments]
         entries = [pair for frame in self.frames for pair in zip(paths, frame.get("garments", ()), strict=False)]
         # Garments that are solved together have one measurement, which each of them tells.
         own = [entry for path, entry in entries if entry.get("together", [path])[0] == path]
         found = [entry["contact"] for entry in own if "contact" in entry]
-        sides = [side for contact in found for side in (contact.get("cloth"), *contact.get("bodies", {}).values())]
-        return sum(side["after"]["crossings"] for side in sides if side) if found else None
+        measured = [each for contact in found for each in (contact.get("cloth"), *contact.get("bodies", {}).values())]
+        return [each[side]["crossings"] for each in measured if each]
 
     def warn(self, *warnings: str) -> None:
         """Take warnings that are not there yet, those of a kind about many prims as one, and log them."""

@@ -10,7 +10,7 @@ from typing import Any
 from .integrate.solve import FAR
 from .words import counted
 
-COLLAPSED, LIMITED = "collapsed", "time limit"
+COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
 
 
 @dataclass(frozen=True)
@@ -20,17 +20,21 @@ class Unsettled:
     Attributes:
         level: The level at which it did not.
         remaining_move: RMS of H0^-1 F there, in local edge lengths; None where there was nothing to solve.
-        stopped: Why its steps ended, as `LevelReport` says it, `COLLAPSED` or `LIMITED`.
+        stopped: Why its steps ended, as `LevelReport` says it, `COLLAPSED`, `LIMITED` or `UNSOLVED`.
         size: Of the cage over its rest shape's, where it has collapsed.
+        error: Why it was not solved, "" where it was.
     """
 
     level: int
     remaining_move: float | None
     stopped: str
     size: float | None = None
+    error: str = ""
 
     def __str__(self) -> str:
         """In words."""
+        if self.error:
+            return self.error
         if self.size is not None:
             return f"the cage has shrunk to {self.size:.2g} of its rest shape's size"
         why = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
@@ -47,6 +51,8 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
         entry: The frame's telemetry of the garment.
         tolerance: Of the solve, in local edge lengths.
     """
+    if "not_solved" in entry:
+        return Unsettled(0, None, UNSOLVED, error=str(entry["not_solved"]))
     if "collapsed" in entry:
         return Unsettled(0, None, COLLAPSED, float(entry["collapsed"]))
     last = {each["level"]: each for each in entry.get("levels", ())}
@@ -88,15 +94,19 @@ def told_unsettled(found: Sequence[Mapping[str, Any]]) -> list[str]:
     said = []
     for path, each in groupby(found, key=lambda entry: str(entry["path"])):
         entries = list(each)
-        collapsed = [entry for entry in entries if entry["stopped"] == COLLAPSED]
-        limited = [entry for entry in entries if entry["stopped"] == LIMITED]
-        moving = [entry for entry in entries if entry["stopped"] not in {COLLAPSED, LIMITED}]
+        named = {kind: [e for e in entries if e["stopped"] == kind] for kind in (COLLAPSED, LIMITED, UNSOLVED)}
+        moving = [entry for entry in entries if entry["stopped"] not in named]
         moving.sort(key=lambda entry: -entry["remaining_move"])
         said += _told(path, moving, "the frame did not settle: {}; more --steps may help", others="nor did")
         reached = "the frame was not solved to its end: it reached its limit of time; see --frame-limit"
-        said += _told(path, limited, reached, others="nor was it")
+        said += _told(path, named[LIMITED], reached, others="nor was it")
         remedy = "cache that frame again, or leave it out with --frames"
-        said += _told(path, collapsed, f"{{}}; the frame is upsampled, not solved: {remedy}", others="so it is at")
+        said += _told(
+            path, named[COLLAPSED], f"{{}}; the frame is upsampled, not solved: {remedy}", others="so it is at"
+        )
+        said += _told(
+            path, named[UNSOLVED], f"{{}}; it follows its cage there, not solved: {remedy}", others="so it is at"
+        )
     return said
 
 
@@ -107,27 +117,30 @@ def told_contact(path: str, entries: Mapping[float | None, Mapping[str, Any]]) -
         path: The garment.
         entries: Its telemetry by time code.
     """
-    found: dict[str, dict[float | None, int]] = {}
+    found: dict[str, dict[float | None, tuple[int, int]]] = {}
     for time, entry in entries.items():
         contact = entry.get("contact", {})
-        found.setdefault("edges pass through cloth", {})[time] = _after(contact.get("cloth", {}), "crossings")
+        found.setdefault("edges pass through cloth", {})[time] = _counts(contact.get("cloth", {}), "crossings")
         for body, told in contact.get("bodies", {}).items():
-            found.setdefault(f"vertices are left inside <{body}>", {})[time] = _after(told, "inside")
+            found.setdefault(f"edges pass through <{body}>", {})[time] = _counts(told, "crossings")
+            found.setdefault(f"vertices are left inside <{body}>", {})[time] = _counts(told, "inside")
             passing = f"vertices are inside <{body}>, which lies between them and where the cage has them"
-            found.setdefault(passing, {})[time] = _after(told, "passing")
+            found.setdefault(passing, {})[time] = _counts(told, "passing")
     said = []
     for what, counts in found.items():
-        left = {time: count for time, count in counts.items() if count}
+        left = {time: count for time, count in counts.items() if count[1]}
         if left:
-            worst = max(left, key=lambda time: left[time])
+            worst = max(left, key=lambda time: left[time][1])
             others = f", and fewer in {counted(len(left) - 1, 'other frame')}" if len(left) > 1 else ""
-            code = "default" if worst is None else f"{worst:g}"
-            said.append(f"<{path}> at time code {code}: {left[worst]:,} {what}{others}")
+            code, (before, after) = "default" if worst is None else f"{worst:g}", left[worst]
+            said.append(f"<{path}> at time code {code}: {after:,} {what}, of {before:,} in the input{others}")
     return said
 
 
-def _after(told: Mapping[str, Any], name: str) -> int:
-    return int(told.get("after", {}).get(name, 0))
+def _counts(told: Mapping[str, Any], name: str) -> tuple[int, int]:
+    """A count of what touches in the upsampled input and in the result; 0 where it was not measured."""
+    before, after = (int(told.get(side, {}).get(name, 0)) for side in ("before", "after"))
+    return before, after
 
 
 def _told(path: str, entries: Sequence[Mapping[str, Any]], said: str, *, others: str) -> list[str]:
@@ -137,4 +150,5 @@ def _told(path: str, entries: Sequence[Mapping[str, Any]], said: str, *, others:
     first, *codes = ["default" if entry["time"] is None else f"{entry['time']:g}" for entry in entries]
     how = Unsettled(**{own.name: entries[0][own.name] for own in fields(Unsettled)})
     more = f"; {others} time code {', '.join(codes)}" if codes else ""
-    return [f"<{path}> at time code {first}: {said.format(how)}{more}"]
+    place = f"<{path}> at time code {first}: "
+    return [place + said.format(str(how).removeprefix(place)) + more]

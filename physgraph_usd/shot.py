@@ -20,7 +20,7 @@ from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageErr
 from .farm import connected, shots_at_once
 from .finished import Job, check_jobs, finished, in_order, made_from, may_be_done, skipped, taken_as_done
 from .frames import FrameFolder, Outcome, frames_folder, kept_for
-from .history import told_broken
+from .history import told_broken, told_jumped
 from .integrate.metric import FACTOR
 from .interrupts import exit_code_of, signals_raise
 from .joined import Looking, joined
@@ -538,6 +538,7 @@ def _of_frames(report: RefineReport) -> list[str]:
         *_coarse_garments(report),
         *_of_garments(report, told, "passed_through"),
         *_of_garments(report, told_broken, "broken_before"),
+        *_of_garments(report, told_jumped, "jumped_from"),
         *_of_garments(report, told_contact),
         *told_unsettled(report.unsettled),
     ]

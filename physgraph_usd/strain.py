@@ -16,11 +16,15 @@ from .scene import Garment
 
 STRAINED = 1.1
 """Area over rest area, or its inverse, from which a face is strained."""
+SHRUNK = 0.25
+"""Area over rest area under which cloth is not gathered: the rest shape is another one's, or broken."""
 LEAST_SHARE = 0.01
 """Of the garment's rest area; smaller parts, such as single faces in a fold, are passed over."""
 COVERED = 0.9
 """Share of a part's faces inside a subset that gives it its name."""
 MOST_NAMED = 3
+LARGEST = 4.0
+"""Times its cage's size that refined cloth may have."""
 COLLAPSED = 0.01
 """Size of a cage over its rest shape's below which there is nothing to solve: edges that are centimetres long at rest
 are shorter there than cloth is thick, so all of it touches all of it."""
@@ -72,14 +76,14 @@ def strained_parts(
 
 
 def stretched(path: str, source: str, parts: Sequence[StrainedPart]) -> str:
-    """A warning where parts are larger than their rest shape in most frames, or ""."""
-    large = [part for part in parts if part.area_ratio > 1.0]
+    """A warning where parts are larger than their rest shape in most frames, or far smaller, or ""."""
+    large = [part for part in parts if part.area_ratio > 1.0 or part.area_ratio < SHRUNK]
     if not large:
         return ""
     named = "; ".join(f"{part.area_ratio:.2f} times on {part.faces} faces {part.where}" for part in large[:MOST_NAMED])
     more = f"; and {len(large) - MOST_NAMED} smaller parts" if len(large) > MOST_NAMED else ""
     return (
-        f"<{path}>: in most frames the cage is larger than its rest shape ({source}), to which refined cloth shrinks: "
+        f"<{path}>: in most frames the cage has not its rest shape's size ({source}), to which refined cloth goes: "
         f"{named}{more}; give --rest auto or --rest FRAME, or author primvars:rest"
     )
 
@@ -88,6 +92,24 @@ def size_left(garment: Garment, points: np.ndarray) -> float:
     """How large a cage at positions [m], shape (V, 3), is along its longest axis over its rest shape; 1 without one."""
     sizes = [float(np.ptp(each, axis=0).max()) if len(each) else 0.0 for each in (points, garment.rest)]
     return sizes[0] / sizes[1] if sizes[1] > 0 else 1.0
+
+
+def strayed(cage: np.ndarray, fine: np.ndarray) -> str:
+    """Says so where refined cloth is no more where its cage is, else "".
+
+    Args:
+        cage: Positions of the cage [m], shape (V, 3).
+        fine: Positions of the refined cloth [m], shape (V_fine, 3).
+    """
+    if not len(cage) or not len(fine):
+        return ""
+    size, own = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (cage, fine))
+    away = float(np.linalg.norm(fine.mean(axis=0) - cage.mean(axis=0)))
+    if away > size:
+        return f"the refined cloth lies {1e3 * away:.4g} mm from its cage, which is {1e3 * size:.4g} mm large"
+    if own > LARGEST * size:
+        return f"the refined cloth is {1e3 * own:.4g} mm large, its cage {1e3 * size:.4g} mm"
+    return ""
 
 
 def has_collapsed(garment: Garment, points: np.ndarray) -> bool:

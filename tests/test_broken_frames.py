@@ -31,6 +31,28 @@ def test_cloth_is_back_after_five_frames(clean: list[np.ndarray], name: str):
     assert told[BEFORE + 1][1].get("broken_before", BEFORE) == BEFORE
 
 
+@pytest.mark.parametrize("name", GLITCHES)
+def test_a_broken_first_frame_is_left_behind_or_named(name: str):
+    """Cloth that a body swallowed in the first frame stayed 38 mm from its place for good."""
+    told = run(1, AFTER, travel=0.0, glitch=GLITCHES[name], at=0)
+    clean = run(1, AFTER, travel=0.0, at=0)
+    assert np.linalg.norm(told[-1][0] - clean[-1][0], axis=1).max() < 1e-3
+    assert not any("jumped_from" in entry for _, entry in clean)
+
+
+def test_a_first_frame_that_is_the_rest_shape_too_is_named(tmp_path: Path):
+    shot = cloth_shot(tmp_path / "shot.usdc", broken={1.0: -1.0})
+    out = tmp_path / "fine.usdc"
+    (warning,) = (each for each in refine(shot, out).warnings if each.startswith(f"<{CLOTH}> at time code 1: "))
+    assert "--frames" in warning
+    assert "--rest" in warning
+    whole = cloth_shot(tmp_path / "whole.usdc")
+    refine(whole, tmp_path / "unbroken.usdc", rest="2")
+    refine(shot, out, rest="2", frames=(2.0, 6.0), overwrite=True)
+    pair = [fine(shot, tmp_path / name, 6.0) for name in ("fine.usdc", "unbroken.usdc")]
+    assert np.abs(pair[0] - pair[1]).max() < 1e-3
+
+
 @pytest.mark.parametrize("scale", [100.0, 0.0, -1.0])
 def test_a_warning_names_the_frame(tmp_path: Path, scale: float):
     shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: scale})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.near import weights
@@ -37,8 +37,7 @@ def along(
     """
     if not len(met.value):
         return way
-    rows = torch.unique(torch.cat([met.corners, met.face.unsqueeze(1).to(met.corners)], dim=1), dim=0)
-    corners, face = rows[:, :4].contiguous(), rows[:, 4] == 1
+    corners, face = _distinct(met)
     weight, places = weights(x, corners, face), corners.long()
     apart = (weight.unsqueeze(2) * x[places]).sum(dim=1)
     distance = apart.norm(dim=1)
@@ -53,3 +52,20 @@ def along(
         each = (push.unsqueeze(1) * gives).unsqueeze(2) * normal.unsqueeze(1)
         out = add_at(way.clone(), places.reshape(-1), each.reshape(-1, 3))
     return out
+
+
+def _distinct(met: Pairs) -> tuple[Int[Tensor, "pairs 4"], Bool[Tensor, " pairs"]]:
+    """Corners of each pair once, in their order, and whether it is of a vertex and a face.
+
+    Two sorts of whole numbers: `torch.unique` of rows compares them number by number, some ten times as slowly.
+    """
+    a, b, c, d = met.corners.long().T
+    count = int(met.corners.max()) + 1
+    first, second = a * count + b, 2 * (c * count + d) + met.face
+    order = torch.argsort(second, stable=True)
+    order = order[torch.argsort(first[order], stable=True)]
+    first, second = first[order], second[order]
+    kept = torch.ones_like(first, dtype=torch.bool)
+    kept[1:] = (first[1:] != first[:-1]) | (second[1:] != second[:-1])
+    order = order[kept]
+    return met.corners[order], met.face[order].bool()

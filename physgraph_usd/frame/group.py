@@ -129,6 +129,13 @@ class Group:
         own = [[each[span] for span in self.levels[-1].spans] for each in (points, crosses)]
         return Solved(own[0], left, telemetry, own[1])
 
+    def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:
+        """World positions of each garment [m] on its cage's smooth surface, not solved."""
+        cage, finest = self._cage(frames), self.levels[-1]
+        smooth = unhindered(finest.smooth_base.apply(cage.points))
+        points = self._followers.placed(smooth, cage.origin, cage.world)
+        return [points[span] for span in finest.spans]
+
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
     ) -> dict[str, float]:
