@@ -92,7 +92,7 @@ def main(level: int, after: int, names: Sequence[str]) -> None:
 
 
 def run(
-    level: int, after: int, *, travel: float, glitch: Glitch | None = None, at: int = BEFORE
+    level: int, after: int, *, travel: float, glitch: Glitch | None = None, at: int = BEFORE, first: int = 0
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
     """Refine all frames in order.
 
@@ -102,6 +102,7 @@ def run(
         travel: Angle by which folds travel in a frame [rad].
         glitch: What breaks one frame, or None.
         at: Which frame that is.
+        first: The first frame that is solved.
 
     Returns:
         Fine positions [m], shape (V, 3), and telemetry of each frame; where it failed those of the frame before.
@@ -109,7 +110,7 @@ def run(
     scene, ball = SHEET.scene(subdivisions=4)
     refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[level], lanes=2)
     told: list[tuple[np.ndarray, dict[str, Any]]] = []
-    for index in range(at + 1 + after):
+    for index in range(first, at + 1 + after):
         points = SHEET.draped(0.002, travel * index) + index * DRIFT
         frame = Frame(float(index), (GarmentFrame(points, PRESETS["jersey"]),), (ball,))
         frame = glitch(frame) if glitch is not None and index == at else frame

@@ -64,12 +64,11 @@ def test_a_dry_run_follows_it(tmp_path: Path) -> None:
     assert checked(json.loads(refine(shot, tmp_path / "fine.usdc", dry_run=True).to_json()))["out"] is None
 
 
-@pytest.mark.parametrize("options", [{"garments": ["/World/gone"]}, {"frames": (2.0, 2.0)}])
-def test_a_run_that_fails_writes_one(tmp_path: Path, options: dict[str, Any]) -> None:
-    """Without its garment, or without its only frame."""
+def test_a_run_that_fails_writes_one(tmp_path: Path) -> None:
+    """Without its only frame."""
     shot, file = cloth_shot(tmp_path / "s.usda", broken={2.0: float("nan")}), tmp_path / "report.json"
     with pytest.raises(PhysGraphError) as error:
-        refine(shot, tmp_path / "fine.usdc", report=file, **options)
+        refine(shot, tmp_path / "fine.usdc", report=file, frames=(2.0, 2.0))
     report = checked(json.loads(file.read_text(encoding="utf-8")))
     assert (report["error"], report["exit_code"], report["out"]) == (str(error.value), 1, None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "s.usda"]

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import ball
 from click.testing import CliRunner
 from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, command, faults, fine, refine, sample_times
+from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import GarmentError, PhysGraphError
@@ -181,3 +183,27 @@ class TestBrokenShots:
         with pytest.raises(PhysGraphError):
             inspect_shot(path)
         assert only(tmp_path, "shot.usdc")
+
+
+def test_one_garment_that_cannot_be_solved_follows_its_cage(tmp_path: Path):
+    """A patch of 2 cm that a ball of 10 cm pushes by more than it is large, beside one that nothing touches."""
+    stage = new_stage(tmp_path / "shot.usda", metres=1.0)
+    for name, size, aside in (("patch", 0.005, 0.0), ("cloth", 0.05, 1.0)):
+        points = size * (np.asarray(sheet_points(1.0), np.float64) - sheet_points(1.0).mean(axis=0))[:, [0, 2, 1]]
+        mesh = add_sheet(stage, f"/World/{name}", times=(1.0, 2.0), default=False)
+        for time in (1.0, 2.0):
+            mesh.GetPointsAttr().Set(vec3(points + np.array([aside, 0.001 * time, 0.0])), time)
+    points, faces = ball(0.05)
+    body = UsdGeom.Mesh.Define(stage, "/World/body")
+    body.CreateFaceVertexCountsAttr([3] * len(faces))
+    body.CreateFaceVertexIndicesAttr(np.asarray(faces).ravel().tolist())
+    body.CreatePointsAttr().Set(vec3(points - [0.0, 0.02, 0.0]))
+    body.GetPrim().AddAppliedSchema(COLLIDER_API)
+    shot, out = Path(save(stage)), tmp_path / "fine.usdc"
+    report = refine(shot, out)
+    assert (report.exit_code, report.failed) == (3, {})
+    assert {entry["path"] for entry in report.unsettled if entry["error"]} == {"/World/patch"}
+    assert any("</World/patch> at time code 1: " in each and "follows its cage" in each for each in report.warnings)
+    assert faults(out, shot) == []
+    assert fine(shot, out, 2.0, prim="/World/patch")[:, 1].max() < 0.01
+    assert report.frames[1]["garments"][1]["levels"]

@@ -202,6 +202,17 @@ class FrameBodies:
             tracks.append(Track(each.surface, shift, offset, side, base, known, longest, inside=closest))
         return FrameBodies(tuple(touching), tuple(tracks), settings)
 
+    def depths(self, finest: Level) -> list[tuple[float, str]]:
+        """For each garment of the finest level that is wholly in a body, how deep on the mean [m], and in which."""
+        found = [(0.0, "")] * len(finest.spans)
+        for each, track in zip(self.touching, self.tracks, strict=True):
+            for index, span in enumerate(finest.spans):
+                if each.surface.closed and span.stop > span.start and bool((track.known[span] < 0).all()):
+                    x = track.at[span] + track.shift
+                    near = each.surface.closest(x, torch.full_like(x[:, 0], float("inf")))
+                    found[index] = max(found[index], (float(near.distance.mean()), each.path))
+        return found
+
     def measure(
         self,
         finest: Level,

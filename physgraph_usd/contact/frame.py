@@ -214,6 +214,11 @@ class FrameContact:
         return out if seam is None or out is self._coarse else seam.closed(out)
 
     @property
+    def depths(self) -> list[tuple[float, str]]:
+        """As `FrameBodies.depths`; nothing without bodies."""
+        return [] if self._bodies is None else self._bodies.depths(self._levels[-1])
+
+    @property
     def crossed(self) -> bool:
         """Whether the cage crosses itself."""
         return self._crossed

@@ -101,6 +101,7 @@ class Group:
             SolveError: A term of the potential is not finite.
         """
         problem = self._problem(given, state)
+        self._refuse_swallowed(given, problem)
         prepared = time.perf_counter()
         try:
             x, reports, module, chosen = self._descend(problem)
@@ -307,6 +308,15 @@ class Group:
         if who not in self._integrators:
             self._integrators[who] = choice.integrator(build)
         return self._integrators[who]
+
+    def _refuse_swallowed(self, given: FrameInput, problem: Problem) -> None:
+        """Refuse cloth wholly in a body, deeper than it is large: pushed out, it would be nowhere near its cage."""
+        depths = [] if problem.contact is None else problem.contact.depths
+        for garment, frame, (deep, body) in zip(self.garments, given.garments, depths, strict=False):
+            size = float(np.linalg.norm(np.ptp(frame.points, axis=0))) if len(frame.points) else 0.0
+            if deep > size:
+                said = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
+                raise SolveError(f"{named([garment], given.at)}: {said}; mend the one or the other there")
 
     def _scaled(self, given: FrameInput, aim: Tensor, x: Placed, *, view: LevelContact | None) -> Placed:
         """The result with its detail scaled as asked for, within bounds, as far as nothing newly crosses."""
