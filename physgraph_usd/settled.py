@@ -10,6 +10,8 @@ from typing import Any
 from .integrate.solve import FAR
 from .words import counted
 
+ROUNDING = 1e-3
+"""Part of an energy that counts for nothing: sums are in single precision."""
 COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
 
 
@@ -117,24 +119,49 @@ def told_contact(path: str, entries: Mapping[float | None, Mapping[str, Any]]) -
         path: The garment.
         entries: Its telemetry by time code.
     """
-    found: dict[str, dict[float | None, tuple[int, int]]] = {}
+    found: dict[tuple[str, str], dict[float | None, tuple[int, int]]] = {}
     for time, entry in entries.items():
         contact = entry.get("contact", {})
-        found.setdefault("edges pass through cloth", {})[time] = _counts(contact.get("cloth", {}), "crossings")
+        found.setdefault(("edge", "through cloth"), {})[time] = _counts(contact.get("cloth", {}), "crossings")
         for body, told in contact.get("bodies", {}).items():
-            found.setdefault(f"edges pass through <{body}>", {})[time] = _counts(told, "crossings")
-            found.setdefault(f"vertices are left inside <{body}>", {})[time] = _counts(told, "inside")
-            passing = f"vertices are inside <{body}>, which lies between them and where the cage has them"
-            found.setdefault(passing, {})[time] = _counts(told, "passing")
+            found.setdefault(("edge", f"through <{body}>"), {})[time] = _counts(told, "crossings")
+            found.setdefault(("vertex", f"inside <{body}>"), {})[time] = _counts(told, "inside")
+            passing = f"inside <{body}>, which lies between cloth and where the cage has it"
+            found.setdefault(("vertex", passing), {})[time] = _counts(told, "passing")
     said = []
-    for what, counts in found.items():
+    for (noun, where), counts in found.items():
         left = {time: count for time, count in counts.items() if count[1]}
         if left:
             worst = max(left, key=lambda time: left[time][1])
+            (before, after), code = left[worst], "default" if worst is None else f"{worst:g}"
+            what = counted(after, noun, "vertices" if noun == "vertex" else "")
             others = f", and fewer in {counted(len(left) - 1, 'other frame')}" if len(left) > 1 else ""
-            code, (before, after) = "default" if worst is None else f"{worst:g}", left[worst]
-            said.append(f"<{path}> at time code {code}: {after:,} {what}, of {before:,} in the input{others}")
+            said.append(f"<{path}> at time code {code}: {what} left {where} ({before:,} in the input){others}")
     return said
+
+
+def told_energy(path: str, entries: Mapping[float | None, Mapping[str, Any]]) -> list[str]:
+    """A warning where refined cloth has more energy than its upsampled cage, with the worst frame.
+
+    No descent ends above its start, but warm frames start from the last one's detail, and what is pushed out of bodies
+    or drawn apart pays for it.
+
+    Args:
+        path: The garment.
+        entries: Its telemetry by time code.
+    """
+    worse: dict[float | None, tuple[float, float]] = {}
+    for time, entry in entries.items():
+        before, after = (sum((entry.get("energy_joules") or {}).get(side, {}).values()) for side in ("input", "output"))
+        if after > (1.0 + ROUNDING) * before:
+            worse[time] = before, after
+    if not worse:
+        return []
+    worst = max(worse, key=lambda time: worse[time][1] - worse[time][0])
+    (before, after), code = worse[worst], "default" if worst is None else f"{worst:g}"
+    others = f"; so it is in {counted(len(worse) - 1, 'other frame')}" if len(worse) > 1 else ""
+    said = f"its energy is {after:.3g} J, its upsampled cage's {before:.3g} J; more --steps may help"
+    return [f"<{path}> at time code {code}: {said}{others}"]
 
 
 def _counts(told: Mapping[str, Any], name: str) -> tuple[int, int]:

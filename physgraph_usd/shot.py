@@ -32,7 +32,7 @@ from .pipeline import Refiner
 from .processes import call_each, memory_is_named
 from .report import LOG, NOTICE, SIGNALLED, RefineReport, is_of_failure
 from .resolution import too_coarse
-from .settled import told_contact, told_unsettled, unsettled_frames
+from .settled import told_contact, told_energy, told_unsettled, unsettled_frames
 from .untagged import AUTO, open_with_colliders
 from .usd.atomic import check_place
 from .usd.chunk import Chunk, chunk_of
@@ -503,7 +503,8 @@ def _resumed(frames: FrameFolder, count: int, run_up: int) -> list[str]:
         return [f"{dropped} of a run that was interrupted {one} solved anew; --resume would have used {them}"]
     if not frames.kept:
         return []
-    how = f", each stretch after {counted(run_up, 'frame')} solved again" if run_up else ""
+    again = f", each stretch after {counted(run_up, 'frame')} solved again" if run_up else ""
+    how = f"{again}; folds that can lie in several ways may lie otherwise there than in an undisturbed run"
     kept = f"{len(frames.kept)} of {counted(count, 'frame')}"
     return [f"{kept} are those of a run that was interrupted; the others are solved{how}"]
 
@@ -540,6 +541,7 @@ def _of_frames(report: RefineReport) -> list[str]:
         *_of_garments(report, told_broken, "broken_before"),
         *_of_garments(report, told_jumped, "jumped_from"),
         *_of_garments(report, told_contact),
+        *_of_garments(report, told_energy),
         *told_unsettled(report.unsettled),
     ]
 

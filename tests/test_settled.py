@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from shots import CLOTH, cloth_shot, command, refine
 
-from physgraph_usd.settled import unsettled
+from physgraph_usd.report import RefineReport
+from physgraph_usd.settled import told_contact, told_energy, unsettled
 
 
 def told(level: int, remaining: float, stopped: str = "steps") -> dict[str, Any]:
@@ -70,3 +71,45 @@ def test_strict_counts_in_the_exit_code(gentle: Path, tmp_path: Path, steps: int
     done = command("refine", gentle, "-o", out, "--level", 1, "--steps", steps, "--strict")
     assert (done.returncode, out.is_file()) == (code, True)
     assert ("did not settle" in done.stderr) == (code == 3)
+
+
+def entry(side: str, before: int, after: int) -> dict[str, Any]:
+    told = {"before": {"crossings": before, "inside": 0}, "after": {"crossings": after, "inside": 0}}
+    return {"contact": {"cloth": told} if side == "cloth" else {"bodies": {side: told}}}
+
+
+class TestContact:
+    def test_what_is_left_in_bodies_is_told_of_as_in_cloth_with_what_there_was(self):
+        said = told_contact(
+            "/A", {1.0: entry("/Body", 1196, 174), 2.0: entry("/Body", 10, 1), 3.0: entry("/Body", 9, 0)}
+        )
+        assert said == [
+            "</A> at time code 1: 174 edges left through </Body> (1,196 in the input), and fewer in 1 other frame"
+        ]
+        assert told_contact("/A", {1.0: entry("cloth", 3, 1)}) == [
+            "</A> at time code 1: 1 edge left through cloth (3 in the input)"
+        ]
+
+    @pytest.mark.parametrize(("after", "code"), [(0, 0), (10, 0), (11, 3)])
+    def test_a_strict_run_leaves_a_tenth_at_most(self, after: int, code: int):
+        for side in ("cloth", "/Body"):
+            frames = [
+                {"time": 1.0, "garments": [entry(side, 60, 0)]},
+                {"time": 2.0, "garments": [entry(side, 40, after)]},
+            ]
+            report = RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=frames)
+            assert report.exit_code == 0
+            report.strict = True
+            assert report.exit_code == code
+
+
+def test_a_frame_above_its_input_is_told_of():
+    """A guide of 1e6 moves with a cage that carried detail does not follow at once."""
+
+    def energies(before: float, after: float) -> dict[str, Any]:
+        return {"energy_joules": {"input": {"stretch": before}, "output": {"stretch": after}}}
+
+    entries = {1.0: energies(1e-3, 1e-3), 2.0: energies(1.9e-5, 3.2e-4), 3.0: energies(1e-3, 1.1e-3), 4.0: {}}
+    (said,) = told_energy("/A", entries)
+    assert said.startswith("</A> at time code 2: its energy is 0.00032 J, its upsampled cage's 1.9e-05 J")
+    assert said.endswith("so it is in 1 other frame")

@@ -164,7 +164,11 @@ layer_options = together(
     _layer("--velocities", is_flag=True, help="Write point velocities even where the shot has none."),
     _layer("--heat-map", is_flag=True, help="Also write depth inside bodies and crossings as primvars."),
     asset_paths_option,
-    _layer("--strict", is_flag=True, help="Exit with 3 where a frame did not settle."),
+    _layer(
+        "--strict",
+        is_flag=True,
+        help="Exit with 3 where a frame did not settle or over a tenth of what crossed is left.",
+    ),
 )
 file_options = together(
     _files("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot."),

@@ -17,7 +17,10 @@ PATIENCE = 4
 
 
 class Guard:
-    """Wraps any integrator; with it no result is worse than the input, whatever the integrator proposes.
+    """Wraps any integrator; with it no descent ends above its start, whatever the integrator proposes.
+
+    That is the upsampled cage in a cold frame, and in a warm one the last frame's detail: a frame that ends above its
+    upsampled cage is warned of (`settled.told_energy`).
 
     A step that raises the energy is truncated where it turns triangles (`truncation`), then halved, quartered, and
     replaced by a step along H0^-1 F with a line search.
