@@ -109,7 +109,12 @@ def test_a_frame_above_its_input_is_told_of():
     def energies(before: float, after: float) -> dict[str, Any]:
         return {"energy_joules": {"input": {"stretch": before}, "output": {"stretch": after}}}
 
-    entries = {1.0: energies(1e-3, 1e-3), 2.0: energies(1.9e-5, 3.2e-4), 3.0: energies(1e-3, 1.1e-3), 4.0: {}}
+    entries: dict[float | None, dict[str, Any]] = {
+        1.0: energies(1e-3, 1e-3),
+        2.0: energies(1.9e-5, 3.2e-4),
+        3.0: energies(1e-3, 1.1e-3),
+        4.0: {},
+    }
     (said,) = told_energy("/A", entries)
     assert said.startswith("</A> at time code 2: its energy is 0.00032 J, its upsampled cage's 1.9e-05 J")
     assert said.endswith("so it is in 1 other frame")
