@@ -115,11 +115,6 @@ def test_a_frame_above_its_input_is_told_of():
         3.0: energies(1e-3, 1.1e-3),
         4.0: {},
     }
-        1.0: energies(1e-3, 1e-3),
-        2.0: energies(1.9e-5, 3.2e-4),
-        3.0: energies(1e-3, 1.1e-3),
-        4.0: {},
-    }
     (said,) = told_energy("/A", entries)
     assert said.startswith("</A> at time code 2: its energy is 0.00032 J, its upsampled cage's 1.9e-05 J")
     assert said.endswith("so it is in 1 other frame")
