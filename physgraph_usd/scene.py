@@ -17,7 +17,19 @@ from .mesh.topology import PolygonMesh
 FARTHEST = 1e9
 """Farthest that a point may be from the world's origin along an axis [m]. Products of four lengths below it, such as
 squared areas, are finite in float32; the hierarchies that kernels build end the process where a box is not."""
-_REMEDY = "check metersPerUnit and the transforms above it, cache that frame again, or leave it out with --frames"
+RESOLVED = 0.1
+"""Part of an edge that single precision must tell apart where the farthest vertex is: about the garment's mean the
+solver's positions have 24 bits, and with less than that nothing of the cloth is left in them."""
+FALLS = 4.0
+"""Its sizes by which a garment may sink: a layer whose cloth is farther from its cage than one is invalid."""
+SPECK = 0.1
+"""Size under which a garment's units are in doubt before its guide is [m]."""
+OUTGROWN = 1e3
+"""Median edges of the rest shape above which those of a cage are not of stretched cloth: it rests as a speck."""
+_REMEDY = (
+    "check metersPerUnit, the rest shape (--rest) and the transforms above it, cache that frame again, or leave it out "
+    "with --frames"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +167,53 @@ def refuse_far(scene: Scene, frame: Frame) -> None:
         GarmentError: With the prim, the time code and the point.
     """
     for garment, own in zip(scene.garments, frame.garments, strict=True):
-        if said := out_of_bounds(own.points):
+        if said := out_of_bounds(own.points) or _unsolvable(garment, own.points):
             raise GarmentError(garment.path, said, time=frame.time, remedy=_REMEDY)
     for collider, pose in zip(scene.colliders, frame.colliders, strict=False):
         corners = np.zeros((0, 3)) if pose is None else pose.corners()
         if said := out_of_bounds(corners[~np.isnan(corners).any(axis=1)]):
             raise GarmentError(collider.path, said, time=frame.time, remedy=_REMEDY)
+
+
+def _unsolvable(garment: Garment, points: np.ndarray) -> str:
+    """Why no solve on a cage could end well, in words; or "".
+
+    Its rest shape is a speck, or a vertex is so far from the others that single precision has no room for their edges.
+    """
+    ends = garment.mesh.half_edges.edges
+    if not len(ends) or len(points) != len(garment.rest):
+        return ""
+    now, rest = (
+        float(np.median(np.linalg.norm(x[ends[:, 1]] - x[ends[:, 0]], axis=1))) for x in (points, garment.rest)
+    )
+    if now > OUTGROWN * rest > 0:
+        return f"the cage's edges are of {now:.3g} m, those of its rest shape, to which cloth shrinks, of {rest:.3g} m"
+    edge = max(now, rest)
+    used = np.zeros(len(points), bool)
+    used[ends] = True
+    away = np.where(used, np.linalg.norm(points - points[used].mean(axis=0), axis=1), 0.0)
+    if np.finfo(np.float32).eps * away.max() <= RESOLVED * edge:
+        return ""
+    farthest = int(away.argmax())
+    return f"point {farthest} is {away[farthest]:g} m from the garment's middle, whose edges are of {edge:g} m"
+
+
+def refuse_falling(scene: Scene, frame: Frame) -> None:
+    """Refuse a frame in which a garment would fall out of its shot: nothing holds it but too weak a guide.
+
+    Without pins, bodies and other garments it sinks by its weight over the guide's stiffness.
+
+    Raises:
+        GarmentError: It would sink by `FALLS` times its own size.
+    """
+    if len(scene.garments) > 1:
+        return
+    for garment, own in zip(scene.garments, frame.garments, strict=True):
+        weight = own.fabric.density * float(np.linalg.norm(scene.gravity))
+        held = garment.colliders or (garment.pin > 0).any() or not len(own.points)
+        size = max(SPECK, *(float(np.ptp(x, axis=0).max(initial=0.0)) for x in (own.points, garment.rest)))
+        stiffness = own.guide * float(garment.guide_scale.mean())
+        if not held and weight > FALLS * size * stiffness:
+            sinks = "without end" if stiffness == 0 else f"by {weight / stiffness:.3g} m"
+            said = f"nothing holds it up but a guide of {own.guide:g} N/m^3: it would sink {sinks}"
+            raise GarmentError(garment.path, said, time=frame.time, remedy="raise physgraph:guide:stiffness, or pin it")

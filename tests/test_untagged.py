@@ -83,6 +83,11 @@ def test_auto_takes_it_and_what_is_marked(stage: Usd.Stage, tmp_path: Path):
     assert not any("does not feel" in said for said in report.warnings)
 
 
+def test_cloth_that_a_solver_held_two_centimetres_away_lies_on_it(stage: Usd.Stage):
+    add_box(stage, points=UNDER - np.array([0.0, 0.0, 0.1]))
+    assert any("does not feel" in said for said in inspect_shot(save(stage))["warnings"])
+
+
 def away(stage: Usd.Stage) -> None:
     add_box(stage, points=UNDER - np.array([0.0, 0.0, 1.0]))
 

@@ -22,6 +22,9 @@ _CONTROLS = {
     "orientation": ("rightHanded", "leftHanded"),
 }
 _SPLIT = "export the garment with one topology, or split the shot where it changes and use --frames"
+MOST_CORNERS, MOST_TWICE = 2000, 64
+"""Corners of a face beyond which a garment is refused, and of one that is there twice: subdivision joins all of them at
+one vertex, and what is near what there grows with their square. 2,000 take seconds, 500 twice half a minute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,7 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
     keep[known] = False
     if not keep.any():
         raise GarmentError(path, f"every one of its {len(counts)} faces is a hole", remedy="clear holeIndices")
+    _refuse_large_faces(path, counts, indices, keep)
     kept_indices = indices[np.repeat(keep, counts)]
     mesh = PolygonMesh(counts[keep], kept_indices, vertex_count)
     return Cage(mesh, np.flatnonzero(keep).astype(np.int32), (*notices, *_not_carried(usd), *_odd_controls(usd)))
@@ -121,6 +125,19 @@ def check_topology(
         corner = int(outside[0])
         said = f"faceVertexIndices[{corner}] is {indices[corner]} but there are {vertex_count} points"
         raise GarmentError(path, said, time=time, remedy=remedy)
+
+
+def _refuse_large_faces(path: str, counts: np.ndarray, indices: np.ndarray, keep: np.ndarray) -> None:
+    """Refuse faces of so many corners that no solve ends, or fewer where one lies on another."""
+    starts, known = np.cumsum(counts) - counts, dict[bytes, int]()
+    for face in np.flatnonzero(keep & (counts > MOST_TWICE)).tolist():
+        count = int(counts[face])
+        remedy = "remesh it, or triangulate it"
+        if count > MOST_CORNERS:
+            raise GarmentError(path, f"face {face} has {count:,} corners; {MOST_CORNERS:,} are the most", remedy=remedy)
+        first = known.setdefault(np.sort(indices[starts[face] :][:count]).tobytes(), face)
+        if first != face:
+            raise GarmentError(path, f"faces {first} and {face} have the same {count} corners", remedy="remove one")
 
 
 def _left_out(path: str, keep: np.ndarray, unknown_holes: int) -> list[Notice]:

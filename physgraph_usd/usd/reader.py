@@ -20,7 +20,7 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from ..errors import AbsentError, SchemaError, StageError, UsageError
-from ..scene import Frame, Scene, refuse_far
+from ..scene import Frame, Scene, refuse_falling, refuse_far
 from .apart import read_apart
 from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots
@@ -147,6 +147,7 @@ class Shot:
         self._tell(told)
         frame = Frame(time, tuple(garments), tuple(poses))
         refuse_far(self.scene, frame)
+        refuse_falling(self.scene, frame)
         return frame
 
     def with_values(self, overrides: Sequence[str]) -> Shot:

@@ -272,9 +272,14 @@ def check_there(path: str | Path) -> None:
 
     Raises:
         AbsentError: It is not.
+        StageError: It is a pipe or a folder.
     """
     if not is_there(path):
         raise AbsentError(f"no such file: {path}")
+    if not Sdf.Layer.IsAnonymousLayerIdentifier(str(path)):
+        found = Path(str(Ar.GetResolver().Resolve(str(path))))
+        if found.exists() and not found.is_file():
+            raise StageError(f"{path} is no file" + (": it is a pipe, which has no end" if found.is_fifo() else ""))
 
 
 def is_sound(layer: Sdf.Layer) -> bool:

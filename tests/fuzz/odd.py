@@ -74,7 +74,7 @@ def _variants(draft: Draft) -> None:
 def _large_face(draft: Draft) -> None:
     """A face of hundreds or thousands of corners, round or crumpled, for cloth or a body."""
     stage = draft.open()
-    mesh, count = a_mesh(draft, stage), draft.pick([50, 300, 1000, 2000])
+    mesh, count = a_mesh(draft, stage), draft.pick([50, 250, 1000, 6000])
     angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle), 0.1 * np.sin(3.0 * angle)], axis=1)
     if draft.chance(0.2):
@@ -83,7 +83,11 @@ def _large_face(draft: Draft) -> None:
         mesh.GetPointsAttr().Set(_vectors(ring), code)
     mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count]))
     mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.arange(count, dtype=np.int32)))
-    draft.save(stage, f"{mesh.GetPath()}: one face of {count} corners")
+    twice = draft.chance(0.3)
+    if twice:
+        mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count, count]))
+        mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.tile(np.arange(count, dtype=np.int32), 2)))
+    draft.save(stage, f"{mesh.GetPath()}: one face of {count} corners" + ", twice" * twice)
 
 
 def _flat_bodies(draft: Draft) -> None:
@@ -104,15 +108,17 @@ def _glitch(draft: Draft) -> None:
     """One sample gone wrong: all points equal, a hundred times its size, turned inside out, far away, or torn."""
     stage = draft.open()
     mesh = a_mesh(draft, stage)
-    code = draft.pick(_times(mesh)[1:] or _times(mesh))
+    code = draft.pick(_times(mesh))
     points = numbers(mesh.GetPointsAttr().Get(code)).astype(np.float64).reshape(-1, 3)
-    how = draft.pick(["equal", "size", "inside out", "far", "torn", "body eightfold"])
+    how = draft.pick(["equal", "size", "inside out", "far", "torn", "body eightfold", "speck", "one far"])
     centre = points.mean(axis=0)
     changed = {
         "equal": lambda: np.broadcast_to(centre, points.shape),
         "size": lambda: centre + draft.pick([1e-3, 100.0]) * (points - centre),
         "inside out": lambda: centre - (points - centre),
         "far": lambda: points + draft.pick([10.0, 1e4]),
+        "speck": lambda: 1e-6 * points,
+        "one far": lambda: np.vstack([points[:-1], [1e9, 0.0, 0.0]]),
         "torn": lambda: points + draft.rng.standard_normal(points.shape),
         "body eightfold": lambda: centre + 8.0 * (points - centre),
     }[how]()
