@@ -182,13 +182,13 @@ def test_a_body_scaled_to_nothing_holds_no_report_up(tmp_path: Path):
     assert (tmp_path / "report" / "report.html").is_file()
 
 
-def test_a_face_of_two_thousand_corners_takes_seconds(tmp_path: Path):
+def test_a_face_of_a_thousand_corners_takes_seconds(tmp_path: Path):
     stage = new_stage(tmp_path / "shot.usda")
-    angle = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
+    angle = np.linspace(0.0, 2.0 * np.pi, 1000, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     mesh = UsdGeom.Mesh.Define(stage, CLOTH)
-    mesh.CreateFaceVertexCountsAttr([2000])
-    mesh.CreateFaceVertexIndicesAttr(list(range(2000)))
+    mesh.CreateFaceVertexCountsAttr([1000])
+    mesh.CreateFaceVertexIndicesAttr(list(range(1000)))
     mesh.CreatePointsAttr(vec3(ring))
     mesh.GetPrim().AddAppliedSchema(GARMENT_API)
     save(stage)
@@ -196,5 +196,5 @@ def test_a_face_of_two_thousand_corners_takes_seconds(tmp_path: Path):
     done = command("refine", tmp_path / "shot.usda", "-o", tmp_path / "out.usdc", "--level", 1)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert done.returncode == 0, done.stderr
-    # 45 s and 1.5 GB where clusters of faces looked one another up one by one.
-    assert after.ru_utime - before.ru_utime < 25.0
+    # Twice as many took 45 s and 1.5 GB where clusters of faces looked one another up one by one.
+    assert after.ru_utime - before.ru_utime < 12.0

@@ -95,8 +95,8 @@ def _corners(clusters: Clusters) -> tuple[np.ndarray, np.ndarray]:
     """The first corner of each cluster, and the vertices of its parts, each once."""
     owned = [
         np.stack([np.repeat(np.arange(clusters.count), np.diff(first.numpy())), vertex], axis=1)
-        for first, parts in (clusters.vertices, clusters.edges[:2], clusters.faces[:2])
-        for vertex in parts.numpy().reshape(len(parts), -1).T
+        for width, (first, parts) in enumerate((clusters.vertices, clusters.edges[:2], clusters.faces[:2]), start=1)
+        for vertex in parts.numpy().reshape(-1, width).T
     ]
     cluster, vertex = np.unique(np.concatenate(owned), axis=0).T
     return np.searchsorted(cluster, np.arange(clusters.count + 1)), vertex

@@ -22,9 +22,10 @@ _CONTROLS = {
     "orientation": ("rightHanded", "leftHanded"),
 }
 _SPLIT = "export the garment with one topology, or split the shot where it changes and use --frames"
-MOST_CORNERS, MOST_TWICE = 2000, 64
+MOST_CORNERS, MOST_TWICE = 1000, 64
 """Corners of a face beyond which a garment is refused, and of one that is there twice: subdivision joins all of them at
-one vertex, and what is near what there grows with their square. 2,000 take seconds, 500 twice half a minute."""
+one vertex, and what is near what there grows with their square. 1,000 take seconds, 2,000 on a body a minute, 500 twice
+half a minute."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,7 +149,7 @@ def check_metadata(stage: Usd.Stage) -> None:
     for key, (what, positive) in _NUMBERS.items():
         value = root_metadata(stage, key)
         number = float(value) if isinstance(value, int | float) else math.nan
-        if value is not None and not (math.isfinite(number) and (number > 0 or not positive)):
+        if value is not None and not (1.0 / _HUGE < number < _HUGE if positive else math.isfinite(number)):
             raise StageError(f"{key} of the stage is {in_brief(value)}, which is no {what}, in its root layer")
     if said := bad_rate(stage):
         raise StageError(said)
@@ -158,12 +158,14 @@ def check_metadata(stage: Usd.Stage) -> None:
 def bad_rate(stage: Usd.Stage) -> str:
     """What is wrong with the time codes per second of a stage's layers, "" where nothing is: USD may not come back."""
     for layer in sorted(stage.GetUsedLayers(), key=lambda layer: layer.anonymous):
-        if not 0 < layer.timeCodesPerSecond < math.inf:
+        if not 1.0 / _HUGE < layer.timeCodesPerSecond < _HUGE:
             name, rate = layer.GetDisplayName(), layer.timeCodesPerSecond
             return f"timeCodesPerSecond of @{name}@ is {rate:g}; author the shot's rate, such as 24"
     return ""
 
 
+_HUGE = 1e15
+"""Sizes and rates of a stage are less than this, and more than its inverse: single precision holds what they scale."""
 _RATE = "rate; author one above 0, such as 24"
 _TIME = "time code; author one or remove it"
 _NUMBERS = {
