@@ -117,7 +117,6 @@ def run(
         try:
             state = refiner.solve(frame)
         except PhysGraphError:
-            refiner.forget()
             told.append(told[-1] if told else (points, {}))
             continue
         assert state.points[0] is not None

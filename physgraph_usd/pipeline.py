@@ -20,7 +20,7 @@ from .contact.passed import Passed
 from .deadline import ends_after, is_over
 from .errors import GarmentError, SolveError
 from .frame.group import Group
-from .frame.values import FrameInput, join, split
+from .frame.values import FrameInput, Solved, join, split
 from .history import Known, bodies_moved, came_back, jumped_in
 from .level import refine_garments
 from .mesh.subdivide import Refinement
@@ -344,26 +344,31 @@ class Refiner:
         entry |= {"start": "cold: the time between samples is too long"} if gap else {}
         entry |= {} if cage is None else {"start": f"cold: the cage walked here from time code {cage[1]:g}"}
         entry |= {} if broken is None else {"broken_before": broken}
-        entry |= {"time_limit": float(f"{self._limit:.3g}")} if is_over() else {}
         entry |= (
             {} if jumped is None else {"jumped_from": jumped, "start": "cold: the first frame is unlike the others"}
         )
-        own = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
-        for place, (index, each) in enumerate(zip(part, frames, strict=True)):
-            first = self._last[index] is None
-            self._before[index] = self._last[index] if broken is None else last[place]
-            self._last[index] = Known(
-                frame.time,
-                each,
-                frame.colliders,
-                near,
-                part,
-                solved.points[place],
-                own[place],
-                solved.crossing[place],
-                first,
-            )
+        entry |= {"time_limit": float(f"{self._limit:.3g}")} if is_over() else {}
+        self._keep(part, frame, near, solved, before=last if broken is not None else None)
         return solved.points, [entry] * len(part)
+
+    def _keep(
+        self,
+        part: tuple[int, ...],
+        frame: Frame,
+        near: tuple[int, ...],
+        solved: Solved,
+        *,
+        before: Sequence[Known | None] | None,
+    ) -> None:
+        """Keep what the next frame of garments needs, and the frame before this: the last one, or what is given."""
+        group = self.group_of(part)
+        own = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
+        last = [self._last[index] for index in part]
+        kept = zip(part, last, last if before is None else before, solved.points, own, solved.crossing, strict=True)
+        for index, known, earlier, points, state, crossing in kept:
+            at = frame.time, frame.garments[index], frame.colliders, near, part
+            self._before[index] = earlier
+            self._last[index] = Known(*at, points, state, crossing, first=known is None)
 
     def _cage_walked(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
         """World positions of cages that another refiner walked to this frame [m], and from which time code."""

@@ -97,6 +97,7 @@ def test_every_odd_stage_is_inspected_without_a_traceback(real_data: Path):
             assert result.stderr.startswith("error: "), path
 
 
+@pytest.mark.slow
 def test_every_odd_stage_refines_or_says_why_not(real_data: Path, tmp_path: Path):
     """Every mesh is taken for a garment; what cannot be refined leaves nothing."""
     done = 0
@@ -107,7 +108,7 @@ def test_every_odd_stage_refines_or_says_why_not(real_data: Path, tmp_path: Path
         result = run("refine", path, "-o", out, "--garment", "/**", "--level", "1", "--steps", "2")
         assert result.exception is None or isinstance(result.exception, SystemExit), (path, result.exception)
         assert "Traceback" not in result.output, path
-        if result.exit_code == 0:
+        if result.exit_code in (0, 3):  # 3 where a garment could not be solved in so few steps and follows its cage.
             done += 1
             assert faults(out, path) == [], path
         else:

@@ -232,11 +232,13 @@ class TestReport:
 
     def test_a_run_that_fails_is_told(self, stage: Usd.Stage, tmp_path: Path):
         told: list[RefineReport] = []
-        options = RefineOptions(**FAST, garments=["/World/gone"], report=tmp_path / "report.json")
-        with pytest.raises(pg.StageError, match="gone"):
+        options = RefineOptions(**FAST, report=tmp_path / "report.json")
+        stage.SetTimeCodesPerSecond(0.0)
+        with pytest.raises(pg.StageError, match="timeCodesPerSecond"):
             refine_stage(stage, options, on_report=told.append)
-        assert "gone" in told[0].error
+        assert "timeCodesPerSecond" in told[0].error
         assert json.loads((tmp_path / "report.json").read_text())["exit_code"] == 1
+        stage.SetTimeCodesPerSecond(24.0)
         refine_stage(stage, RefineOptions(**FAST, report=tmp_path / "report.json"))
         assert json.loads((tmp_path / "report.json").read_text())["exit_code"] == 0
 
