@@ -113,6 +113,7 @@ def test_auto_is_what_it_chose_to_the_bit(level: int, same: str, steps: int):
     assert sorted({each["level"] for each in auto.telemetry[0]["levels"]}) == ([1] if level == 1 else [0, 1, 2])
 
 
+@pytest.mark.slow
 def test_cloth_near_cloth_goes_through_the_cage_and_is_solved_as_if_never_asked():
     lower, upper = square(8), square(8)
     tilted = upper[1] + np.outer(0.3 * upper[1][:, 0] + 0.003, [0.0, 1.0, 0.0])

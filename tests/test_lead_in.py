@@ -31,6 +31,7 @@ def test_nothing_crosses_in_frames_whose_cages_cross(skirt: Path, tmp_path: Path
     assert all(entry["start"] == "warm" for entry in entries[1:])
 
 
+@pytest.mark.slow
 def test_one_frame_is_as_low_in_energy_as_in_the_whole_shot(skirt: Path, tmp_path: Path):
     """Nearly: the cage by itself leaves 0.2 to 0.4 J more."""
     energies = {}

@@ -31,7 +31,7 @@ def garments_of(report: RefineReport) -> Iterator[dict[str, Any]]:
     [
         ("block", (12.0, 13.0), 0.4),
         ("tshirt", (1.0, 2.0), 0.8),
-        ("layers", (1.0, 30.0), 0.1),
+        pytest.param("layers", (1.0, 30.0), 0.1, marks=pytest.mark.slow),
         ("crossing", (1.0, 2.0), 0.3),
     ],
 )

@@ -156,7 +156,7 @@ def test_a_sample_with_all_points_at_one_place_loses_no_layer(tmp_path: Path, ti
     assert refine(shot, tmp_path / "out.usdc").exit_code == 0
 
 
-@pytest.mark.parametrize("name", ["sleeve", "torus"])
+@pytest.mark.parametrize("name", [pytest.param("sleeve", marks=pytest.mark.slow), "torus"])
 def test_a_garment_of_a_millimetre_is_refined_in_the_time_of_a_large_one(tmp_path: Path, name: str):
     shot = write_sample(name, tmp_path)
     stage = Usd.Stage.Open(str(shot))

@@ -141,7 +141,7 @@ def test_a_shot_that_is_cut_short_while_it_is_read_is_named(tmp_path: Path, part
     assert done.returncode == 0, done.stderr
     assert "shot.usdc" in done.stdout
     assert "\n" not in done.stdout
-    assert only(tmp_path, "shot.usdc")
+    assert only(tmp_path, "shot.usdc", "fine.usdc.frames")
 
 
 @pytest.mark.parametrize(("place", "patch"), [(248, b"\x01"), (244, bytes(8)), (128, bytes(8))])

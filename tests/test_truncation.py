@@ -135,6 +135,7 @@ def test_more_steps_do_not_end_higher(real_data: Path):
     assert energies[1] < 5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_cloth_between_what_touches_is_solved_as_if_held_there(real_data: Path):
     """As if it hung free it would have moved by 60 edges at once, and 48 steps of the finest level moved nothing."""
