@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_shot
 
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SchemaError, StageError
+from physgraph_usd.options import RefineOptions
+from physgraph_usd.shot import refine_shot
 from physgraph_usd.usd.carry import to_numpy
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.stage import LONGEST_REASON, in_brief, pxr_errors, read_units
@@ -264,3 +267,27 @@ def test_validating_over_a_shot_that_cannot_be_read_is_a_layer_error(dressed: Us
     (tmp_path / "broken.usda").write_text("#usda 1.0\ndef {")
     with pytest.raises(PhysGraphError):
         assert validate_layer(out, tmp_path / "broken.usda")
+
+
+def test_a_painted_value_that_is_no_array_is_validated(tmp_path: Path):
+    """It has one element; counting those of it was a traceback."""
+    shot = sheet_shot(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(shot)
+    retype(stage, f"{CLOTH}.primvars:physgraph:detailScale", "double", 1.0)
+    UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(CLOTH)).GetPrimvar("physgraph:detailScale").SetInterpolation("constant")
+    stage.Save()
+    refine_shot(shot, tmp_path / "fine.usdc", RefineOptions(level=1, steps=2))
+    assert not [each for each in validate_layer(tmp_path / "fine.usdc") if each.severity == "error"]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_mesh_without_edges_is_no_traceback(tmp_path: Path, count: int):
+    """Faces all of whose corners are one vertex; the estimate looked for their edges."""
+    shot = sheet_shot(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(shot)
+    mesh = UsdGeom.Mesh.Get(stage, CLOTH)
+    mesh.GetFaceVertexCountsAttr().Set([3] * count)
+    mesh.GetFaceVertexIndicesAttr().Set([0] * 3 * count)
+    stage.Save()
+    with suppress(PhysGraphError):
+        refine_shot(shot, tmp_path / "fine.usdc", RefineOptions(level=1, steps=2, dry_run=True))

@@ -231,7 +231,7 @@ def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) 
     value = primvar.Get(code_of(time))
     if value is None:
         return ""
-    groups = np.size(np.asarray(value)) / max(primvar.GetElementSize(), 1)
+    groups = len(np.atleast_1d(np.asarray(value))) / max(primvar.GetElementSize(), 1)
     if not primvar.IsIndexed():
         return "" if groups == expected else f"has {groups:g} elements; its interpolation needs {expected}"
     indices = np.asarray(primvar.GetIndices(code_of(time)))
