@@ -51,7 +51,7 @@ np.savez(sys.argv[2], x_0_1=x, ms_0_1=ms, x_1_1=x, ms_1_1=ms)
 """A solver outside that does nothing."""
 
 OPTIONS = ChartOptions(
-    level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=0.5
+    level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=2.0
 )
 QUICK = replace(OPTIONS, budget_minutes=0.02)
 

@@ -134,6 +134,9 @@ def test_both_ends_of_each_limit_are_accepted_and_what_is_just_outside_is_named(
         for number in (limit, limit + np.sign(outwards) if row.type == "int" else beyond):
             stage = new_stage(tmp_path / f"{limit}{number != limit}.usda")
             prim = add_sheet(stage, "/World/rig/cloth").GetPrim()
+            if row.short != "pin":  # Cloth that nothing holds is refused as falling.
+                pins = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("physgraph:pin", value_type("float[]"), "constant")
+                pins.Set([1.0])
             prim = prim if row.name in {each.name for each in GARMENT.values()} else add_body(stage)
             attribute = prim.CreateAttribute(row.name, value_type(row.type))
             attribute.Set(held(row, number))

@@ -176,19 +176,19 @@ class TestGain:
         assert np.array_equal(second(1.0), second(3.0))
 
 
-TORN = Fabric(stretch=1e30)
+TORN = Fabric(stretch=1e38)
 """Cloth whose energy, pulled far within bounds, is not finite in float32."""
 
 
 class TestNotFinite:
     def test_the_error_names_prim_time_and_term(self):
         with pytest.raises(SolveError, match=r"</World/Sheet> at time code 7: .*not finite.*stretch"):
-            refiner().solve(frame_of(1e9 * wave(REST), 7.0, fabric=TORN))
+            refiner().solve(frame_of(9e2 * wave(REST), 7.0, fabric=TORN))
 
     def test_the_next_frame_can_be_solved(self):
         one = refiner()
         with pytest.raises(SolveError):
-            one.solve(frame_of(1e9 * wave(REST), 1.0, fabric=TORN))
+            one.solve(frame_of(9e2 * wave(REST), 1.0, fabric=TORN))
         one.forget()
         fresh = refiner().solve(frame_of(wave(REST), 2.0))
         assert one.solve(frame_of(wave(REST), 2.0)).points[0].tobytes() == fresh.points[0].tobytes()
