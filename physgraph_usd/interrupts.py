@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
 
-_FIRST = 128
+SIGNALLED = 128
 """A shell reports the end by a signal as this plus the signal's number."""
 _MAIN = threading.main_thread().ident
 
@@ -45,7 +45,7 @@ _SIGNALS = _Signals()
 def _leave(number: int) -> None:
     if number == signal.SIGINT:
         raise KeyboardInterrupt
-    raise SystemExit(_FIRST + number)
+    raise SystemExit(SIGNALLED + number)
 
 
 @contextmanager
@@ -84,9 +84,9 @@ def leave_if_asked() -> None:
 def exit_code_of(error: BaseException | None) -> int | None:
     """The code by which a shell reports the signal that raised an exception, or None where none did."""
     if isinstance(error, KeyboardInterrupt):
-        return _FIRST + signal.SIGINT
+        return SIGNALLED + signal.SIGINT
     code = error.code if isinstance(error, SystemExit) else None
-    return code if isinstance(code, int) and code > _FIRST else None
+    return code if isinstance(code, int) and code > SIGNALLED else None
 
 
 class Undisturbed:

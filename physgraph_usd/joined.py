@@ -77,20 +77,7 @@ def stitch(
 
 
 def check_seams(chunks: Sequence[str | Path], *, of: Path | None = None, seam_bound: float = SEAM_BOUND) -> list[Seam]:
-    """Look at the seams of chunks that follow one another, as `usd.stitch.check_seams` does, in the shot.
-
-    Args:
-        chunks: As for `stitch`.
-        of: One of them, to look at its own seams alone.
-        seam_bound: As for `stitch`.
-
-    Returns:
-        The seams, in order.
-
-    Raises:
-        UsageError: Chunks are not of one shot, version and set of options.
-        LayerError: A chunk cannot be read, or a seam moves too far.
-    """
+    """Look at the seams of chunks in the shot; arguments, result and errors are those of `usd.stitch.check_seams`."""
     with ExitStack() as stack:
         return look_at_seams(chunks, of=of, seam_bound=seam_bound, look_with=partial(_looking, stack))
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .interrupts import SIGNALLED
 from .plain_json import to_json
 from .usd.atomic import write_text
 from .version import __version__
@@ -20,10 +21,6 @@ SCHEMA = Path(__file__).with_name("report.schema.json")
 DONE, FAILED, IN_PART = 0, 1, 3
 LEFT = 0.1
 """Part of what crosses in the input that a strict run may leave."""
-SIGNALLED = 128
-"""Added to a signal's number, as shells report it."""
-NOTICE = 25
-"""Level of what a run says without being asked and is nothing wrong, between logging's INFO and WARNING."""
 LOG = logging.getLogger("physgraph_usd")
 """Where warnings and progress go, for the whole package."""
 MOST_ALONE = 3

@@ -152,6 +152,8 @@ def told_energy(path: str, entries: Mapping[float | None, Mapping[str, Any]]) ->
     """
     worse: dict[float | None, tuple[float, float]] = {}
     for time, entry in entries.items():
+        if entry.get("together", [path])[0] != path:  # Garments that are solved together have one energy.
+            continue
         before, after = (sum((entry.get("energy_joules") or {}).get(side, {}).values()) for side in ("input", "output"))
         if after > (1.0 + ROUNDING) * before:
             worse[time] = before, after

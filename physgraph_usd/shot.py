@@ -22,7 +22,7 @@ from .finished import Job, check_jobs, finished, in_order, made_from, may_be_don
 from .frames import FrameFolder, Outcome, frames_folder, kept_for
 from .history import told_broken, told_jumped
 from .integrate.metric import FACTOR
-from .interrupts import exit_code_of, signals_raise
+from .interrupts import SIGNALLED, exit_code_of, signals_raise
 from .joined import Looking, joined
 from .lead_in import cages_walked
 from .mesh.lanes import kernels_are_kept, start_warp
@@ -30,19 +30,19 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .pipeline import Refiner
 from .processes import call_each, memory_is_named
-from .report import LOG, NOTICE, SIGNALLED, RefineReport, is_of_failure
+from .report import LOG, RefineReport, is_of_failure
 from .resolution import too_coarse
 from .settled import told_contact, told_energy, told_unsettled, unsettled_frames
 from .untagged import AUTO, open_with_colliders
 from .usd.atomic import check_place
 from .usd.chunk import Chunk, chunk_of
 from .usd.files import check_targets, files_of
-from .usd.provenance import FAILED, UNSETTLED, is_result_of, write_root
+from .usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED, is_result_of, write_root
 from .usd.reader import Shot
 from .usd.stage import shot_name
 from .usd.view import Layer, Stage
 from .usd.writer import LayerWriter
-from .words import counted
+from .words import NOTICE, counted
 
 try:
     import resource
@@ -421,7 +421,13 @@ def _write_frames(
         raise SolveError(next(iter(report.failed.values())))
     report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
     start = clock.perf_counter()
-    writer.close(lacking={FAILED: list(report.failed) or None, UNSETTLED: len(report.unsettled) or None})
+    lacking = {
+        FAILED: list(report.failed) or None,
+        UNSOLVED: sum(bool(entry["error"]) for entry in report.unsettled) or None,
+        UNSETTLED: len(report.unsettled) or None,
+        CROSSED: report.crossings if report.leaves_crossings else None,
+    }
+    writer.close(lacking=lacking)
     report.seconds["close"] = clock.perf_counter() - start
     report.seconds["write"] = written
     report.warn(*map(str, writer.notices), *_of_frames(report))

@@ -24,7 +24,7 @@ COVERED = 0.9
 """Share of a part's faces inside a subset that gives it its name."""
 MOST_NAMED = 3
 LARGEST = 4.0
-"""Times its cage's size that refined cloth may have."""
+"""Times its cage's size that refined cloth may have, or its cage may have of it: the validator refuses more."""
 COLLAPSED = 0.01
 """Size of a cage over its rest shape's below which there is nothing to solve: edges that are centimetres long at rest
 are shorter there than cloth is thick, so all of it touches all of it."""
@@ -95,7 +95,8 @@ def size_left(garment: Garment, points: np.ndarray) -> float:
 
 
 def strayed(cage: np.ndarray, fine: np.ndarray) -> str:
-    """Says so where refined cloth is no more where its cage is, else "".
+    """Why refined cloth is no refinement of its cage any more, in words, or "": farther from it than it is large, or of
+    another size.
 
     Args:
         cage: Positions of the cage [m], shape (V, 3).
@@ -107,7 +108,7 @@ def strayed(cage: np.ndarray, fine: np.ndarray) -> str:
     away = float(np.linalg.norm(fine.mean(axis=0) - cage.mean(axis=0)))
     if away > size:
         return f"the refined cloth lies {1e3 * away:.4g} mm from its cage, which is {1e3 * size:.4g} mm large"
-    if own > LARGEST * size:
+    if not size / LARGEST <= own <= LARGEST * size:
         return f"the refined cloth is {1e3 * own:.4g} mm large, its cage {1e3 * size:.4g} mm"
     return ""
 

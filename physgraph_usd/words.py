@@ -1,6 +1,9 @@
-"""Words of messages: numbers of things."""
+"""Words of messages: numbers of things, and how loud they are."""
 
 from __future__ import annotations
+
+NOTICE = 25
+"""Level of what a run says without being asked and is nothing wrong, between logging's INFO and WARNING."""
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:

@@ -16,7 +16,7 @@ from shots import CLOTH, EDGE, TIMES, cloth_shot, command, faults, fine, refine,
 from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
 
 from physgraph_usd.cli import main
-from physgraph_usd.errors import GarmentError, PhysGraphError
+from physgraph_usd.errors import GarmentError, PhysGraphError, UsageError
 from physgraph_usd.shot import inspect_shot
 
 
@@ -207,3 +207,5 @@ def test_one_garment_that_cannot_be_solved_follows_its_cage(tmp_path: Path):
     assert faults(out, shot) == []
     assert fine(shot, out, 2.0, prim="/World/patch")[:, 1].max() < 0.01
     assert report.frames[1]["garments"][1]["levels"]
+    with pytest.raises(UsageError, match="exists"):  # What was done in part is not taken as done.
+        refine(shot, out, resume=True)

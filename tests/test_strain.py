@@ -14,6 +14,7 @@ from stages import GARMENT_API, new_stage, save, vec3
 from physgraph_usd.errors import GarmentError, UsageError
 from physgraph_usd.mesh.fit import median_shape
 from physgraph_usd.shot import inspect_shot
+from physgraph_usd.strain import strayed
 from physgraph_usd.usd.reader import open_shot
 
 SLEEVE = "/World/sleeve"
@@ -160,3 +161,21 @@ def test_the_command_tells_once_of_each_of_several_shots(tmp_path: Path, workers
 def test_a_rest_that_is_neither_a_time_nor_auto_is_refused(tmp_path: Path, asked: str | float):
     with pytest.raises(UsageError, match="neither a time code nor 'auto'"):
         open_shot(puffed_shot(tmp_path / "a.usda"), rest_frame=asked)
+
+
+@pytest.mark.parametrize(
+    ("scale", "aside", "said"),
+    [
+        (1.0, 0.0, ""),
+        (1.0, 1.3, ""),
+        (1.0, 1.5, "lies 1500 mm"),
+        (5.0, 0.0, "7071 mm large"),
+        (0.2, 0.0, "282.8 mm large"),
+    ],
+)
+def test_cloth_that_has_left_its_cage_is_told(scale: float, aside: float, said: str):
+    """A cage 1.41 m across; the validator refuses what is farther from it, or four times as large or small."""
+    cage = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) - [0.5, 0.5, 0.0]
+    found = strayed(cage, scale * cage + [aside, 0.0, 0.0])
+    assert said in found
+    assert bool(found) == bool(said)

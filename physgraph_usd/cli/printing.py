@@ -14,13 +14,11 @@ from typing import Any, TextIO
 import click
 
 from ..errors import PhysGraphError
-from ..words import counted
+from ..words import NOTICE, counted
 
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
 LOGGER = "physgraph_usd"
-NOTICE = 25
-"""`report.NOTICE`, whose module imports much."""
 _LEVELS = (NOTICE, logging.INFO, logging.DEBUG)
 _CLEAR_LINE = "\r\033[K"
 _LINE = "%(asctime)s %(levelname)s %(shot)s: %(message)s"

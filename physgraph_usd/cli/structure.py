@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import errno
+import signal
 from typing import Any, Never
 
 import click
 
 from ..errors import PhysGraphError
+from ..interrupts import SIGNALLED
 
-DONE, FAILED, INTERRUPTED = 0, 1, 130
+DONE, FAILED = 0, 1
 EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
 """Which extra brings a module that only some commands need."""
 
@@ -26,7 +28,7 @@ class Commands(click.Group):
                 return super().invoke(ctx)
         except KeyboardInterrupt:
             click.echo("interrupted", err=True)
-            ctx.exit(INTERRUPTED)
+            ctx.exit(SIGNALLED + signal.SIGINT)
         except PhysGraphError as error:
             _leave(ctx, str(error), error.exit_code)
         except OSError as error:

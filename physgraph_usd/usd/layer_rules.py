@@ -136,7 +136,7 @@ def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name
         if not least / 4 <= _size(fine) <= 4 * most:
             said = f"is {_size(fine):g} units large; the coarse mesh is {_size(below):g}"
             yield _error(f"{said}: units or transforms are wrong", name, time)
-        elif away > 4 * most:
+        elif away > most:
             yield _error(f"lies {away:g} units from the coarse mesh, which is {most:g} large", name, time)
 
 

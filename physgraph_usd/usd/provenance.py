@@ -23,8 +23,11 @@ from .view import root_over
 RECORD = "physgraph"
 CONTENTS = "contents"
 """Entry of the record: a digest of what the layer holds, since who copies a record copies no layer."""
-FAILED, UNSETTLED = "failed", "unsettled"
-"""Entries of the record: time codes without a sample, and how many were written though they did not settle."""
+FAILED, UNSOLVED, UNSETTLED, CROSSED = "failed", "unsolved", "unsettled", "crossed"
+"""Entries of the record: time codes without a sample; frames of garments that were not solved and follow their cage;
+those that were written though they did not settle; edges left through faces, where over a tenth of the input's are."""
+LACKING = (FAILED, UNSOLVED, UNSETTLED, CROSSED)
+"""What a layer lacks; the first two make every run one that was done in part, the others a strict one."""
 _LIST = (Vt.StringArray, list)
 _TYPES: dict[str, Any] = {
     "garments": _LIST,
@@ -122,7 +125,7 @@ def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False
     except USD_ERRORS:
         return False
     there = (read_record(layer) if layer and is_only_ours(layer) else None) or {}
-    lacking = FAILED in there or (settled and UNSETTLED in there)
+    lacking = any(name in there for name in (LACKING if settled else LACKING[:2]))
     return not lacking and all(there.get(key) == value for key, value in (read_record(wanted) or {}).items())
 
 

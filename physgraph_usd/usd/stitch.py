@@ -25,8 +25,11 @@ from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .hints import ATTRIBUTE as HINT
 from .normals import VertexNormals
 from .provenance import (
+    CROSSED,
     FAILED,
+    LACKING,
     UNSETTLED,
+    UNSOLVED,
     asset_path,
     author_record,
     export_layer,
@@ -425,7 +428,7 @@ def _check_seams(parts: Sequence[_Part], seams: Sequence[Seam], bound: float) ->
 def _record(parts: Sequence[_Part], shot: Path, out: Path, *, frames: tuple[float, float] | None) -> dict[str, Any]:
     """The record of the joined layer: that of a run of all frames, and the chunks that it was joined from."""
     first = parts[0]
-    record = {name: value for name, value in first.record.items() if name not in (CHUNK, FAILED, UNSETTLED)}
+    record = {name: value for name, value in first.record.items() if name not in (CHUNK, *LACKING)}
     absolute = Path(str(record["shot"])).is_absolute()
     folder = out.resolve().parent
     options = {name: _comparable(value) for name, value in dict(record["options"]).items() if name != "frames"}
@@ -442,7 +445,10 @@ def _record(parts: Sequence[_Part], shot: Path, out: Path, *, frames: tuple[floa
         "left_out": dict.fromkeys(garments, said) if left else None,
         "chunks": [part.span() for part in parts],
         FAILED: [str(time) for part in parts for time in part.record.get(FAILED, ())] or None,
-        UNSETTLED: sum(int(part.record.get(UNSETTLED, 0)) for part in parts) or None,
+        **{
+            name: sum(int(part.record.get(name, 0)) for part in parts) or None
+            for name in (UNSOLVED, UNSETTLED, CROSSED)
+        },
     }
 
 
