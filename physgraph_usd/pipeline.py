@@ -402,7 +402,9 @@ class Refiner:
     def _refuse_strayed(self, part: tuple[int, ...], frame: Frame, points: Sequence[np.ndarray]) -> None:
         """Refuse cloth that is no more where its cage is."""
         for index, fine in zip(part, points, strict=True):
-            if said := strayed(frame.garments[index].points, fine):
+            last = self._last[index]
+            before = None if last is None else last.frame.points
+            if said := strayed(frame.garments[index].points, fine, before=before):
                 when = "" if frame.time is None else f" at time code {frame.time:g}"
                 raise SolveError(f"<{self._scene.garments[index].path}>{when}: {said}")
 

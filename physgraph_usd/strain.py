@@ -94,21 +94,23 @@ def size_left(garment: Garment, points: np.ndarray) -> float:
     return sizes[0] / sizes[1] if sizes[1] > 0 else 1.0
 
 
-def strayed(cage: np.ndarray, fine: np.ndarray) -> str:
+def strayed(cage: np.ndarray, fine: np.ndarray, *, before: np.ndarray | None = None) -> str:
     """Why refined cloth is no refinement of its cage any more, in words, or "": farther from it than it is large, or of
     another size.
 
     Args:
         cage: Positions of the cage [m], shape (V, 3).
         fine: Positions of the refined cloth [m], shape (V_fine, 3).
+        before: Positions of the cage in the frame before, or None: cloth may stay as small as that was.
     """
     if not len(cage) or not len(fine):
         return ""
-    size, own = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (cage, fine))
+    earlier = cage if before is None else before
+    size, own, known = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (cage, fine, earlier))
     away = float(np.linalg.norm(fine.mean(axis=0) - cage.mean(axis=0)))
     if away > size:
         return f"the refined cloth lies {1e3 * away:.4g} mm from its cage, which is {1e3 * size:.4g} mm large"
-    if not size / LARGEST <= own <= LARGEST * size:
+    if not min(size, known) / LARGEST <= own <= LARGEST * size:
         return f"the refined cloth is {1e3 * own:.4g} mm large, its cage {1e3 * size:.4g} mm"
     return ""
 

@@ -179,3 +179,4 @@ def test_cloth_that_has_left_its_cage_is_told(scale: float, aside: float, said: 
     found = strayed(cage, scale * cage + [aside, 0.0, 0.0])
     assert said in found
     assert bool(found) == bool(said)
+    assert not strayed(5.0 * cage, cage, before=cage)  # One frame's cage is too large, and its cloth not.
