@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from physgraph_usd.integrate.network import PhysgraphConfig
-from physgraph_usd.integrate.weights import save_network
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.integrate.network import PhysgraphConfig
+from physgraph_usd.solver.integrate.weights import save_network
 from physgraph_usd.train import record
 from physgraph_usd.train.loop import TrainConfig, Trainer
 

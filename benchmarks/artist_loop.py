@@ -18,12 +18,12 @@ from PIL import Image
 from pxr import Usd, UsdGeom
 
 from benchmarks.sleeve import say
-from physgraph_usd.level import Level, build_levels
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.preview import preview
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import refine_shot
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.usd.reader import Shot, open_shot
 
 STIFFNESSES = (4.7e-6, 47e-6)

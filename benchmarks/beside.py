@@ -97,8 +97,8 @@ def walk_shot(*, sample: str, level: int, frames: int, out: str, shot: str | Non
     from benchmarks.contact_shots import groups_of  # noqa: PLC0415
     from benchmarks.temporal import detail_of  # noqa: PLC0415
     from physgraph_usd.options import RefineOptions  # noqa: PLC0415
-    from physgraph_usd.pipeline import Refiner  # noqa: PLC0415
     from physgraph_usd.samples import write_sample  # noqa: PLC0415
+    from physgraph_usd.solver.frame.pipeline import Refiner  # noqa: PLC0415
     from physgraph_usd.usd.reader import open_shot  # noqa: PLC0415
 
     sys.path.append(str(HERE.parent))

@@ -25,15 +25,15 @@ import click
 import numpy as np
 import torch
 
-from physgraph_usd.frame import level_forces
-from physgraph_usd.frame.group import Group
-from physgraph_usd.level import hinge_geometry
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
 from physgraph_usd.settled import unsettled
 from physgraph_usd.shot import prepare_device
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.frame import level_forces
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.level import hinge_geometry
 from physgraph_usd.usd.reader import Shot, open_shot
 
 from .contact_shots import LANES, REAL, SAMPLES, groups_of

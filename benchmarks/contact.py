@@ -20,14 +20,14 @@ from typing import Any
 
 import trimesh
 
-from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.fabric import PRESETS
-from physgraph_usd.integrate import method_named
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, GarmentFrame, Scene
 from physgraph_usd.shot import prepare_device
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
 
 from .sheet_over_ball import SheetOverBall
 

@@ -24,13 +24,13 @@ import torch
 
 from benchmarks.sleeve import CORES, say
 from physgraph_usd.chart.problem import Problem
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.integrate import method_named
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.reader import Shot, open_shot
 
 SAMPLES = {"block": (12.0,), "armpit": (15.0,), "layers": (5.0, 8.0, 11.0, 14.0, 17.0, 20.0), "sleeve": (24.0,)}

@@ -21,18 +21,18 @@ import torch
 from PIL import Image, ImageDraw
 
 from benchmarks.sleeve import say
-from physgraph_usd.contact.bodies import FrameBodies
-from physgraph_usd.contact.broad_phase import Bodies
-from physgraph_usd.contact.cloth import ClothContact
-from physgraph_usd.contact.frame import FrameContact
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.level import build_levels, refine_garments
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.preview import label, surface_of
 from physgraph_usd.raycast import BACKGROUND, View, draw, encode_color, fit_view
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import recentred
 from physgraph_usd.shot import prepare_device, refine_shot
+from physgraph_usd.solver.contact.bodies import FrameBodies
+from physgraph_usd.solver.contact.broad_phase import Bodies
+from physgraph_usd.solver.contact.cloth import ClothContact
+from physgraph_usd.solver.contact.frame import FrameContact
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.level import build_levels, refine_garments
+from physgraph_usd.solver.scene import recentred
 from physgraph_usd.usd.meshes import DrawnMesh, DrawnStage, refined_in
 from physgraph_usd.usd.reader import open_shot
 

@@ -24,10 +24,10 @@ import numpy as np
 
 from benchmarks.crossing_count import crossing_count
 from benchmarks.temporal import detail_of
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.usd.reader import Shot, open_shot
 
 FORMS = {

@@ -22,17 +22,17 @@ from pathlib import Path
 import torch
 
 from physgraph_usd.chart.reference import Reference
-from physgraph_usd.frame.group import Group
-from physgraph_usd.integrate import METHODS
-from physgraph_usd.integrate.base import Integrator, System
-from physgraph_usd.integrate.first_order import Adam, GradientDescent
-from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, solve_level
-from physgraph_usd.integrate.weights import FOLDER, load_network
-from physgraph_usd.level import refine_garments
 from physgraph_usd.shot import prepare_device
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.solver.integrate.base import Integrator, System
+from physgraph_usd.solver.integrate.first_order import Adam, GradientDescent
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.weights import FOLDER, load_network
+from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.train.patches import PatchConfig, make_patches
 
 from .rows import Found, Row, run_alone, say, table

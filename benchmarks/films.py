@@ -34,7 +34,7 @@ from physgraph_usd.usd.meshes import DrawnMesh, DrawnStage
 LEVEL, PANEL, RATE, QUALITY = 2, (480, 540), 12, "25"
 """Subdivisions, one side's size [pixels], frames a second, and x264's rate factor."""
 LOOP, QUADS = "Cage, Loop subdivision", "Cage, Catmull-Clark subdivision"
-"""Titles of the left side: `mesh/subdivide.py` has one rule of both, which is the pure one among one kind of face."""
+"""Titles of the left side: `solver/mesh/subdivide.py` has one rule of both, the pure one among one kind of face."""
 
 
 @dataclass(frozen=True)

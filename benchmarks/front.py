@@ -30,9 +30,9 @@ from benchmarks.shots import opened
 from physgraph_usd.chart.problem import COLD, Problem, Solved, plain_detail
 from physgraph_usd.chart.reference import Reference, find_reference
 from physgraph_usd.chart.table import TOLERANCE, quickest
-from physgraph_usd.integrate import METHODS
-from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.reader import Shot, open_shot
 
 JOURNAL = f"front.{{}}.{code_of(Path(physgraph_usd.__file__).parent)}.jsonl"

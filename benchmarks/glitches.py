@@ -17,13 +17,13 @@ from typing import Any
 import click
 import numpy as np
 
-from physgraph_usd.colliders.pose import MeshPose
 from physgraph_usd.errors import PhysGraphError
-from physgraph_usd.fabric import PRESETS
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, GarmentFrame
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.scene import Frame, GarmentFrame
 
 from .sheet_over_ball import SheetOverBall
 

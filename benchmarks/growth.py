@@ -22,11 +22,11 @@ import torch
 
 from benchmarks.rows import say, table
 from benchmarks.unseen import opened_garment, plain_group
-from physgraph_usd.integrate.base import Carry, Integrator, System
-from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.weights import FOLDER, load_network
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.integrate.base import Carry, Integrator, System
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.weights import FOLDER, load_network
 
 NOISE = 1e-9
 """Of the starts, in edge lengths."""

@@ -19,9 +19,9 @@ import click
 import numpy as np
 
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.scene import Frame
 
 from .contact_shots import LANES, REAL, SAMPLES, open_one
 

@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from physgraph_usd.chart.reference import Reference
-from physgraph_usd.integrate.base import Integrator
-from physgraph_usd.integrate.guard import Guard
-from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.network import PhysgraphConfig
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.weights import FOLDER, Network, load_network
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.integrate.base import Integrator
+from physgraph_usd.solver.integrate.guard import Guard
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.network import PhysgraphConfig
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.weights import FOLDER, Network, load_network
 
 from .unseen import FABRICS, SHOTS, Case, cases, descend
 

@@ -20,12 +20,12 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from physgraph_usd.fabric import PRESETS
-from physgraph_usd.level import Level
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.resolution import choose_levels, sample_frames
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.resolution import choose_levels, sample_frames
 from physgraph_usd.usd.reader import open_shot
 
 WAVES = np.array([4.0, 6.0, 9.0, 13.0, 19.0, 27.0, 38.0, 54.0, 76.0])

@@ -23,7 +23,7 @@ from benchmarks.rows import Found, Row, run_alone, under
 from benchmarks.shots import frames_of, opened, problem_of
 from physgraph_usd.chart.problem import COLD
 from physgraph_usd.chart.reference import find_reference
-from physgraph_usd.level import Level
+from physgraph_usd.solver.level import Level
 
 TIME = 24.0
 BAND = (4.0, 10.0)

@@ -23,13 +23,13 @@ from benchmarks.loose_garment import lowpass, vertex_area
 from benchmarks.rows import Found, Row, run_alone, table
 from benchmarks.shots import frames_of, opened, problem_of
 from physgraph_usd.chart.problem import COLD, Problem, with_garments
-from physgraph_usd.fabric import PRESETS, Fabric
-from physgraph_usd.integrate import method_named
-from physgraph_usd.level import Level
 from physgraph_usd.preview import label
 from physgraph_usd.raycast import Surface, View, draw, fit_view
-from physgraph_usd.scene import Frame
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.fabric import PRESETS, Fabric
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.scene import Frame
 
 TIME = 24.0
 STRETCHES = tuple(20.0 * 100.0 ** (step / 3.0) for step in range(4))

@@ -18,10 +18,10 @@ from unittest import mock
 
 import torch
 
-from physgraph_usd.frame import level_forces
-from physgraph_usd.integrate.metric import Metric, kept_to_edges
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.frame import level_forces
+from physgraph_usd.solver.integrate.metric import Metric, kept_to_edges
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 
 from .rows import say, table
 from .unseen import Case, cases, descend

@@ -25,12 +25,12 @@ from benchmarks.rows import Found, Row, run_alone, table, under
 from benchmarks.shots import distances, frames_of, opened, problem_of
 from physgraph_usd.chart.problem import Problem, with_garments
 from physgraph_usd.chart.reference import Reference, find_reference
-from physgraph_usd.fabric import PRESETS
-from physgraph_usd.integrate import METHODS, Method
-from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.weights import shipped_network
-from physgraph_usd.scene import Frame
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import METHODS, Method
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.weights import shipped_network
+from physgraph_usd.solver.scene import Frame
 
 POSES = {
     "armpit": ((), (4.0, 10.0, 15.0)),

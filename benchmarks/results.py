@@ -39,8 +39,8 @@ from benchmarks import (
 )
 from benchmarks.rows import HEAD, Found, Part, code_of
 from physgraph_usd import __version__
-from physgraph_usd.integrate.weights import FOLDER
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.integrate.weights import FOLDER
 
 PAGE = Path("docs/results.md")
 CACHE = Path("build")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from physgraph_usd.colliders.pose import Collider, MeshPose
-from physgraph_usd.mesh.topology import PolygonMesh
-from physgraph_usd.scene import Garment, Scene
+from physgraph_usd.solver.colliders.pose import Collider, MeshPose
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Garment, Scene
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from physgraph_usd.chart.problem import Problem, plain_detail
-from physgraph_usd.colliders.sign import signed_distances
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import Frame
+from physgraph_usd.solver.colliders.sign import signed_distances
+from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.reader import Shot, open_shot
 
 CORES = os.cpu_count() or 1

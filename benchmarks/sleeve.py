@@ -21,17 +21,17 @@ import torch
 
 from benchmarks.unseen import reference_of
 from physgraph_usd.chart.reference import Reference
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.frame.group import Group
-from physgraph_usd.integrate import method_named
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, solve_level
-from physgraph_usd.level import Level
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import prepare_device, refine_shot
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.level import Level
 from physgraph_usd.usd.reader import open_shot
 
 REPEATS = 5

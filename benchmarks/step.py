@@ -22,19 +22,19 @@ from typing import cast
 import numpy as np
 import torch
 
-from physgraph_usd.fabric import PRESETS
-from physgraph_usd.frame.group import Group
-from physgraph_usd.integrate import METHODS
-from physgraph_usd.integrate.base import Integrator, System
-from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.network import PhysgraphConfig
-from physgraph_usd.integrate.paper_network import PaperConfig
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.weights import random_network, shipped_network
-from physgraph_usd.mesh.topology import PolygonMesh
-from physgraph_usd.scene import Garment, GarmentFrame
 from physgraph_usd.shot import prepare_device
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.solver.integrate.base import Integrator, System
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.network import PhysgraphConfig
+from physgraph_usd.solver.integrate.paper_network import PaperConfig
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.weights import random_network, shipped_network
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Garment, GarmentFrame
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 SHIPPED = cast(PhysgraphConfig, shipped_network("physgraph").config)

@@ -19,12 +19,12 @@ import numpy as np
 
 from benchmarks.rows import Found, Row, run_alone, say, table, under
 from benchmarks.shots import CORES, opened
-from physgraph_usd.mesh.subdivide import Refinement
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import Frame
 from physgraph_usd.shot import prepare_device
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.mesh.subdivide import Refinement
+from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.reader import Shot, open_shot
 
 FRAMES = 24

@@ -17,16 +17,16 @@ import torch
 
 from physgraph_usd.chart.problem import ALONE, Problem
 from physgraph_usd.chart.reference import Reference, find_reference
-from physgraph_usd.fabric import PRESETS
-from physgraph_usd.frame.group import Group
-from physgraph_usd.integrate import method_named
-from physgraph_usd.integrate.base import Carry, Integrator, System
-from physgraph_usd.integrate.saddle import leave_saddle
-from physgraph_usd.integrate.solve import Budget, solve_level
-from physgraph_usd.level import refine_garments
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.integrate.base import Carry, Integrator, System
+from physgraph_usd.solver.integrate.saddle import leave_saddle
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
 from physgraph_usd.usd.reader import open_shot
 
 SHOTS: dict[str, tuple[str, float | None]] = {

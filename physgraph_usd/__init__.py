@@ -27,11 +27,11 @@ if TYPE_CHECKING:
         StageError,
         UsageError,
     )
-    from .fabric import PRESETS, Fabric
     from .joined import stitch
     from .options import RefineOptions
     from .report import RefineReport
     from .shot import inspect_shot, refine_shot, refine_shots, refine_stage
+    from .solver.fabric import PRESETS, Fabric
     from .usd.reader import Shot, open_shot
     from .usd.schema import schema_path
     from .usd.tag import tag
@@ -73,7 +73,7 @@ _ROOMS = {
         "StageError",
         "UsageError",
     ),
-    "fabric": ("PRESETS", "Fabric"),
+    "solver.fabric": ("PRESETS", "Fabric"),
     "options": ("RefineOptions",),
     "report": ("RefineReport",),
     "shot": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from .contact.crowding import Crowding, CrowdingMeter
 from .errors import GarmentError, StageError
 from .estimate import cannot_fit, estimate
-from .integrate import LEARNED
-from .mesh.defects import defects
 from .options import RefineOptions
 from .report import RefineReport, of_a_kind
-from .resolution import LevelChoice, carries_none, choose_levels, sample_frames
-from .scene import Frame, Garment, GarmentFrame
-from .strain import strained_parts, stretched
+from .solver.contact.crowding import Crowding, CrowdingMeter
+from .solver.integrate import LEARNED
+from .solver.mesh.defects import defects
+from .solver.resolution import LevelChoice, carries_none, choose_levels, sample_frames
+from .solver.scene import Frame, Garment, GarmentFrame
+from .solver.strain import strained_parts, stretched
 from .untagged import bodies_beside, command_of, proposal, told_beside
 from .usd.reader import Shot
 from .usd.stage import GarmentSource

@@ -23,10 +23,10 @@ import numpy as np
 
 from .errors import LayerError
 from .frames import Lead, Outcome
-from .mesh.lanes import start_warp
 from .options import RefineOptions
-from .pipeline import Refiner
-from .scene import Frame
+from .solver.frame.pipeline import Refiner
+from .solver.mesh.lanes import start_warp
+from .solver.scene import Frame
 from .untagged import open_with_colliders
 from .usd.reader import Shot
 from .usd.seams import Look, Points, Seam, between

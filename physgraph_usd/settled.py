@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from itertools import groupby
 from typing import Any
 
-from .integrate.solve import FAR
+from .solver.integrate.solve import FAR
 from .words import counted
 
 ROUNDING = 1e-3

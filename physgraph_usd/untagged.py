@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from .colliders.mesh import MeshBody
-from .colliders.pose import MeshPose
-from .contact.broad_phase import bounds_of
-from .contact.nearby import NEAR, share_at, smallest_body
 from .errors import StageError
-from .mesh.lanes import start_warp
-from .resolution import sample_frames
-from .scene import Frame
+from .solver.colliders.mesh import MeshBody
+from .solver.colliders.pose import MeshPose
+from .solver.contact.broad_phase import bounds_of
+from .solver.contact.nearby import NEAR, share_at, smallest_body
+from .solver.mesh.lanes import start_warp
+from .solver.resolution import sample_frames
+from .solver.scene import Frame
 from .usd.reader import Shot, open_shot
 from .usd.untagged import meshes_beside
 from .usd.view import Stage

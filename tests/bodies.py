@@ -7,8 +7,8 @@ import numpy as np
 import torch
 import trimesh
 
-from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.solver.colliders.pose import MeshPose
 
 Soup = tuple[np.ndarray, np.ndarray]
 """Points, shape (V, 3), and triangles, shape (T, 3)."""

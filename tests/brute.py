@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physgraph_usd.level import Level
+from physgraph_usd.solver.level import Level
 
 
 @dataclass(frozen=True, eq=False)

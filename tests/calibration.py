@@ -28,8 +28,8 @@ from probes import (
 )
 from sheets import KINDS, level_of_kind
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.forces.membrane import in_plane_terms
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.membrane import in_plane_terms
 
 YOUNGS, RIGIDITY, DENSITY = 261.0, 5e-6, 0.15
 SHEET = (0.16, 0.16, 0.01)

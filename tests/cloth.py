@@ -11,15 +11,15 @@ import torch
 from meshes import grid
 from sheets import garment_of
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.frame.group import Group
-from physgraph_usd.integrate import method_named
-from physgraph_usd.integrate.base import System
-from physgraph_usd.level import refine_garments
-from physgraph_usd.mesh.topology import PolygonMesh
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
 
 DOWN = np.array([0.0, -9.81, 0.0])
 FABRIC = Fabric(30.0, 4.7e-6, 0.187)

@@ -16,12 +16,12 @@ import torch
 from probes import G, hang
 from sheets import equilateral, level_of
 
-from physgraph_usd.fabric import PRESETS, Fabric
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.forces.bending import Bending
-from physgraph_usd.forces.gravity import Gravity
-from physgraph_usd.forces.membrane import in_plane_terms
-from physgraph_usd.level import Level
+from physgraph_usd.solver.fabric import PRESETS, Fabric
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.forces.bending import Bending
+from physgraph_usd.solver.forces.gravity import Gravity
+from physgraph_usd.solver.forces.membrane import in_plane_terms
+from physgraph_usd.solver.level import Level
 
 OUTER, INNER = 0.15, 0.09
 """Radii of the fabric and of the support [m]."""

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from physgraph_usd.forces.base import Force
+from physgraph_usd.solver.forces.base import Force
 
 HINGE_CAP = 10.0
 Energy = Callable[[Tensor], Tensor]

@@ -12,18 +12,18 @@ from cloth import DOWN, FABRIC, GUIDE, Solver, settings_of
 from meshes import grid
 from sheets import garment_of
 
-from physgraph_usd.colliders.pose import Collider, MeshPose, Pose
-from physgraph_usd.contact.cloth import ClothContact, ClothView
-from physgraph_usd.contact.frame import FrameContact
-from physgraph_usd.contact.promise import Promise
-from physgraph_usd.contact.seams import Seams
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.forces.seam import Seam
-from physgraph_usd.level import Level, build_levels, refine_garments
-from physgraph_usd.mesh.topology import PolygonMesh
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, Garment, GarmentFrame, Scene
+from physgraph_usd.solver.colliders.pose import Collider, MeshPose, Pose
+from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
+from physgraph_usd.solver.contact.frame import FrameContact
+from physgraph_usd.solver.contact.promise import Promise
+from physgraph_usd.solver.contact.seams import Seams
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.seam import Seam
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.level import Level, build_levels, refine_garments
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
 
 EDGE = 0.05
 LEVEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from physgraph_usd.mesh.attributes import vertex_values
-from physgraph_usd.mesh.subdivide import Refinement, subdivide_times
+from physgraph_usd.solver.mesh.attributes import vertex_values
+from physgraph_usd.solver.mesh.subdivide import Refinement, subdivide_times
 from physgraph_usd.usd.reader import Shot, open_shot
 from physgraph_usd.usd.validate import validate_layer
 from physgraph_usd.usd.view import root_over

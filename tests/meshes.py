@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 
 def mesh_of(faces: list[list[int]], vertex_count: int | None = None) -> PolygonMesh:

@@ -16,17 +16,17 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from sheets import level_of_kind
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.forces.base import Force, ForceModule
-from physgraph_usd.forces.bending import Bending
-from physgraph_usd.forces.gravity import Gravity
-from physgraph_usd.forces.membrane import in_plane_terms
-from physgraph_usd.integrate.base import System
-from physgraph_usd.integrate.metric import Metric
-from physgraph_usd.integrate.newton import Newton
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, solve_level
-from physgraph_usd.level import Level
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.base import Force, ForceModule
+from physgraph_usd.solver.forces.bending import Bending
+from physgraph_usd.solver.forces.gravity import Gravity
+from physgraph_usd.solver.forces.membrane import in_plane_terms
+from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.integrate.newton import Newton
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.level import Level
 
 G = 9.81
 

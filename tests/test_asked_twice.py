@@ -15,16 +15,16 @@ from cloth import DOWN, FABRIC, settings_of
 from folds import crumpled, frame_with, named, square
 
 from physgraph_usd.chart.judge import judge
-from physgraph_usd.colliders.pose import Collider
-from physgraph_usd.contact.bodies import Touching
-from physgraph_usd.contact.frame import FrameContact, LevelContact
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.frame.values import FrameInput
-from physgraph_usd.integrate.base import System
-from physgraph_usd.integrate.metric import Metric
-from physgraph_usd.level import Placed
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import GarmentFrame, Scene
+from physgraph_usd.solver.colliders.pose import Collider
+from physgraph_usd.solver.contact.bodies import Touching
+from physgraph_usd.solver.contact.frame import FrameContact, LevelContact
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.level import Placed
+from physgraph_usd.solver.scene import GarmentFrame, Scene
 
 Cages = tuple[np.ndarray, ...]
 STIFF = replace(FABRIC, stretch=3.0 * FABRIC.stretch, bend=5.0 * FABRIC.bend, density=2.0 * FABRIC.density)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import any_mesh, cube, faces_of, grid, mesh_of
 
-from physgraph_usd.mesh.attributes import (
+from physgraph_usd.solver.mesh.attributes import (
     corner_values,
     edge_subset,
     face_subset,
@@ -17,8 +17,8 @@ from physgraph_usd.mesh.attributes import (
     vertex_subset,
     vertex_values,
 )
-from physgraph_usd.mesh.subdivide import compose, subdivide_times
-from physgraph_usd.mesh.topology import PolygonMesh, find_edges
+from physgraph_usd.solver.mesh.subdivide import compose, subdivide_times
+from physgraph_usd.solver.mesh.topology import PolygonMesh, find_edges
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])

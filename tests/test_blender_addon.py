@@ -14,7 +14,7 @@ import pytest
 from blender import NEEDS_BLENDER
 from scipy.spatial import cKDTree
 
-from physgraph_usd.fabric import PRESETS
+from physgraph_usd.solver.fabric import PRESETS
 
 ADDON = Path(__file__).parents[1] / "plugins" / "blender"
 SCENE = Path(__file__).with_name("blender_addon_scene.py")

@@ -12,7 +12,7 @@ import pytest
 
 import physgraph_usd
 from physgraph_usd import cli
-from physgraph_usd.fabric import PRESETS
+from physgraph_usd.solver.fabric import PRESETS
 
 ADDON = Path(__file__).parents[1] / "plugins" / "blender"
 QUICK = "--integrator quasi-newton --steps 4"

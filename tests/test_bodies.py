@@ -22,9 +22,9 @@ from stages import (
     vec3,
 )
 
-from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.colliders.primitives import ShapeSurface
-from physgraph_usd.scene import Frame, Scene
+from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.solver.colliders.primitives import ShapeSurface
+from physgraph_usd.solver.scene import Frame, Scene
 from physgraph_usd.usd.reader import open_shot
 
 BODY = "/World/body"

@@ -9,8 +9,8 @@ import pytest
 from cloth import sheet
 from sheets import garment_of
 
-from physgraph_usd.colliders.pose import Collider, MeshPose, ShapePose
-from physgraph_usd.contact.broad_phase import Bodies, bounds_of
+from physgraph_usd.solver.colliders.pose import Collider, MeshPose, ShapePose
+from physgraph_usd.solver.contact.broad_phase import Bodies, bounds_of
 
 MESH, REST = sheet(4, 4)
 TOP = float(REST[:, 1].max())

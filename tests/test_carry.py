@@ -7,8 +7,8 @@ import pytest
 from layers import grid
 from pxr import Gf, Sdf, Vt
 
-from physgraph_usd.mesh.subdivide import subdivide_times
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.mesh.subdivide import subdivide_times
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.carry import FineMap, to_numpy, to_vt
 
 POINTS, COUNTS, INDICES = grid(3, 2)

@@ -36,9 +36,9 @@ from physgraph_usd.chart.run import chart_shot
 from physgraph_usd.chart.table import Chart, Point, typical
 from physgraph_usd.chart.words import settings
 from physgraph_usd.errors import UsageError
-from physgraph_usd.integrate import METHODS, Method
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.scene import Frame
+from physgraph_usd.solver.integrate import METHODS, Method
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.scene import Frame
 
 ECHO = """
 import sys

@@ -206,7 +206,7 @@ class TestRefine:
         assert declared == {field.name for field in fields(RefineOptions)} - {"sources"}
 
     def test_help_is_in_groups_with_the_names_that_options_take(self) -> None:
-        from physgraph_usd.integrate import METHODS
+        from physgraph_usd.solver.integrate import METHODS
 
         said = run("refine", "--help").output
         headings = ["Files:", "Scene:", "Solver:", "Layer:", "Several shots, and", "What is said:", "Options:"]

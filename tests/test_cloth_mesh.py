@@ -7,8 +7,8 @@ import torch
 from brute import Soup, beside
 from folds import fine, levels_of, named, square
 
-from physgraph_usd.contact.cloth_mesh import ClothMesh
-from physgraph_usd.level import Level
+from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
+from physgraph_usd.solver.level import Level
 
 ALL = np.ones((2, 2), bool)
 NONE = np.zeros((0, 2), np.int64)

@@ -8,9 +8,9 @@ import numpy as np
 from folds import levels_of, named, square
 from scipy.sparse import csgraph
 
-from physgraph_usd.collide.clusters import Clusters
-from physgraph_usd.level import Level
-from physgraph_usd.mesh.topology import adjacency, owned_sides
+from physgraph_usd.solver.collide.clusters import Clusters
+from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.mesh.topology import adjacency, owned_sides
 
 
 def clusters_of(level: Level) -> Clusters:

@@ -14,13 +14,13 @@ from pxr import Usd, UsdGeom, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix, vec3
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.colliders.sign import _sides, signed_distances
-from physgraph_usd.contact.track import Track
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.shot import inspect_shot
 from physgraph_usd.sides import SIDES
+from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.solver.colliders.sign import _sides, signed_distances
+from physgraph_usd.solver.contact.track import Track
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.schema import COLLIDER
 

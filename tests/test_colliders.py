@@ -7,11 +7,11 @@ import pytest
 import torch
 from bodies import around, ball, box, distances, endless, flipped, split, surfaces, together, tube
 
-from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.colliders.orient import pieces_of
-from physgraph_usd.colliders.pose import MeshPose, ShapePose, moved_rigidly
-from physgraph_usd.colliders.primitives import ShapeSurface
-from physgraph_usd.colliders.sign import signed_distances
+from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.solver.colliders.orient import pieces_of
+from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose, moved_rigidly
+from physgraph_usd.solver.colliders.primitives import ShapeSurface
+from physgraph_usd.solver.colliders.sign import signed_distances
 from physgraph_usd.usd.shapes import tessellated
 
 FAR = np.array([0.25, 0.0, 0.0])

@@ -13,11 +13,11 @@ from cloth import FABRIC, sheet
 from sheets import level_of
 from touching import frame, measured, mesh_pose, refiner
 
-import physgraph_usd.contact.bodies
-from physgraph_usd.colliders.mesh import MeshBody
-from physgraph_usd.colliders.pose import ShapePose
-from physgraph_usd.contact.push_out import no_farther
-from physgraph_usd.forces.contact import Contact, Planes
+import physgraph_usd.solver.contact.bodies
+from physgraph_usd.solver.colliders.mesh import MeshBody
+from physgraph_usd.solver.colliders.pose import ShapePose
+from physgraph_usd.solver.contact.push_out import no_farther
+from physgraph_usd.solver.forces.contact import Contact, Planes
 
 MESH, REST = sheet(12, 12, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
@@ -201,7 +201,7 @@ class TestLeftOut:
         def refuse(*args: object, **options: object) -> None:
             raise AssertionError("contact code ran")
 
-        monkeypatch.setattr(physgraph_usd.contact.bodies.FrameBodies, "begin", refuse)
+        monkeypatch.setattr(physgraph_usd.solver.contact.bodies.FrameBodies, "begin", refuse)
         monkeypatch.setattr(MeshBody, "pose", refuse)
         near = mesh_pose(ball())
         assert refiner((MESH, REST), felt=()).solve(frame(draped(0.1), near)).points[0] is not None

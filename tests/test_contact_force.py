@@ -7,7 +7,7 @@ import pytest
 import torch
 from sheets import equilateral, level_of
 
-from physgraph_usd.forces.contact import Contact, Planes
+from physgraph_usd.solver.forces.contact import Contact, Planes
 
 STIFFNESS = 50.0
 POINTS, TRIANGLES = equilateral(0.3, 0.2, 0.1)

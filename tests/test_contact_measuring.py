@@ -13,14 +13,14 @@ from cloth import sheet
 from folds import levels_of, named
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.contact.bodies import FrameBodies, Touching
-from physgraph_usd.contact.push_out import projected
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.level import Level
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.scene import State
+from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.contact.bodies import FrameBodies, Touching
+from physgraph_usd.solver.contact.push_out import projected
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.scene import State
 
 MESH, REST = sheet(8, 8, 0.05)
 HANGING = REST - REST.mean(axis=0)
@@ -105,5 +105,5 @@ class TestBodies:
         view = bodies.at(level, level)
         moved = base - 0.05 * torch.as_tensor(NORMAL, dtype=base.dtype)
         assert int(view.within(moved)[0].sum()) > 20
-        monkeypatch.setattr("physgraph_usd.contact.bodies.signed_distances", None)
+        monkeypatch.setattr("physgraph_usd.solver.contact.bodies.signed_distances", None)
         assert int(view.within(base)[0].sum()) == 0

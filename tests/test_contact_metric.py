@@ -7,11 +7,11 @@ import pytest
 import scipy.sparse as sp
 import torch
 
-from physgraph_usd.contact import metric as contact_metric
-from physgraph_usd.contact.frame import LevelContact
-from physgraph_usd.contact.metric import HeldMetric
-from physgraph_usd.forces.contact import Contact
-from physgraph_usd.integrate.metric import Metric
+from physgraph_usd.solver.contact import metric as contact_metric
+from physgraph_usd.solver.contact.frame import LevelContact
+from physgraph_usd.solver.contact.metric import HeldMetric
+from physgraph_usd.solver.forces.contact import Contact
+from physgraph_usd.solver.integrate.metric import Metric
 
 
 def chain(count: int = 12) -> tuple[Metric, np.ndarray]:

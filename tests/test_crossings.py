@@ -16,11 +16,11 @@ from meshes import mesh_of
 from scipy.spatial import Delaunay
 from sheets import rotation, triangle_mesh
 
-from physgraph_usd.collide.crossings import Crossings, crossings
-from physgraph_usd.collide.parts import Parts
-from physgraph_usd.contact.cloth_mesh import ClothMesh
-from physgraph_usd.level import Level
-from physgraph_usd.mesh.topology import joined_by
+from physgraph_usd.solver.collide.crossings import Crossings, crossings
+from physgraph_usd.solver.collide.parts import Parts
+from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
+from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.mesh.topology import joined_by
 
 ALL = np.ones((2, 2), bool)
 CROSSED = ("rolled through itself", "crumpled", "crumpled more")

@@ -16,20 +16,20 @@ from pxr import Usd, UsdGeom
 from sheets import garment_of
 
 from physgraph_usd.cli import main
-from physgraph_usd.colliders.mesh import MeshBody
-from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.frame.group import Group
-from physgraph_usd.frame.values import FrameInput
-from physgraph_usd.integrate.fused import fused_physgraph
-from physgraph_usd.integrate.learned import LearnedMetric, LearnedPaper
-from physgraph_usd.integrate.metric import Metric
-from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
-from physgraph_usd.integrate.paper_network import PaperConfig, PaperNetwork, has_triton
-from physgraph_usd.integrate.weights import random_network, shipped_network
-from physgraph_usd.level import refine_garments
-from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import GarmentFrame
+from physgraph_usd.solver.colliders.mesh import MeshBody
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.integrate.fused import fused_physgraph
+from physgraph_usd.solver.integrate.learned import LearnedMetric, LearnedPaper
+from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
+from physgraph_usd.solver.integrate.paper_network import PaperConfig, PaperNetwork, has_triton
+from physgraph_usd.solver.integrate.weights import random_network, shipped_network
+from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import GarmentFrame
 
 EDGE = 0.02
 
@@ -109,7 +109,7 @@ def test_the_papers_step_is_the_same_by_its_kernel(latent: int, monkeypatch: pyt
         paper = LearnedPaper(cast(PaperNetwork, random_network(PaperConfig(latent), seed=3, scale=0.3)))
     carry = paper.start(system, x)
     fused, again = paper.propose(system, carry), paper.propose(system, carry)
-    monkeypatch.setattr("physgraph_usd.integrate.paper_network.has_triton", lambda: False)
+    monkeypatch.setattr("physgraph_usd.solver.integrate.paper_network.has_triton", lambda: False)
     plain = paper.propose(system, carry)
     assert torch.equal(fused, again)
     assert 0.0 < float((fused - plain).norm()) < 3e-3 * float(plain.norm())
@@ -143,7 +143,7 @@ def test_what_a_bodys_normals_tell_is_the_same_asked_together(monkeypatch: pytes
     faces = np.concatenate([np.asarray(balls[0].faces), np.asarray(balls[1].faces) + len(balls[0].vertices)])
     x, told = np.random.default_rng(1).uniform([-0.3, -0.3, -0.3], [0.5, 0.3, 0.3], (2000, 3)), []
     for device, most in (("cpu", 0), ("cuda", 0), ("cuda", 10_000)):
-        monkeypatch.setattr("physgraph_usd.colliders.mesh.TOGETHER", most)
+        monkeypatch.setattr("physgraph_usd.solver.colliders.mesh.TOGETHER", most)
         (surface,) = MeshBody(device=device, lanes=1).pose(MeshPose(points, faces.astype(np.int32)))
         asked = torch.as_tensor(x - surface.origin, device=device)
         told.append(surface.closest(asked, torch.full_like(asked[:, 0], torch.inf)).side.cpu())

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from shots import CLOTH, cloth_shot, faults, refine, sample_times
 
-from physgraph_usd import deadline
+from physgraph_usd.solver import deadline
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from meshes import any_mesh, cube, grid, mesh_of, planar_mesh, prism, tetrahedron
 
-from physgraph_usd.mesh.defects import defects
-from physgraph_usd.mesh.subdivide import subdivide
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.mesh.defects import defects
+from physgraph_usd.solver.mesh.subdivide import subdivide
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 
 def kinds(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[tuple[str, int]]:

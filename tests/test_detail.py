@@ -9,8 +9,8 @@ from cloth import group_of, sheet, wave
 from meshes import mesh_of
 from sheets import rotation
 
-from physgraph_usd.frame.detail import MovingFrames
-from physgraph_usd.frame.values import State
+from physgraph_usd.solver.frame.detail import MovingFrames
+from physgraph_usd.solver.frame.values import State
 
 MESH, REST = sheet(6, 4)
 GROUP = group_of(MESH, REST, level=2)

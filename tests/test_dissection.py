@@ -10,11 +10,11 @@ import torch
 from meshes import grid
 
 from physgraph_usd.errors import SolveError
-from physgraph_usd.integrate import fronts
-from physgraph_usd.integrate.dissection import dissect
-from physgraph_usd.integrate.metric import DeviceFactors, HostFactors
-from physgraph_usd.integrate.multifrontal import DissectedSolver, Elimination
-from physgraph_usd.mesh.topology import edges_of
+from physgraph_usd.solver.integrate import fronts
+from physgraph_usd.solver.integrate.dissection import dissect
+from physgraph_usd.solver.integrate.metric import DeviceFactors, HostFactors
+from physgraph_usd.solver.integrate.multifrontal import DissectedSolver, Elimination
+from physgraph_usd.solver.mesh.topology import edges_of
 
 
 def laplacian(columns: int, rows: int, rng: np.random.Generator) -> sp.csr_matrix:

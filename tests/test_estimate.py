@@ -18,16 +18,16 @@ from shots import cloth_shot, command, fine, refine
 from stages import add_sheet, new_stage, save
 
 from physgraph_usd.cli import main
-from physgraph_usd.colliders.pose import Collider, ShapePose
-from physgraph_usd.contact.crowding import Crowding, CrowdingMeter
 from physgraph_usd.errors import GarmentError
 from physgraph_usd.estimate import cannot_fit, estimate, memory_there
-from physgraph_usd.mesh.subdivide import fine_count, subdivide_times
-from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Scene
 from physgraph_usd.shot import ending, inspect_shot
+from physgraph_usd.solver.colliders.pose import Collider, ShapePose
+from physgraph_usd.solver.contact.crowding import Crowding, CrowdingMeter
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.mesh.subdivide import fine_count, subdivide_times
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Scene
 from physgraph_usd.untagged import open_with_colliders
 
 

@@ -11,14 +11,14 @@ from sheets import KINDS, Sheet, equilateral, irregular, level_of, rotation
 from test_forces import ELASTIC, INTERNAL, POTENTIALS, crumple, force_of
 from torch import Tensor
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.forces.base import Force, ForceModule
-from physgraph_usd.forces.bending import Bending, hinge_jacobian
-from physgraph_usd.forces.guide import Guide, GuideMap
-from physgraph_usd.forces.membrane import Membrane, in_plane_terms
-from physgraph_usd.forces.stretch import Stretch
-from physgraph_usd.integrate.metric import Metric
-from physgraph_usd.level import Level, build_levels, refine_garments
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.base import Force, ForceModule
+from physgraph_usd.solver.forces.bending import Bending, hinge_jacobian
+from physgraph_usd.solver.forces.guide import Guide, GuideMap
+from physgraph_usd.solver.forces.membrane import Membrane, in_plane_terms
+from physgraph_usd.solver.forces.stretch import Stretch
+from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.level import Level, build_levels, refine_garments
 
 
 def sheet(kind: str = "irregular") -> Sheet:

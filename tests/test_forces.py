@@ -24,14 +24,14 @@ from meshes import planar_mesh
 from sheets import equilateral, level_of, quality, rotation
 from torch import Tensor
 
-from physgraph_usd.forces.base import Force, ForceModule
-from physgraph_usd.forces.bending import Bending
-from physgraph_usd.forces.gravity import Gravity
-from physgraph_usd.forces.guide import Guide, GuideMap
-from physgraph_usd.forces.membrane import Membrane
-from physgraph_usd.forces.stretch import Stretch
-from physgraph_usd.forces.tether import Tether
-from physgraph_usd.level import Level
+from physgraph_usd.solver.forces.base import Force, ForceModule
+from physgraph_usd.solver.forces.bending import Bending
+from physgraph_usd.solver.forces.gravity import Gravity
+from physgraph_usd.solver.forces.guide import Guide, GuideMap
+from physgraph_usd.solver.forces.membrane import Membrane
+from physgraph_usd.solver.forces.stretch import Stretch
+from physgraph_usd.solver.forces.tether import Tether
+from physgraph_usd.solver.level import Level
 
 DOWN = np.array([0.0, 0.0, -9.81])
 POTENTIALS = ("continuum", "paper")

@@ -11,8 +11,8 @@ from energies import evaluate
 from folds import EDGE, crumpled, curved, flat, folded, levels_of, named, placed, square, strip, view_of
 from test_tangles import pair
 
-from physgraph_usd.contact.cloth import ClothView
-from physgraph_usd.forces.self_contact import Gaps, SelfContact
+from physgraph_usd.solver.contact.cloth import ClothView
+from physgraph_usd.solver.forces.self_contact import Gaps, SelfContact
 
 QUIET: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "flat": flat,

@@ -15,14 +15,14 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API
 
-from physgraph_usd.colliders.mesh import MeshBody
-from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.colliders.primitives import ShapeSurface
-from physgraph_usd.contact.heat import body_crossings, penetration_map
 from physgraph_usd.errors import LayerError
 from physgraph_usd.frames import FrameFolder, Outcome
-from physgraph_usd.mesh.topology import edges_of
 from physgraph_usd.options import RefineOptions
+from physgraph_usd.solver.colliders.mesh import MeshBody
+from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.solver.colliders.primitives import ShapeSurface
+from physgraph_usd.solver.contact.heat import body_crossings, penetration_map
+from physgraph_usd.solver.mesh.topology import edges_of
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.validate import validate_layer
 from physgraph_usd.usd.writer import LayerWriter

@@ -11,11 +11,11 @@ from bodies import ball
 from cloth import sheet
 from touching import frame, mesh_pose, refiner
 
-from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.frame import start
-from physgraph_usd.frame.start import SLOWER, SLOWEST, STILL, slowing
-from physgraph_usd.frame.values import State, join, split
-from physgraph_usd.scene import Frame
+from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.solver.frame import start
+from physgraph_usd.solver.frame.start import SLOWER, SLOWEST, STILL, slowing
+from physgraph_usd.solver.frame.values import State, join, split
+from physgraph_usd.solver.scene import Frame
 
 MESH, REST = sheet(8, 8, 0.05)
 HANGING = REST - REST.mean(axis=0)

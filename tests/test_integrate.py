@@ -12,13 +12,13 @@ import torch
 from cloth import finest_system, group_of, sheet, wave
 
 from physgraph_usd.errors import SolveError, UsageError
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.integrate import LEARNED, METHODS, method_named
-from physgraph_usd.integrate.base import Carry, ForceField, Integrator, System
-from physgraph_usd.integrate.metric import REGULARISATION, Metric, kept_to_edges
-from physgraph_usd.integrate.newton import Newton
-from physgraph_usd.integrate.quasi_newton import QuasiNewton, backtrack
-from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.integrate import LEARNED, METHODS, method_named
+from physgraph_usd.solver.integrate.base import Carry, ForceField, Integrator, System
+from physgraph_usd.solver.integrate.metric import REGULARISATION, Metric, kept_to_edges
+from physgraph_usd.solver.integrate.newton import Newton
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, backtrack
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
 
 
 class Quadratic:
@@ -278,7 +278,7 @@ class TestRounding:
 
         system, method = system_of(spd(12, 50.0), metric=np.eye(12)), QuasiNewton()
         carry = method.step(system, method.start(system, start(12)))
-        monkeypatch.setattr("physgraph_usd.integrate.quasi_newton.backtrack", short)
+        monkeypatch.setattr("physgraph_usd.solver.integrate.quasi_newton.backtrack", short)
         assert len(method.step(system, carry).memory.pairs) == kept
 
 

@@ -7,10 +7,10 @@ import pytest
 import scipy.sparse as sp
 import torch
 
-from physgraph_usd.integrate.base import System
-from physgraph_usd.integrate.metric import Metric
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
 
 COUNT = 6
 

@@ -15,8 +15,8 @@ import torch
 import warp as wp
 
 import physgraph_usd
-from physgraph_usd.mesh.lanes import LEAST_PER_LANE, LEAST_QUERIES, Launch, _tapered
-from physgraph_usd.mesh.stencil import Stencil
+from physgraph_usd.solver.mesh.lanes import LEAST_PER_LANE, LEAST_QUERIES, Launch, _tapered
+from physgraph_usd.solver.mesh.stencil import Stencil
 
 
 @pytest.mark.parametrize("rows", [3, LEAST_PER_LANE, 3 * LEAST_PER_LANE + 7])

@@ -9,7 +9,7 @@ from bodies import ball, box
 from brute import Soup, crossings
 from folds import contact_of, frame_with, levels_of, named, refiner_with, square
 
-from physgraph_usd.level import Placed
+from physgraph_usd.solver.level import Placed
 
 
 class TestCorners:

@@ -19,19 +19,19 @@ from sheets import rotation
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.frame.group import Group
-from physgraph_usd.integrate import METHODS, paper_network
-from physgraph_usd.integrate.base import Carry, Integrator, System
-from physgraph_usd.integrate.features import NORMAL, seeing
-from physgraph_usd.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
-from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
-from physgraph_usd.integrate.paper_network import PaperConfig
-from physgraph_usd.integrate.solve import Budget, solve_level
-from physgraph_usd.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
-from physgraph_usd.level import refine_garments
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import GarmentFrame
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.integrate import METHODS, paper_network
+from physgraph_usd.solver.integrate.base import Carry, Integrator, System
+from physgraph_usd.solver.integrate.features import NORMAL, seeing
+from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
+from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
+from physgraph_usd.solver.integrate.paper_network import PaperConfig
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
+from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.scene import GarmentFrame
 
 ALL = PhysgraphConfig(vectors=VECTORS, width=16, rounds=1, strain=True)
 PLAIN = PhysgraphConfig(width=16)

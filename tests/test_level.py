@@ -11,7 +11,7 @@ from meshes import any_mesh, grid, mesh_of, planar_mesh
 from sheets import equilateral, garment_of, level_of, rotation
 from test_forces import force_of
 
-from physgraph_usd.level import (
+from physgraph_usd.solver.level import (
     HINGE_SHAPE_LIMIT,
     Level,
     build_levels,
@@ -20,7 +20,7 @@ from physgraph_usd.level import (
     rest_shape,
     triangle_shape,
 )
-from physgraph_usd.mesh.topology import PolygonMesh, edges_of, hinges_of
+from physgraph_usd.solver.mesh.topology import PolygonMesh, edges_of, hinges_of
 
 
 def shape_of(rest: np.ndarray, triangles: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:

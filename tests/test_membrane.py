@@ -13,17 +13,17 @@ from meshes import grid
 from sheets import equilateral, garment_of, level_of
 from test_forces import crumple
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.forces.membrane import Membrane, in_plane_terms
-from physgraph_usd.forces.stretch import Stretch
-from physgraph_usd.frame.group import Group
-from physgraph_usd.frame.values import FrameInput
-from physgraph_usd.integrate import method_named
-from physgraph_usd.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
-from physgraph_usd.mesh.diagonals import quad_edges
-from physgraph_usd.scene import GarmentFrame
 from physgraph_usd.shot import inspect_shot
-from physgraph_usd.solve_settings import SolveSettings
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.membrane import Membrane, in_plane_terms
+from physgraph_usd.solver.forces.stretch import Stretch
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
+from physgraph_usd.solver.mesh.diagonals import quad_edges
+from physgraph_usd.solver.scene import GarmentFrame
 
 SPRINGS, TRIANGLES = Fabric(30.0), Fabric(30.0, shear=7.0)
 

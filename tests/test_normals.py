@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from layers import grid
 
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.normals import VertexNormals
 
 

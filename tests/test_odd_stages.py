@@ -18,12 +18,12 @@ from sheets import garment_of
 from shots import CLOTH, TIMES, cloth_shot, command, faults, fine, refine, sample_times
 from stages import COLLIDER_API, GARMENT_API, add_sheet, new_stage, save, sheet_points, vec3
 
-from physgraph_usd.colliders.pose import Collider, MeshPose
 from physgraph_usd.errors import GarmentError, SolveError
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
-from physgraph_usd.scene import Frame, GarmentFrame, Scene
+from physgraph_usd.solver.colliders.pose import Collider, MeshPose
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
 from physgraph_usd.usd.reader import open_shot
 
 FLOATS = Sdf.ValueTypeNames.FloatArray

@@ -11,14 +11,14 @@ import torch
 from bodies import ball, box, surfaces, together
 from folds import levels_of, named, square
 
-from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.contact.bodies import FrameBodies, LevelBodies, Touching
-from physgraph_usd.contact.measure import depths, pinched
-from physgraph_usd.contact.push_out import pushed_out
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.level import Level
-from physgraph_usd.mesh.topology import patches_with
+from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.contact.bodies import FrameBodies, LevelBodies, Touching
+from physgraph_usd.solver.contact.measure import depths, pinched
+from physgraph_usd.solver.contact.push_out import pushed_out
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.mesh.topology import patches_with
 
 SHEET = named(square(12))
 SETTINGS = ContactSettings(stiffness=1.0, cloth_stiffness=1e5)

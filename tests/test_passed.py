@@ -13,10 +13,10 @@ from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API, vec3
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.colliders.sweep import Sweep, through_shape
-from physgraph_usd.contact.passed import Passed
 from physgraph_usd.samples import write_sample
+from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.solver.colliders.sweep import Sweep, through_shape
+from physgraph_usd.solver.contact.passed import Passed
 from physgraph_usd.usd.reader import open_shot
 
 EDGE = 0.05

@@ -12,10 +12,10 @@ from cloth import DOWN, FABRIC, Solver, base_of, frame_of, refiner_of, rms, sett
 from sheets import garment_of
 
 from physgraph_usd.errors import SolveError
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.mesh.subdivide import smooth
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, GarmentFrame, Scene
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.mesh.subdivide import smooth
+from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
 
 EDGE = 0.05
 MESH, REST = sheet(6, 4, EDGE)

@@ -7,11 +7,11 @@ import torch
 from brute import Soup, crossings
 from folds import EDGE, levels_of, named, promise_of, square
 
-from physgraph_usd.collide.near import weights
-from physgraph_usd.collide.sweep import Pairs
-from physgraph_usd.contact.along import COMES, along
-from physgraph_usd.contact.carry import carried
-from physgraph_usd.level import Placed
+from physgraph_usd.solver.collide.near import weights
+from physgraph_usd.solver.collide.sweep import Pairs
+from physgraph_usd.solver.contact.along import COMES, along
+from physgraph_usd.solver.contact.carry import carried
+from physgraph_usd.solver.level import Placed
 
 GAP = 0.2 * EDGE
 

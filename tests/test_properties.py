@@ -20,13 +20,13 @@ from pxr import Sdf, UsdGeom, Vt
 from sheets import garment_of, rotation
 from stages import GARMENT_API, affine, author, new_stage, save, set_matrix, vec3
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.forces.guide import GuideMap
-from physgraph_usd.level import build_levels, refine_garments
-from physgraph_usd.mesh.subdivide import subdivide, subdivide_times
-from physgraph_usd.mesh.topology import PolygonMesh
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.shot import refine_shot
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.guide import GuideMap
+from physgraph_usd.solver.level import build_levels, refine_garments
+from physgraph_usd.solver.mesh.subdivide import subdivide, subdivide_times
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 CLOTH = "/World/cloth"
 EDGE = 0.05

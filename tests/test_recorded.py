@@ -9,15 +9,15 @@ import pytest
 import torch
 from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.frame.values import FrameInput
-from physgraph_usd.integrate.base import System
-from physgraph_usd.integrate.fused import fused_physgraph
-from physgraph_usd.integrate.learned import LearnedMetric, graph_of
-from physgraph_usd.integrate.network import VECTORS, Physgraph, PhysgraphConfig
-from physgraph_usd.integrate.recorded import Place
-from physgraph_usd.integrate.weights import random_network
-from physgraph_usd.scene import GarmentFrame
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.fused import fused_physgraph
+from physgraph_usd.solver.integrate.learned import LearnedMetric, graph_of
+from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
+from physgraph_usd.solver.integrate.recorded import Place
+from physgraph_usd.solver.integrate.weights import random_network
+from physgraph_usd.solver.scene import GarmentFrame
 
 LOCAL = PhysgraphConfig(("secant", "metric1", "move1", "diagonal"), width=16, means=False)
 ALL = PhysgraphConfig(VECTORS, width=8, rounds=1, strain=True)

@@ -16,8 +16,8 @@ from benchmarks.convergence import from_least
 from benchmarks.learned import FRONT, SCHEDULES, Runs, measured
 from physgraph_usd.chart.problem import ALONE, Problem
 from physgraph_usd.chart.reference import Reference, find_reference
-from physgraph_usd.integrate import METHODS
-from physgraph_usd.scene import Frame, Scene
+from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.solver.scene import Frame, Scene
 
 
 def squeezed() -> tuple[Problem, Frame]:

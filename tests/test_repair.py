@@ -11,15 +11,15 @@ import torch
 from bodies import ball, together
 from folds import crumpled, frame_with, levels_of, named, refiner_with, square
 
-from physgraph_usd.colliders.mesh import MeshBody
-from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.contact.bodies import FrameBodies, Touching
-from physgraph_usd.contact.cloth_mesh import ClothMesh
-from physgraph_usd.contact.repair import repaired_cage
-from physgraph_usd.contact.settings import ContactSettings
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.samples import write_sample
+from physgraph_usd.solver.colliders.mesh import MeshBody
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.contact.bodies import FrameBodies, Touching
+from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
+from physgraph_usd.solver.contact.repair import repaired_cage
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.usd.reader import open_shot
 
 

@@ -13,10 +13,10 @@ from cloth import DOWN, FABRIC, frame_of, sheet
 from meshes import grid, mesh_of
 from sheets import garment_of
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.level import build_levels
-from physgraph_usd.mesh.subdivide import fine_count, subdivide_times
-from physgraph_usd.resolution import (
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.level import build_levels
+from physgraph_usd.solver.mesh.subdivide import fine_count, subdivide_times
+from physgraph_usd.solver.resolution import (
     AUTO,
     EDGES_PER_WAVE,
     LEAST_STRAIN,
@@ -31,7 +31,7 @@ from physgraph_usd.resolution import (
     sharp_folds,
     too_coarse,
 )
-from physgraph_usd.scene import Frame, Scene
+from physgraph_usd.solver.scene import Frame, Scene
 
 EDGE = 0.05
 MESH, REST = sheet(6, 4, EDGE)

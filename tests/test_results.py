@@ -22,7 +22,7 @@ from benchmarks.results import PARTS, Journal, page, run
 from benchmarks.rows import Found, Part, Row, under
 from benchmarks.skinning_repair import turned_over
 from benchmarks.step_rows import PAPER_MS, parsed, size_of
-from physgraph_usd.level import Level, build_levels, refine_garments
+from physgraph_usd.solver.level import Level, build_levels, refine_garments
 
 
 def level_of(columns: int, rows: int) -> Level:

@@ -7,8 +7,8 @@ import pytest
 import torch
 from bodies import ball, box, surfaces, together
 
-from physgraph_usd.colliders.primitives import ShapeSurface
-from physgraph_usd.contact.room import room_above
+from physgraph_usd.solver.colliders.primitives import ShapeSurface
+from physgraph_usd.solver.contact.room import room_above
 
 
 @pytest.mark.parametrize("gap", [0.0005, 0.01, 0.05])

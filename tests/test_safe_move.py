@@ -14,10 +14,10 @@ import torch
 from folds import named
 from scipy.spatial import Delaunay
 
-from physgraph_usd.collide.parts import Parts
-from physgraph_usd.contact.safe_move import Moved, safe_move
-from physgraph_usd.level import Level, build_levels
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.collide.parts import Parts
+from physgraph_usd.solver.contact.safe_move import Moved, safe_move
+from physgraph_usd.solver.level import Level, build_levels
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
 EDGE = 0.02

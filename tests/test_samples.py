@@ -17,10 +17,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.mesh.rays import Rays
 from physgraph_usd.samples import SAMPLES, write_sample
 from physgraph_usd.samples.grid import ease, quad_grid, springs
 from physgraph_usd.samples.panel import Cut, sew
+from physgraph_usd.solver.mesh.rays import Rays
 from physgraph_usd.usd.plain import PlainMesh, PlainStage
 
 GARMENT, COLLIDER = "PhysGraphGarmentAPI", "PhysGraphColliderAPI"

@@ -12,7 +12,7 @@ from pxr import Plug, Sdf, Usd, UsdGeom, UsdShade
 from stages import author, sheet_shot, value_type
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.fabric import PRESETS
+from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.usd.lookup import find_value
 from physgraph_usd.usd.schema import (
     COLLIDER,

@@ -27,19 +27,19 @@ from folds import (
 )
 from shots import refine
 
-from physgraph_usd.collide.crossings import crossings
-from physgraph_usd.collide.near import near_pairs
-from physgraph_usd.collide.parts import Parts
-from physgraph_usd.collide.sweep import Reach
-from physgraph_usd.contact.bodies import LevelBodies
-from physgraph_usd.contact.push_out import projected, pushed_out
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.forces import elastic_terms
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.forces.seam import Seam, SewnForces
-from physgraph_usd.level import Level, Placed
-from physgraph_usd.mesh.topology import PolygonMesh, joined_by
-from physgraph_usd.scene import Garment
+from physgraph_usd.solver.collide.crossings import crossings
+from physgraph_usd.solver.collide.near import near_pairs
+from physgraph_usd.solver.collide.parts import Parts
+from physgraph_usd.solver.collide.sweep import Reach
+from physgraph_usd.solver.contact.bodies import LevelBodies
+from physgraph_usd.solver.contact.push_out import projected, pushed_out
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.forces import elastic_terms
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.forces.seam import Seam, SewnForces
+from physgraph_usd.solver.level import Level, Placed
+from physgraph_usd.solver.mesh.topology import PolygonMesh, joined_by
+from physgraph_usd.solver.scene import Garment
 
 SOFT = replace(FABRIC, shear=10.0)
 """A fabric that also resists shear."""

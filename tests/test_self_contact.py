@@ -12,7 +12,7 @@ from sheets import irregular, level_of, rotation
 from test_force_hessians import dense
 from test_forces import crumple
 
-from physgraph_usd.forces.self_contact import Gaps, SelfContact, Spheres
+from physgraph_usd.solver.forces.self_contact import Gaps, SelfContact, Spheres
 
 POINTS, TRIANGLES = irregular(0.4, 0.3, 0.1)
 LEVEL = level_of(POINTS, TRIANGLES)

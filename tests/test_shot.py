@@ -14,12 +14,7 @@ from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_times
 from stages import author
 
-from physgraph_usd.errors import (
-    LayerError,
-    SchemaError,
-    StageError,
-    UsageError,
-)
+from physgraph_usd.errors import LayerError, SchemaError, StageError, UsageError
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.shot import inspect_shot, refine_shot
 from physgraph_usd.usd.validate import validate_layer

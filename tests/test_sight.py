@@ -8,12 +8,12 @@ import torch
 from bodies import Soup
 from folds import levels_of, named, square
 
-from physgraph_usd.colliders.mesh import MeshBody
-from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.contact.bodies import FrameBodies, LevelBodies, Touching
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.contact.sight import Sight
-from physgraph_usd.level import Level
+from physgraph_usd.solver.colliders.mesh import MeshBody
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.contact.bodies import FrameBodies, LevelBodies, Touching
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.contact.sight import Sight
+from physgraph_usd.solver.level import Level
 
 OFFSET = 0.002
 WALL = ((1.0, 0.0, 0.0), (0.0, 0.01, 0.0))

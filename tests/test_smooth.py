@@ -17,9 +17,9 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from test_subdivide import same_surface
 
-from physgraph_usd.mesh.attributes import edge_subset
-from physgraph_usd.mesh.subdivide import Refinement, smooth, subdivide
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.mesh.attributes import edge_subset
+from physgraph_usd.solver.mesh.subdivide import Refinement, smooth, subdivide
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 BLENDER = """
 import sys, numpy as np, bpy

@@ -10,16 +10,16 @@ from bodies import ball
 from brute import Soup, crossings
 from folds import EDGE, contact_of, folded, levels_of, named, square, strip
 
-from physgraph_usd.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.colliders.pose import MeshPose
-from physgraph_usd.contact.bodies import STALE, FrameBodies, Touching
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.contact.solve import solve_touching
-from physgraph_usd.integrate.base import System
-from physgraph_usd.integrate.metric import Metric
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, LevelReport
-from physgraph_usd.level import Level
+from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.contact.bodies import STALE, FrameBodies, Touching
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.contact.solve import solve_touching
+from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, LevelReport
+from physgraph_usd.solver.level import Level
 
 
 class Springs:

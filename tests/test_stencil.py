@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from physgraph_usd.mesh.stencil import Stencil
+from physgraph_usd.solver.mesh.stencil import Stencil
 
 
 @given(rows=st.integers(1, 8), columns=st.integers(1, 8), density=st.floats(0, 1), seed=st.integers(0, 2**16))

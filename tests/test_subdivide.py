@@ -9,9 +9,9 @@ from hypothesis import given
 from meshes import any_mesh, cube, faces_of, grid, mesh_of, planar_mesh, prism, tetrahedron
 from scipy.spatial import KDTree
 
-from physgraph_usd.mesh.attributes import edge_subset
-from physgraph_usd.mesh.subdivide import compose, subdivide, subdivide_times
-from physgraph_usd.mesh.topology import PolygonMesh, find_edges
+from physgraph_usd.solver.mesh.attributes import edge_subset
+from physgraph_usd.solver.mesh.subdivide import compose, subdivide, subdivide_times
+from physgraph_usd.solver.mesh.topology import PolygonMesh, find_edges
 
 
 def signed_areas(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bodies import ball, flipped, tube
 
-from physgraph_usd.colliders.sweep import Sweep
+from physgraph_usd.solver.colliders.sweep import Sweep
 
 rng = np.random.default_rng(7)
 

@@ -9,7 +9,7 @@ from layers import COAT, TIMES, make_shot
 from pxr import Sdf, Usd, UsdGeom
 
 from physgraph_usd.errors import StageError, UsageError
-from physgraph_usd.fabric import PRESETS
+from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.usd.reader import open_shot
 from physgraph_usd.usd.tag import tag
 

@@ -11,13 +11,13 @@ from brute import Soup, contour_length, crossings
 from energies import evaluate
 from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
 
-from physgraph_usd.collide.crossings import Crossings
-from physgraph_usd.collide.crossings import crossings as crossings_of
-from physgraph_usd.contact.cloth_mesh import ClothMesh
-from physgraph_usd.contact.promise import Promise
-from physgraph_usd.contact.tangles import Tangles, gaps_out, ways_out
-from physgraph_usd.forces.self_contact import SelfContact
-from physgraph_usd.level import Level, Placed
+from physgraph_usd.solver.collide.crossings import Crossings
+from physgraph_usd.solver.collide.crossings import crossings as crossings_of
+from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
+from physgraph_usd.solver.contact.promise import Promise
+from physgraph_usd.solver.contact.tangles import Tangles, gaps_out, ways_out
+from physgraph_usd.solver.forces.self_contact import SelfContact
+from physgraph_usd.solver.level import Level, Placed
 
 BOTH = np.ones((2, 2), bool)
 LIFT = 0.3 * EDGE

@@ -10,7 +10,7 @@ from cloth import Answer
 from folds import Cloth, curved, flat, folded, frame_with, named, refiner_with, rolled, square, strip
 from sheets import rotation
 
-from physgraph_usd.contact.settings import ContactSettings
+from physgraph_usd.solver.contact.settings import ContactSettings
 
 OFF = ContactSettings(cloth="off")
 QUIET = {"flat": flat, "curved": curved, "half a turn": lambda points: curved(points, np.pi)}

@@ -14,13 +14,13 @@ from click.testing import CliRunner, Result
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import UsageError
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.forces.contact import Contact
-from physgraph_usd.integrate.base import Carry, System
-from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.network import PhysgraphConfig
-from physgraph_usd.integrate.paper_network import PaperConfig
-from physgraph_usd.integrate.weights import load_network, random_network
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.forces.contact import Contact
+from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.network import PhysgraphConfig
+from physgraph_usd.solver.integrate.paper_network import PaperConfig
+from physgraph_usd.solver.integrate.weights import load_network, random_network
 from physgraph_usd.train import loop, record
 from physgraph_usd.train.bundle import Bundle, deal
 from physgraph_usd.train.loop import TrainConfig, Trainer, loss_of, nested_gap

@@ -8,15 +8,15 @@ import pytest
 import torch
 from cloth import finest_system, group_of, sheet, wave
 
-from physgraph_usd.fabric import PRESETS, Fabric
-from physgraph_usd.integrate.base import Carry, System
-from physgraph_usd.integrate.guard import Guard
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import FAR, Budget, solve_level
-from physgraph_usd.integrate.truncation import truncated
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
 from physgraph_usd.settled import unsettled
+from physgraph_usd.solver.fabric import PRESETS, Fabric
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.guard import Guard
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import FAR, Budget, solve_level
+from physgraph_usd.solver.integrate.truncation import truncated
 from physgraph_usd.usd.reader import open_shot
 
 

@@ -22,8 +22,8 @@ from shots import CLOTH, cloth_shot
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import PhysGraphError, UsageError
-from physgraph_usd.fabric import PRESETS
 from physgraph_usd.samples import write_sample
+from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.tune.loop import SolveLoop
 from physgraph_usd.tune.session import Shown, TuneSession
 from physgraph_usd.tune.values import TUNABLES, painted_on

@@ -10,10 +10,10 @@ import torch
 from brute import Soup, between_edges, crossings, on_segments, on_triangles
 from folds import SHAPES, folded, frame_with, levels_of, named, placed, refiner_with, square, strip
 
-from physgraph_usd.collide.near import near_pairs
-from physgraph_usd.collide.parts import Parts
-from physgraph_usd.collide.sweep import Reach
-from physgraph_usd.level import Level
+from physgraph_usd.solver.collide.near import near_pairs
+from physgraph_usd.solver.collide.parts import Parts
+from physgraph_usd.solver.collide.sweep import Reach
+from physgraph_usd.solver.level import Level
 
 ONE = np.ones((1, 1), bool)
 

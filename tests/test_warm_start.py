@@ -12,14 +12,14 @@ import torch
 from cloth import frame_of, group_of, sheet, wave
 from folds import frame_with, named, refiner_with, square
 
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.frame.group import Group
-from physgraph_usd.frame.start import STILL
-from physgraph_usd.frame.values import FrameInput
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.resolution import edge_strain
 from physgraph_usd.samples import write_sample
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.start import STILL
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.resolution import edge_strain
 from physgraph_usd.usd.reader import open_shot
 
 MESH, REST = sheet(8, 6)

@@ -11,11 +11,11 @@ import torch
 from cloth import DOWN, FABRIC, GUIDE, settings_of
 from sheets import garment_of
 
-from physgraph_usd.colliders.pose import Collider, MeshPose, Pose
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.mesh.topology import PolygonMesh
-from physgraph_usd.pipeline import Refiner
-from physgraph_usd.scene import Frame, GarmentFrame, Scene, State
+from physgraph_usd.solver.colliders.pose import Collider, MeshPose, Pose
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene, State
 
 Cloth = tuple[PolygonMesh, np.ndarray]
 

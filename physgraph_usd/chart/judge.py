@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..forces.base import ForceModule
-from ..frame.group import Group
-from ..pipeline import Refiner
-from ..resolution import edge_strain
-from ..scene import Frame
+from ..solver.forces.base import ForceModule
+from ..solver.frame.group import Group
+from ..solver.frame.pipeline import Refiner
+from ..solver.resolution import edge_strain
+from ..solver.scene import Frame
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SolveError
-from ..scene import Frame
+from ..solver.scene import Frame
 from .journal import Journal
 from .methods import DEFAULT, SMOOTH, UPSAMPLED, Curve
 from .plan import Clock, Plan

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ..errors import UsageError
-from ..integrate import METHODS, Method
+from ..solver.integrate import METHODS, Method
 
 DEFAULT = "refine's default"
 UPSAMPLED, SMOOTH = "plain upsampling", "Loop subdivision"

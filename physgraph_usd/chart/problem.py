@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..contact.settings import ContactSettings
-from ..frame.values import FrameInput, State
-from ..level import Level
 from ..options import RefineOptions
-from ..pipeline import Refiner
-from ..scene import Frame, Scene
-from ..solve_settings import SolveSettings
+from ..solver.contact.settings import ContactSettings
+from ..solver.frame.pipeline import Refiner
+from ..solver.frame.settings import SolveSettings
+from ..solver.frame.values import FrameInput, State
+from ..solver.level import Level
+from ..solver.scene import Frame, Scene
 from .judge import Judgement, judge
 
 DEFAULT = RefineOptions().solve_settings()

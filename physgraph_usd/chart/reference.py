@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ..frame.values import State
-from ..integrate import METHODS
-from ..scene import Frame
-from ..solve_settings import SolveSettings
+from ..solver.frame.settings import SolveSettings
+from ..solver.frame.values import State
+from ..solver.integrate import METHODS
+from ..solver.scene import Frame
 from .problem import COLD, Problem
 
 STARTS = (

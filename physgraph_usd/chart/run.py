@@ -16,9 +16,9 @@ import torch
 
 from ..errors import UsageError
 from ..options import RefineOptions
-from ..resolution import choose_levels, sample_frames
-from ..scene import Frame, Scene
 from ..shot import MOST_LANES, prepare_device
+from ..solver.resolution import choose_levels, sample_frames
+from ..solver.scene import Frame, Scene
 from ..untagged import open_with_colliders
 from ..usd.atomic import check_place
 from ..usd.files import check_targets, files_of

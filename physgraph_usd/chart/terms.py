@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import SolveError
-from ..scene import Frame, GarmentFrame, Scene
-from ..solve_settings import SolveSettings
+from ..solver.frame.settings import SolveSettings
+from ..solver.scene import Frame, GarmentFrame, Scene
 from .journal import Journal
 from .plan import Clock
 from .problem import COLD, Problem, Solved, with_garments

@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 from ..errors import UsageError
-from ..fabric import PRESETS
 from ..plain_json import to_json
+from ..solver.fabric import PRESETS
 from .options import (
     asset_paths_option,
     collider_option,
@@ -222,8 +222,8 @@ def warm_up(device: str) -> None:
 
     They are kept in the folder that WARP_CACHE_PATH names, by default in the user's cache.
     """
-    from ..mesh.lanes import compile_kernels
     from ..shot import prepare_device
+    from ..solver.mesh.lanes import compile_kernels
 
     prepare_device(device)
     compile_kernels(device)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import LayerError, StageError
-from ..pipeline import Refiner
 from ..report import RefineReport
+from ..solver.frame.pipeline import Refiner
 from ..usd.readback import RefinedLayer
 from ..usd.reader import Shot
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from ..fabric import PRESETS
+from ..solver.fabric import PRESETS
 from ..usd.plain import Look, PlainMesh, PlainStage
 from .grid import ease
 from .panel import sew

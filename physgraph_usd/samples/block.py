@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..fabric import PRESETS
+from ..solver.fabric import PRESETS
 from ..usd.plain import Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
 from .grid import grid_uv, quad_grid

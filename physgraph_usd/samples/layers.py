@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..fabric import PRESETS, Fabric
+from ..solver.fabric import PRESETS, Fabric
 from ..usd.plain import Look, PlainMesh, PlainStage
 from .grid import ease
 from .walker import Cage, Cells, body, trousers, tube, walk

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import Delaunay
 
-from ..fabric import PRESETS
+from ..solver.fabric import PRESETS
 from ..usd.plain import FaceVarying, Look, PlainMesh, PlainStage
 from .grid import ease
 

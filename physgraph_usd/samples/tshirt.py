@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..fabric import PRESETS
+from ..solver.fabric import PRESETS
 from ..usd.plain import Look, PlainMesh, PlainStage, Skeleton, Skin
 from .grid import ease, quad_grid
 from .panel import Cut, Pillow, sew

@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..contact.settings import ContactSettings
-from ..forces.base import ForceModule
-from ..forces.contact import Contact, Planes
-from ..integrate.around import Around
-from ..integrate.base import System
-from ..integrate.metric import Metric
-from ..level import Level
+from ..solver.contact.settings import ContactSettings
+from ..solver.forces.base import ForceModule
+from ..solver.forces.contact import Contact, Planes
+from ..solver.integrate.around import Around
+from ..solver.integrate.base import System
+from ..solver.integrate.metric import Metric
+from ..solver.level import Level
 
 HEIGHT = (-2.0, -0.9)
 """Powers of ten between which the waves' heights lie, in cage edges: a body comes through its cloth by so much."""

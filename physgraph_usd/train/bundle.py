@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..frame.group import Group
-from ..integrate import METHODS
-from ..level import refine_garments
-from ..solve_settings import SolveSettings
+from ..solver.frame.group import Group
+from ..solver.frame.settings import SolveSettings
+from ..solver.integrate import METHODS
+from ..solver.level import refine_garments
 from .bodies import with_bodies
 from .patches import Patch
 from .unroll import JointSystem

@@ -18,13 +18,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import UsageError
-from ..integrate.base import Integrator
-from ..integrate.learned import integrator_of
-from ..integrate.network import Physgraph, PhysgraphConfig
-from ..integrate.paper_network import PaperConfig, PaperNetwork
-from ..integrate.quasi_newton import QuasiNewton
-from ..integrate.weights import make_network
 from ..plain_json import to_json
+from ..solver.integrate.base import Integrator
+from ..solver.integrate.learned import integrator_of
+from ..solver.integrate.network import Physgraph, PhysgraphConfig
+from ..solver.integrate.paper_network import PaperConfig, PaperNetwork
+from ..solver.integrate.quasi_newton import QuasiNewton
+from ..solver.integrate.weights import make_network
 from .bundle import Bundle, deal
 from .patches import Patch, PatchConfig, make_patches
 from .unroll import Twin, detached, unrolled

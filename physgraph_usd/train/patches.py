@@ -20,18 +20,18 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ..fabric import Fabric
-from ..frame.group import Group
-from ..integrate import METHODS
-from ..integrate.base import System
-from ..integrate.quasi_newton import QuasiNewton
-from ..integrate.saddle import leave_saddle
-from ..integrate.solve import Budget, solve_level
-from ..level import refine_garments
-from ..mesh.topology import PolygonMesh, edges_of
-from ..scene import Garment, GarmentFrame
 from ..shot import prepare_device
-from ..solve_settings import SolveSettings
+from ..solver.fabric import Fabric
+from ..solver.frame.group import Group
+from ..solver.frame.settings import SolveSettings
+from ..solver.integrate import METHODS
+from ..solver.integrate.base import System
+from ..solver.integrate.quasi_newton import QuasiNewton
+from ..solver.integrate.saddle import leave_saddle
+from ..solver.integrate.solve import Budget, solve_level
+from ..solver.level import refine_garments
+from ..solver.mesh.topology import PolygonMesh, edges_of
+from ..solver.scene import Garment, GarmentFrame
 from .bodies import Body, with_bodies
 
 SHAPES = ("sheet", "tube", "dome")

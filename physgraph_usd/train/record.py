@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 import torch
 
 from ..errors import UsageError
-from ..integrate.network import VECTORS, PhysgraphConfig
-from ..integrate.paper_network import PaperConfig
-from ..integrate.weights import save_network
 from ..plain_json import to_json
+from ..solver.integrate.network import VECTORS, PhysgraphConfig
+from ..solver.integrate.paper_network import PaperConfig
+from ..solver.integrate.weights import save_network
 from ..version import __version__
 from .loop import TrainConfig, Trainer
 from .patches import PatchConfig, describe

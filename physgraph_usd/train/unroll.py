@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..forces.base import ForceModule
-from ..integrate.base import Carry, Integrator, Solver, System
+from ..solver.forces.base import ForceModule
+from ..solver.integrate.base import Carry, Integrator, Solver, System
 
 NOISE = 1e-3
 """Root mean square of what a twin's start differs by, in local edge lengths: well above float32's rounding."""

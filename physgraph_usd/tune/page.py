@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import PhysGraphError
-from ..fabric import PRESETS
+from ..solver.fabric import PRESETS
 from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
 from .figures import figures
 from .guard import guarded_server

@@ -9,8 +9,8 @@ import trimesh
 import viser
 from trimesh.exchange.gltf import export_glb
 
-from ..colliders.pose import MeshPose, Pose
-from ..scene import Frame
+from ..solver.colliders.pose import MeshPose, Pose
+from ..solver.scene import Frame
 from ..usd.shapes import tessellated
 from .session import Shown, TuneSession
 from .values import painted_on

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import UsageError
-from ..fabric import PRESETS
-from ..mesh.subdivide import Refinement
-from ..resolution import choose_levels, sample_frames
-from ..scene import Frame, State
 from ..shot import prepare_device
+from ..solver.fabric import PRESETS
+from ..solver.mesh.subdivide import Refinement
+from ..solver.resolution import choose_levels, sample_frames
+from ..solver.scene import Frame, State
 from ..untagged import AUTO, bodies_beside, open_with_colliders, told_beside
 from ..usd.schema import AUTO_LEVEL, GARMENT
 from ..usd.tag import fabric_values, tag

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from ..lead_in import cages_walked
 from ..options import RefineOptions
-from ..pipeline import Refiner
-from ..scene import State
 from ..shot import MOST_LANES, sampled_at
-from ..solve_settings import SolveSettings
+from ..solver.frame.lead_in import cages_walked
+from ..solver.frame.pipeline import Refiner
+from ..solver.frame.settings import SolveSettings
+from ..solver.scene import State
 from ..usd.reader import Shot
 
 BUDGET_MS = 1000.0

@@ -8,8 +8,8 @@ from functools import reduce
 
 import numpy as np
 
-from ..mesh.subdivide import Refinement
-from ..scene import Garment, GarmentFrame
+from ..solver.mesh.subdivide import Refinement
+from ..solver.scene import Garment, GarmentFrame
 from ..usd.schema import GARMENT
 
 

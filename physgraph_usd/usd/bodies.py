@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ..colliders.orient import FIXED
-from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
-from ..mesh.topology import PolygonMesh
-from ..scene import FARTHEST, out_of_bounds
+from ..solver.colliders.orient import FIXED
+from ..solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
+from ..solver.mesh.topology import PolygonMesh
+from ..solver.scene import FARTHEST, out_of_bounds
 from .lookup import COLLIDER_OFFSET, COLLIDER_SIDE, find_token, find_value
 from .placement import is_flipped, place, timecode
 from .shapes import UPRIGHT, tessellated

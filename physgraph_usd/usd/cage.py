@@ -13,7 +13,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ..errors import GarmentError
-from ..mesh.topology import PolygonMesh
+from ..solver.mesh.topology import PolygonMesh
 from ..words import counted
 from .stage import Notice
 

@@ -12,9 +12,16 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from ..mesh.attributes import corner_values, edge_subset, face_subset, uniform_values, vertex_subset, vertex_values
-from ..mesh.subdivide import Refinement, compose
-from ..mesh.topology import PolygonMesh
+from ..solver.mesh.attributes import (
+    corner_values,
+    edge_subset,
+    face_subset,
+    uniform_values,
+    vertex_subset,
+    vertex_values,
+)
+from ..solver.mesh.subdivide import Refinement, compose
+from ..solver.mesh.topology import PolygonMesh
 
 
 class FineMap:

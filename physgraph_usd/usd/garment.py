@@ -11,9 +11,9 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ..errors import GarmentError
-from ..mesh.fit import median_shape
-from ..mesh.topology import PolygonMesh, edges_of
-from ..scene import Garment, GarmentFrame
+from ..solver.mesh.fit import median_shape
+from ..solver.mesh.topology import PolygonMesh, edges_of
+from ..solver.scene import Garment, GarmentFrame
 from .cage import read_cage
 from .deformable import rest_angle_notices
 from .lookup import Override, find_value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pxr import Sdf
 
-from ..scene import Garment, GarmentFrame
+from ..solver.scene import Garment, GarmentFrame
 from .overs import edit_schemas
 from .schema import GARMENT_API
 from .stage import GarmentSource

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from ..fabric import Fabric
+from ..solver.fabric import Fabric
 from .deformable import STIFFNESSES, Derived, density, read_thickness, stiffness
 from .lookup import Found, Override, bound_materials, find_value
 from .schema import GARMENT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from ..mesh.topology import PolygonMesh
+from ..solver.mesh.topology import PolygonMesh
 
 _FALLBACK = np.array([0.0, 1.0, 0.0])
 

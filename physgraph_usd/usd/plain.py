@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..fabric import Fabric
+from ..solver.fabric import Fabric
 
 
 @dataclass(frozen=True)

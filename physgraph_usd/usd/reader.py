@@ -20,7 +20,7 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from ..errors import AbsentError, SchemaError, StageError, UsageError
-from ..scene import Frame, Scene, refuse_falling, refuse_far
+from ..solver.scene import Frame, Scene, refuse_falling, refuse_far
 from .apart import read_apart
 from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots

@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ..errors import GarmentError
-from ..scene import out_of_bounds
+from ..solver.scene import out_of_bounds
 from .lookup import nearest, source_name
 from .points import as_points, repair
 from .stage import Notice

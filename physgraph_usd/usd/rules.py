@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
-from ..mesh.topology import PolygonMesh
+from ..solver.mesh.topology import PolygonMesh
 from .heat import HEAT, PREFIX
 from .limits import beyond_limits
 from .normals import VertexNormals

@@ -18,7 +18,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdUtils, Vt
 
 from ..errors import LayerError, UsageError
-from ..mesh.topology import PolygonMesh
+from ..solver.mesh.topology import PolygonMesh
 from .atomic import prepare_target, publish, temporary_path
 from .chunk import CHUNK, Chunk, read_chunk
 from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of

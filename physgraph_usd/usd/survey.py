@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from pxr import Usd
 
-from ..colliders.orient import pieces_of
 from ..errors import StageError
+from ..solver.colliders.orient import pieces_of
 from .cage import read_cage
 from .find import has_schema, instance_roots
 from .placement import check_placement

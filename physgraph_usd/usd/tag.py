@@ -8,8 +8,8 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdGeom
 
 from ..errors import SchemaError, StageError, UsageError
-from ..fabric import PRESETS, Fabric
 from ..sides import SIDES
+from ..solver.fabric import PRESETS, Fabric
 from .atomic import ASSET_PATHS, prepare_target
 from .files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from .find import find_colliders, find_garments

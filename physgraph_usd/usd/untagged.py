@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
-from ..colliders.pose import Collider, MeshPose, Pose
 from ..errors import GarmentError
+from ..solver.colliders.pose import Collider, MeshPose, Pose
 from .bodies import ColliderReader
 from .find import has_schema, traverse
 from .garment import is_visible

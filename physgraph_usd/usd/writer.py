@@ -17,7 +17,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ..errors import LayerError, UsageError
-from ..mesh.subdivide import Refinement
+from ..solver.mesh.subdivide import Refinement
 from . import overs, provenance
 from .carry import FineMap
 from .chunk import CHUNK, Chunk

@@ -21,7 +21,7 @@ from test_contact_bodies import KINDS, STILL, jaws, pane
 from test_contact_cloth import THICK, WEIGHTLESS, counted, crossed, seam_gap, told, tube_of_cloth
 from test_contact_moving import STEP, needles, pulled, ring
 
-from physgraph_usd.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.pose import MeshPose
 
 SHEET = square(8)
 REST = SHEET[1]

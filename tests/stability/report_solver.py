@@ -16,14 +16,14 @@ from test_jumps import JUMPS, jumping
 from test_meshes import ALMOST_NOTHING, CORNERS, FAULTS, faulty, hung
 from test_starts import ball, squeezed
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.frame.values import FrameInput
-from physgraph_usd.integrate import method_named
-from physgraph_usd.integrate.base import Carry
-from physgraph_usd.integrate.guard import Guard
-from physgraph_usd.integrate.solve import Budget, solve_level
-from physgraph_usd.mesh.topology import PolygonMesh
-from physgraph_usd.scene import GarmentFrame
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.integrate.base import Carry
+from physgraph_usd.solver.integrate.guard import Guard
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import GarmentFrame
 
 EDGE = 0.05
 LONG = {"steps": 200, "tolerance": 1e-6}

@@ -20,8 +20,8 @@ from test_forces_folds import TRIANGLES, hinge
 from test_guard import PROPOSALS, descent, problem
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.resolution import too_coarse
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.resolution import too_coarse
 
 
 def s5_broken_point(method: str) -> Result:

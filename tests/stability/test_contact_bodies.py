@@ -16,8 +16,8 @@ from test_contact import REST as WIDE_REST
 from test_contact import SHAPES, draped, up
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.colliders.primitives import ShapeSurface
+from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.solver.colliders.primitives import ShapeSurface
 
 SHEET = square(8)
 REST = SHEET[1]

@@ -13,9 +13,9 @@ from folds import EDGE, Cloth, frame_with, named, refiner_with, square
 from sheets import garment_of
 from test_tangles import cornered, dented
 
-from physgraph_usd.contact.settings import ContactSettings
-from physgraph_usd.level import refine_garments
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 THICK = 1e-3
 """Thickness of the fabric [m]."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drape import BANDS, INNER, OUTER, disc, drape, shadow
 
-from physgraph_usd.fabric import PRESETS
+from physgraph_usd.solver.fabric import PRESETS
 
 BELOW = pytest.mark.xfail(reason="the preset drapes more than is published: docs/fabrics.md", strict=True)
 

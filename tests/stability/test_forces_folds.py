@@ -8,8 +8,8 @@ import torch
 from energies import apart, autograd_force, bending_energy, difference_force, evaluate
 from sheets import level_of, rotation
 
-from physgraph_usd.forces.bending import Bending
-from physgraph_usd.level import Level
+from physgraph_usd.solver.forces.bending import Bending
+from physgraph_usd.solver.level import Level
 
 TRIANGLES = np.array([[0, 1, 2], [1, 0, 3]])
 REST_ANGLES = (0.0, 1.0, -2.5, 3.0)

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from sheets import equilateral, level_of, rotation
 from test_forces import force_of
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.forces.base import ForceModule
-from physgraph_usd.forces.bending import Bending
-from physgraph_usd.forces.membrane import in_plane_terms
-from physgraph_usd.integrate.base import System
-from physgraph_usd.integrate.metric import Metric
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.forces.bending import Bending
+from physgraph_usd.solver.forces.membrane import in_plane_terms
+from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
 
 INTERNAL = ("stretch", "membrane", "bending")
 

@@ -10,10 +10,10 @@ import pytest
 import torch
 from cloth import finest_system, group_of, sheet, wave
 
-from physgraph_usd.integrate.base import Carry, System
-from physgraph_usd.integrate.guard import PATIENCE, Guard
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.guard import PATIENCE, Guard
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
 
 Proposal = Callable[[Carry, torch.Generator], torch.Tensor]
 
@@ -119,7 +119,7 @@ def test_s37_a_good_direction_that_overshoots_is_halved_or_quartered():
 
 def test_s37_at_the_minimum_it_stays():
     system, x = problem()
-    from physgraph_usd.integrate.newton import Newton
+    from physgraph_usd.solver.integrate.newton import Newton
 
     x, _ = solve_level(system, Newton(), x, level=0, budget=Budget(60, 1e-10))
     carries = descent(system, x, PROPOSALS["random"], steps=5)

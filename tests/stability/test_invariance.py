@@ -11,9 +11,9 @@ from cloth import DOWN, FABRIC, base_of, frame_of, refiner_of, rms, sheet, solve
 from meshes import grid, mesh_of
 from sheets import garment_of, rotation
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.integrate import METHODS
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 EDGE = 0.05
 FAR = np.array([1e5, -2e5, 3e5])

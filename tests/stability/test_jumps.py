@@ -10,7 +10,7 @@ import torch
 from cloth import Solver, frame_of, refiner_of, rms, sheet, solved, wave
 from sheets import garment_of, rotation
 
-from physgraph_usd.scene import Frame
+from physgraph_usd.solver.scene import Frame
 
 EDGE = 0.05
 MESH, REST = sheet(8, 6, EDGE)

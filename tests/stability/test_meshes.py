@@ -10,9 +10,9 @@ from meshes import mesh_of
 from sheets import garment_of
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.integrate import METHODS
-from physgraph_usd.mesh.defects import defects
-from physgraph_usd.mesh.topology import PolygonMesh
+from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.solver.mesh.defects import defects
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0.01], [0.5, 0.5, 0.5]])
 ALMOST_NOTHING = {

@@ -9,16 +9,16 @@ import pytest
 import torch
 from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.integrate.base import Carry, System
-from physgraph_usd.integrate.guard import Guard
-from physgraph_usd.integrate.learned import integrator_of
-from physgraph_usd.integrate.network import VECTORS, PhysgraphConfig
-from physgraph_usd.integrate.paper_network import PaperConfig
-from physgraph_usd.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.integrate.solve import Budget, solve_level
-from physgraph_usd.integrate.weights import FOLDER, load_network, random_network
-from physgraph_usd.scene import GarmentFrame
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.guard import Guard
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
+from physgraph_usd.solver.integrate.paper_network import PaperConfig
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.weights import FOLDER, load_network, random_network
+from physgraph_usd.solver.scene import GarmentFrame
 
 RANDOM = {
     "physgraph": PhysgraphConfig(width=16),

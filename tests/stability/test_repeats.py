@@ -10,8 +10,8 @@ import torch
 from cloth import FABRIC, GUIDE, frame_of, group_of, refiner_of, rms, sheet, solved, total, wave
 from sheets import garment_of
 
-from physgraph_usd.frame.values import FrameInput
-from physgraph_usd.scene import Frame, GarmentFrame
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.scene import Frame, GarmentFrame
 
 MESH, REST = sheet(8, 6)
 TIMES = tuple(float(time) for time in range(1, 9))

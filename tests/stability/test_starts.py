@@ -11,11 +11,11 @@ import torch
 from cloth import Answer, finest_system, frame_of, group_of, refiner_of, sheet, solved, total, wave
 from sheets import garment_of, rotation
 
-from physgraph_usd.fabric import Fabric
-from physgraph_usd.integrate import method_named
-from physgraph_usd.integrate.base import Carry
-from physgraph_usd.integrate.guard import Guard
-from physgraph_usd.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.integrate import method_named
+from physgraph_usd.solver.integrate.base import Carry
+from physgraph_usd.solver.integrate.guard import Guard
+from physgraph_usd.solver.integrate.solve import Budget, solve_level
 
 EDGE = 0.05
 

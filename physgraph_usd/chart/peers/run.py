@@ -14,13 +14,13 @@ import scipy.sparse as sp
 import torch
 
 from ...errors import SolveError, UsageError
-from ...forces.base import ForceModule
-from ...forces.bending import Bending
-from ...forces.guide import Guide
-from ...forces.stretch import Stretch
-from ...frame.group import Group
-from ...level import Level
-from ...scene import Frame
+from ...solver.forces.base import ForceModule
+from ...solver.forces.bending import Bending
+from ...solver.forces.guide import Guide
+from ...solver.forces.stretch import Stretch
+from ...solver.frame.group import Group
+from ...solver.level import Level
+from ...solver.scene import Frame
 from ..journal import Journal
 from ..plan import Clock, Plan
 from ..problem import Problem

@@ -13,13 +13,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ...errors import SolveError
 from ..contact.bodies import FrameBodies, Touching
 from ..contact.cloth import ClothContact
 from ..contact.frame import FrameContact, LevelContact
 from ..contact.seams import Seams
 from ..contact.settings import ContactSettings
-from ..errors import SolveError
-from ..followers import Followers
 from ..forces.base import ForceModule
 from ..forces.guide import GuideMap
 from ..integrate.base import Integrator, System
@@ -29,10 +28,11 @@ from ..level import Placed, build_levels, unhindered
 from ..mesh.subdivide import Refinement
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST, Garment, GarmentFrame, recentred
-from ..solve_settings import SolveSettings
 from .descent import Problem
 from .detail import MovingFrames
+from .followers import Followers
 from .level_forces import LevelForces, blame, build_forces, named
+from .settings import SolveSettings
 from .start import Start, start_of
 from .values import Cage, FrameInput, Solved, State
 

@@ -18,13 +18,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from ..errors import WeightsError
+from ...errors import WeightsError
 from .network import VECTORS, Physgraph, PhysgraphConfig
 from .paper_network import PaperConfig, PaperNetwork
 
 VERSION = "2"
 """Format of the file and meaning of the features; other versions are refused."""
-FOLDER = Path(__file__).resolve().parents[1] / "weights"
+FOLDER = Path(__file__).resolve().parents[2] / "weights"
 """The weights that ship."""
 
 Network = Physgraph | PaperNetwork

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from .errors import SolveError, StageError
+from ...errors import SolveError, StageError
+from ..scene import Frame, Scene
 from .pipeline import Refiner
-from .scene import Frame, Scene
-from .solve_settings import SolveSettings
+from .settings import SolveSettings
 
 
 def cages_walked(

@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from .contact.settings import ContactSettings
-from .integrate import Method
-from .integrate.solve import Budget
+from ..contact.settings import ContactSettings
+from ..integrate import Method
+from ..integrate.solve import Budget
 
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
 """Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from .errors import StageError
+from ..errors import StageError
 from .level import Level, hinge_geometry
 from .mesh.subdivide import fine_count
 from .mesh.topology import edges_of

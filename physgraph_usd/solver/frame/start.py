@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ..level import Level
 from ..resolution import edge_strain
-from ..solve_settings import Reset
 from .detail import MovingFrames
+from .settings import Reset
 from .values import Cage, State
 
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0

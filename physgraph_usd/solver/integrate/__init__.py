@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import UsageError
+from ...errors import UsageError
 from .base import Integrator
 from .first_order import Adam, GradientDescent
 from .guard import Guard

@@ -22,7 +22,17 @@ from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
 from .around import Around
 from .features import NORMAL, STRAIN, Parts, seeing
-from .network import FLOOR, LOG_OFFSET, LOG_SCALE, Physgraph, PhysgraphConfig, clock_of, counted, families_of, pairs_of
+from .network import (
+    FLOOR,
+    LOG_OFFSET,
+    LOG_SCALE,
+    Physgraph,
+    PhysgraphConfig,
+    clock_of,
+    counted,
+    families_of,
+    pairs_of,
+)
 
 wp.set_module_options({"enable_backward": False})
 

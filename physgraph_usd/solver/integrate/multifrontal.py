@@ -35,7 +35,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ..errors import SolveError
+from ...errors import SolveError
 from ..mesh.lanes import current_stream
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 from .dissection import dissect

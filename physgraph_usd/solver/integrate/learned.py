@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..errors import SolveError
+from ...errors import SolveError
 from .around import Around
 from .base import Carry, Surface, System
 from .fused import FusedPhysgraph, can_fuse, fused_physgraph

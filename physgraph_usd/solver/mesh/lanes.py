@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from ..interrupts import undisturbed
+from ...interrupts import undisturbed
 
 _STDERR = 2
 LEAST_PER_LANE = 4000

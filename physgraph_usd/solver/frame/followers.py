@@ -8,8 +8,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from .level import PIN_MARGIN, Level, Placed
-from .mesh.topology import PolygonMesh
+from ..level import PIN_MARGIN, Level, Placed
+from ..mesh.topology import PolygonMesh
 
 NEAREST = 1e-6
 """Distance under which points count as at one place, in edge lengths."""

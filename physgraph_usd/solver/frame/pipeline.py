@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from .contact.bodies import Touching
-from .contact.broad_phase import Bodies, Parts, bounds_of, reach_of
-from .contact.heat import body_crossings, penetration_map
-from .contact.passed import Passed
-from .deadline import ends_after, is_over
-from .errors import GarmentError, SolveError
-from .frame.group import Group
-from .frame.values import FrameInput, Solved, join, split
+from ...errors import GarmentError, SolveError
+from ..contact.bodies import Touching
+from ..contact.broad_phase import Bodies, Parts, bounds_of, reach_of
+from ..contact.heat import body_crossings, penetration_map
+from ..contact.passed import Passed
+from ..deadline import ends_after, is_over
+from ..level import refine_garments
+from ..mesh.subdivide import Refinement
+from ..mesh.topology import edges_of
+from ..scene import Frame, GarmentFrame, Scene, State, out_of_bounds, refuse_far
+from ..strain import has_collapsed, size_left, strayed
+from .group import Group
 from .history import Known, bodies_moved, came_back, jumped_in
-from .level import refine_garments
-from .mesh.subdivide import Refinement
-from .mesh.topology import edges_of
-from .scene import Frame, GarmentFrame, Scene, State, out_of_bounds, refuse_far
-from .solve_settings import SolveSettings
-from .strain import has_collapsed, size_left, strayed
+from .settings import SolveSettings
+from .values import FrameInput, Solved, join, split
 
 LIMIT, LEAST_LIMIT, LIMIT_PER_VERTEX = 20.0, 120.0, 0.01
 """A frame stops where it stands after so many times the median of the shot's frames, but never before so many seconds

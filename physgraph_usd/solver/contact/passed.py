@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ...words import counted
 from ..colliders.orient import pieces_of
 from ..colliders.pose import Collider, MeshPose, ShapePose
 from ..colliders.sweep import Sweep, through_shape
 from ..scene import Frame, Garment
-from ..words import counted
 
 
 class Passed:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..errors import GarmentError
 from .colliders.pose import Collider, Pose
-from .errors import GarmentError
 from .fabric import Fabric
 from .mesh.topology import PolygonMesh
 

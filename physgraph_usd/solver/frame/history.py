@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .colliders.pose import Pose
-from .frame.values import State
-from .scene import GarmentFrame
+from ..colliders.pose import Pose
+from ..scene import GarmentFrame
+from .values import State
 
 BACK = 0.25
 """Part of the way that the input took into a broken frame by which it may miss its place before, to have come back.

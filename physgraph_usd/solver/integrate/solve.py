@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
+from ...errors import SolveError
 from ..deadline import is_over
-from ..errors import SolveError
 from .base import Carry, Integrator, System, resumed
 
 FAR = 50.0
