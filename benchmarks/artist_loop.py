@@ -24,7 +24,7 @@ from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import refine_shot
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.level import Level, build_levels
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 STIFFNESSES = (4.7e-6, 47e-6)
 TIME = 36.0

@@ -99,7 +99,7 @@ def walk_shot(*, sample: str, level: int, frames: int, out: str, shot: str | Non
     from physgraph_usd.options import RefineOptions  # noqa: PLC0415
     from physgraph_usd.samples import write_sample  # noqa: PLC0415
     from physgraph_usd.solver.frame.pipeline import Refiner  # noqa: PLC0415
-    from physgraph_usd.usd.reader import open_shot  # noqa: PLC0415
+    from physgraph_usd.usd.read.reader import open_shot  # noqa: PLC0415
 
     sys.path.append(str(HERE.parent))
     from crossing_count import crossing_count  # noqa: PLC0415

@@ -34,7 +34,7 @@ from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.level import hinge_geometry
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 from .contact_shots import LANES, REAL, SAMPLES, groups_of
 

@@ -31,7 +31,7 @@ from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.scene import Frame
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 SAMPLES = {"block": (12.0,), "armpit": (15.0,), "layers": (5.0, 8.0, 11.0, 14.0, 17.0, 20.0), "sleeve": (24.0,)}
 """Time codes of each: several where what it ends at differs from frame to frame."""

@@ -33,8 +33,8 @@ from physgraph_usd.solver.contact.frame import FrameContact
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.level import build_levels, refine_garments
 from physgraph_usd.solver.scene import recentred
-from physgraph_usd.usd.meshes import DrawnMesh, DrawnStage, refined_in
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage, refined_in
+from physgraph_usd.usd.read.reader import open_shot
 
 LEVEL, RUN_UP = 2, 6
 """Subdivisions, and frames solved before the one drawn."""

@@ -28,7 +28,7 @@ from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.pipeline import Refiner
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 FORMS = {
     "ours": ContactSettings(),

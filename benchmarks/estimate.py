@@ -19,7 +19,7 @@ from pathlib import Path
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import inspect_shot, refine_shot
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 CASES = (("sleeve", 1), ("sleeve", 2), ("flag", 2), ("skirt", 2), ("tshirt", 2), ("armpit", 2), ("layers", 2))
 LARGE = (("sleeve", 3), ("skirt", 3), ("flag", 4), ("sleeve", 4))

@@ -29,7 +29,7 @@ from physgraph_usd.preview import label, surface_of
 from physgraph_usd.raycast import View, draw, fit_view
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import prepare_device, refine_shot
-from physgraph_usd.usd.meshes import DrawnMesh, DrawnStage
+from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
 
 LEVEL, PANEL, RATE, QUALITY = 2, (480, 540), 12, "25"
 """Subdivisions, one side's size [pixels], frames a second, and x264's rate factor."""

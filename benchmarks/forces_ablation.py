@@ -20,7 +20,7 @@ from benchmarks.rows import Found, Row, run_alone, table
 from benchmarks.shots import CORES, frames_of, opened, problem_of
 from physgraph_usd.chart.judge import Judgement
 from physgraph_usd.chart.problem import COLD, Problem, with_garments
-from physgraph_usd.usd.reader import Shot
+from physgraph_usd.usd.read.reader import Shot
 
 SAMPLE, TIME = "armpit", 15.0
 LEVEL = {True: 1, False: 2}

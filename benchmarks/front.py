@@ -33,7 +33,7 @@ from physgraph_usd.chart.table import TOLERANCE, quickest
 from physgraph_usd.shot import prepare_device
 from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.scene import Frame
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 JOURNAL = f"front.{{}}.{code_of(Path(physgraph_usd.__file__).parent)}.jsonl"
 """Rows of this code, by device."""

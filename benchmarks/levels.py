@@ -26,7 +26,7 @@ from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.level import Level
 from physgraph_usd.solver.resolution import choose_levels, sample_frames
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 WAVES = np.array([4.0, 6.0, 9.0, 13.0, 19.0, 27.0, 38.0, 54.0, 76.0])
 """Ends of the bands [mm]."""

@@ -12,7 +12,7 @@ from contextlib import closing
 import numpy as np
 
 from physgraph_usd.solver.mesh.topology import edges_of
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 FRAMES = 9
 

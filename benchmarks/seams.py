@@ -26,9 +26,9 @@ from benchmarks.contact_shots import REAL, say
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import refine_shot
-from physgraph_usd.usd.chunk import read_chunk
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.stitch import mean_edge, points_at
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.chunk import read_chunk
+from physgraph_usd.usd.write.stitch import mean_edge, points_at
 
 CASES: tuple[tuple[str, int, dict[str, Any]], ...] = (("sleeve", 1, {}), ("swatch", 1, {}), ("flag", 1, {}))
 MORE = (

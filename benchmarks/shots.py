@@ -14,7 +14,7 @@ from physgraph_usd.chart.problem import Problem, plain_detail
 from physgraph_usd.samples import write_sample
 from physgraph_usd.solver.colliders.sign import signed_distances
 from physgraph_usd.solver.scene import Frame
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 CORES = os.cpu_count() or 1
 NEAR = 0.02

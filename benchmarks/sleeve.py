@@ -32,7 +32,7 @@ from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.level import Level
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 REPEATS = 5
 CORES = os.cpu_count() or 1

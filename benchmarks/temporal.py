@@ -25,7 +25,7 @@ from physgraph_usd.shot import prepare_device
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.mesh.subdivide import Refinement
 from physgraph_usd.solver.scene import Frame
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 FRAMES = 24
 LEVELS = {"layers": 1}

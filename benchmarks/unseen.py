@@ -27,7 +27,7 @@ from physgraph_usd.solver.integrate.saddle import leave_saddle
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 SHOTS: dict[str, tuple[str, float | None]] = {
     "sleeve": ("", None),

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from .report import RefineReport
     from .shot import inspect_shot, refine_shot, refine_shots, refine_stage
     from .solver.fabric import PRESETS, Fabric
-    from .usd.reader import Shot, open_shot
+    from .usd.check.validate import validate_layer
+    from .usd.read.reader import Shot, open_shot
     from .usd.schema import schema_path
-    from .usd.tag import tag
-    from .usd.validate import validate_layer
+    from .usd.write.tag import tag
 
 __all__ = [
     "PRESETS",
@@ -77,11 +77,11 @@ _ROOMS = {
     "options": ("RefineOptions",),
     "report": ("RefineReport",),
     "shot": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
-    "usd.reader": ("Shot", "open_shot"),
+    "usd.read.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
     "joined": ("stitch",),
-    "usd.tag": ("tag",),
-    "usd.validate": ("validate_layer",),
+    "usd.write.tag": ("tag",),
+    "usd.check.validate": ("validate_layer",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 

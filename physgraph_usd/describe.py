@@ -20,9 +20,9 @@ from .solver.resolution import LevelChoice, carries_none, choose_levels, sample_
 from .solver.scene import Frame, Garment, GarmentFrame
 from .solver.strain import strained_parts, stretched
 from .untagged import bodies_beside, command_of, proposal, told_beside
-from .usd.reader import Shot
+from .usd.read.reader import Shot
+from .usd.read.survey import survey
 from .usd.stage import GarmentSource
-from .usd.survey import survey
 from .usd.times import within
 from .usd.view import Stage
 

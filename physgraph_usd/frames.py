@@ -20,7 +20,7 @@ import numpy as np
 
 from .errors import LayerError, UsageError
 from .lock import LOCK, FolderLock
-from .usd.atomic import make_file, temporary_path, write_text
+from .usd.write.atomic import make_file, temporary_path, write_text
 from .words import counted
 
 RUN = "run.json"

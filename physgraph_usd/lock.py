@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from .errors import LayerError
-from .usd.atomic import HOST, NO_LINK, check_no_link
+from .usd.write.atomic import HOST, NO_LINK, check_no_link
 
 LOCK = "run.lock"
 """The file that is held; it says by whom."""

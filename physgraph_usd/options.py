@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .errors import UsageError
-from .usd.atomic import ASSET_PATHS
+from .usd.write.atomic import ASSET_PATHS
 
 if TYPE_CHECKING:
     from .solver.contact.settings import ContactSettings

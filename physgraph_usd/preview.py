@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from .errors import LayerError, StageError, UsageError
 from .raycast import BACKGROUND, Surface, View, draw, encode_color, fit_view
-from .usd.atomic import check_place, make_file, prepare_target, publish, temporary_path
 from .usd.files import check_targets, files_of
-from .usd.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
+from .usd.read.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
+from .usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
 
 STILL, LOOP = ".png", ".gif"
 """Formats by suffix."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from .interrupts import SIGNALLED
 from .plain_json import to_json
-from .usd.atomic import write_text
+from .usd.write.atomic import write_text
 from .version import __version__
 
 FORMAT = 1

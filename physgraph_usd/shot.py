@@ -34,14 +34,14 @@ from .solver.integrate.metric import FACTOR
 from .solver.mesh.lanes import kernels_are_kept, start_warp
 from .solver.resolution import too_coarse
 from .untagged import AUTO, open_with_colliders
-from .usd.atomic import check_place
-from .usd.chunk import Chunk, chunk_of
 from .usd.files import check_targets, files_of
 from .usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED, is_result_of, write_root
-from .usd.reader import Shot
+from .usd.read.reader import Shot
 from .usd.stage import shot_name
 from .usd.view import Layer, Stage
-from .usd.writer import LayerWriter
+from .usd.write.atomic import check_place
+from .usd.write.chunk import Chunk, chunk_of
+from .usd.write.writer import LayerWriter
 from .words import NOTICE, counted
 
 try:

@@ -12,7 +12,7 @@ from .errors import PhysGraphError, UsageError
 from .frames import kept_for
 from .plain_json import to_json
 from .report import DONE, FAILED, FORMAT, IN_PART, RefineReport
-from .usd.atomic import check_place, write_text
+from .usd.write.atomic import check_place, write_text
 from .version import __version__
 
 SCHEMA = Path(__file__).with_name("summary.schema.json")

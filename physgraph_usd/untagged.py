@@ -20,8 +20,8 @@ from .solver.contact.nearby import NEAR, share_at, smallest_body
 from .solver.mesh.lanes import start_warp
 from .solver.resolution import sample_frames
 from .solver.scene import Frame
-from .usd.reader import Shot, open_shot
-from .usd.untagged import meshes_beside
+from .usd.read.reader import Shot, open_shot
+from .usd.read.untagged import meshes_beside
 from .usd.view import Stage
 
 AUTO = "auto"

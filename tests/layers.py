@@ -10,10 +10,10 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from physgraph_usd.solver.mesh.attributes import vertex_values
 from physgraph_usd.solver.mesh.subdivide import Refinement, subdivide_times
-from physgraph_usd.usd.reader import Shot, open_shot
-from physgraph_usd.usd.validate import validate_layer
+from physgraph_usd.usd.check.validate import validate_layer
+from physgraph_usd.usd.read.reader import Shot, open_shot
 from physgraph_usd.usd.view import root_over
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.write.writer import LayerWriter
 
 COAT = "/World/rig/coat"
 TIMES = (1.0, 2.5, 4.0)

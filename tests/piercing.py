@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from physgraph_usd.usd.plain import PlainMesh
+from physgraph_usd.usd.write.plain import PlainMesh
 
 
 def triangles_of(mesh: PlainMesh) -> np.ndarray:

@@ -17,8 +17,8 @@ from pxr import Sdf
 
 from physgraph_usd.errors import LayerError, UsageError
 from physgraph_usd.interrupts import leave_if_asked, signals_raise
-from physgraph_usd.usd.atomic import HOST, remove_stale, temporary_path
-from physgraph_usd.usd.stream import LayerStream
+from physgraph_usd.usd.write.atomic import HOST, remove_stale, temporary_path
+from physgraph_usd.usd.write.stream import LayerStream
 
 POINTS = Sdf.Path("/World/coat.points")
 
@@ -114,7 +114,7 @@ def test_hosts_of_one_disk_do_not_meet(tmp_path: Path, monkeypatch: pytest.Monke
     with LayerStream(target) as stream:
         fill(stream, 1)
         stream.flush()
-        monkeypatch.setattr("physgraph_usd.usd.atomic.HOST", "elsewhere")
+        monkeypatch.setattr("physgraph_usd.usd.write.atomic.HOST", "elsewhere")
         with LayerStream(target) as second:
             fill(second, 1)
             second.flush()

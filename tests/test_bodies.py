@@ -25,7 +25,7 @@ from stages import (
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.primitives import ShapeSurface
 from physgraph_usd.solver.scene import Frame, Scene
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 BODY = "/World/body"
 

@@ -11,8 +11,8 @@ from pxr import Usd, UsdGeom
 from stages import add_sheet, new_stage, save, sheet_faces
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.usd.cage import read_cage
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.cage import read_cage
+from physgraph_usd.usd.read.reader import open_shot
 
 COUNTS, INDICES = (array.tolist() for array in sheet_faces())
 

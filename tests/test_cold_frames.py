@@ -14,7 +14,7 @@ from benchmarks.cold_frames import folds_on_cage
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.scene import Scene
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 COLD = RefineOptions(temporal="off").solve_settings()
 

@@ -16,13 +16,13 @@ from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.shot import inspect_shot
-from physgraph_usd.sides import SIDES
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.sign import _sides, signed_distances
 from physgraph_usd.solver.contact.track import Track
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import COLLIDER
+from physgraph_usd.usd.sides import SIDES
 
 MESH, REST = sheet(6, 6, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))

@@ -22,7 +22,7 @@ from physgraph_usd.samples import write_sample
 from physgraph_usd.samples.panel import sew
 from physgraph_usd.samples.solids import box, join, lathe, off_box, off_torus, torus
 from physgraph_usd.samples.tshirt import SHIRT, dress
-from physgraph_usd.usd.plain import Look, PlainMesh, PlainStage
+from physgraph_usd.usd.write.plain import Look, PlainMesh, PlainStage
 
 DEEP = 1e-4
 

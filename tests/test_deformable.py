@@ -12,8 +12,8 @@ from stages import add_sheet, author, new_stage, save
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.usd.lookup import parse_overrides
-from physgraph_usd.usd.materials import Values, find_values
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.materials import Values, find_values
+from physgraph_usd.usd.read.reader import Shot, open_shot
 from physgraph_usd.usd.stage import read_units
 
 CLOTH, MATERIAL = "/World/cloth", "/World/m"

@@ -9,7 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 from stages import COLLIDER_API, add_sheet, author, instanced_shot, new_stage
 
 from physgraph_usd.errors import GarmentError, StageError
-from physgraph_usd.usd.find import find_colliders, find_garments, instance_roots
+from physgraph_usd.usd.read.find import find_colliders, find_garments, instance_roots
 
 
 @pytest.fixture

@@ -23,9 +23,9 @@ from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.primitives import ShapeSurface
 from physgraph_usd.solver.contact.heat import body_crossings, penetration_map
 from physgraph_usd.solver.mesh.topology import edges_of
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.validate import validate_layer
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.check.validate import validate_layer
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.writer import LayerWriter
 
 NAMES = ("penetration", "crossing")
 NO_EDGES = np.zeros((0, 2), np.int32)

@@ -19,7 +19,7 @@ from shots import cloth_shot, command, faults, sample_times
 
 from physgraph_usd.frames import frames_folder
 from physgraph_usd.lock import LOCK
-from physgraph_usd.usd.atomic import HOST
+from physgraph_usd.usd.write.atomic import HOST
 
 TIMES = tuple(float(t) for t in range(1, 61))
 LINE = ("--level", "2", "--steps", "4", "--temporal", "off")

@@ -14,8 +14,8 @@ from shots import cloth_shot
 from physgraph_usd.frames import Lead, Outcome
 from physgraph_usd.joined import Looking, joined
 from physgraph_usd.options import RefineOptions
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.seams import between
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.seams import between
 
 
 def outcome(time: float, height: float, *, kept: bool = False) -> Outcome:

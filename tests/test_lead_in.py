@@ -13,7 +13,7 @@ from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import refine_shot
 from physgraph_usd.solver.frame.lead_in import lead_in
 from physgraph_usd.solver.frame.pipeline import Refiner
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 
 @pytest.fixture(scope="module")

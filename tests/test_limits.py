@@ -13,7 +13,7 @@ from shots import CLOTH, cloth_shot
 
 from physgraph_usd import RefineOptions, inspect_shot, refine_shot, validate_layer
 from physgraph_usd.errors import UsageError
-from physgraph_usd.usd.tag import tag
+from physgraph_usd.usd.write.tag import tag
 
 DENSITY = "physgraph:material:density"
 

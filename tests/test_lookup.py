@@ -14,8 +14,8 @@ from stages import add_sheet, author, new_stage
 from physgraph_usd.errors import SchemaError, UsageError
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.usd.lookup import check_overrides, find_value, parse_overrides
-from physgraph_usd.usd.materials import Values, find_values
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.materials import Values, find_values
+from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import GARMENT
 from physgraph_usd.usd.stage import read_units
 

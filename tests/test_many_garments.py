@@ -20,7 +20,7 @@ from physgraph_usd.report import of_a_kind
 from physgraph_usd.shot import inspect_shot
 from physgraph_usd.solver.contact.broad_phase import Parts
 from physgraph_usd.solver.scene import Garment, GarmentFrame
-from physgraph_usd.usd.find import felt_by, find_colliders
+from physgraph_usd.usd.read.find import felt_by, find_colliders
 
 MESH, REST = sheet(2, 2)
 FEW, FACTOR = 40, 8

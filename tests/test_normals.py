@@ -7,7 +7,7 @@ import pytest
 from layers import grid
 
 from physgraph_usd.solver.mesh.topology import PolygonMesh
-from physgraph_usd.usd.normals import VertexNormals
+from physgraph_usd.usd.write.normals import VertexNormals
 
 
 def sphere() -> tuple[np.ndarray, PolygonMesh]:

@@ -24,7 +24,7 @@ from physgraph_usd.solver.colliders.pose import Collider, MeshPose
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 FLOATS = Sdf.ValueTypeNames.FloatArray
 FAR = (1e24, 3e38, float("inf"), float("nan"))

@@ -14,10 +14,10 @@ from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_shot
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SchemaError, StageError
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.shot import refine_shot
-from physgraph_usd.usd.carry import to_numpy
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.check.validate import validate_layer
+from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.stage import LONGEST_REASON, in_brief, pxr_errors, read_units
-from physgraph_usd.usd.validate import validate_layer
+from physgraph_usd.usd.write.carry import to_numpy
 
 CLOTH = "/World/cloth"
 

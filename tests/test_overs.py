@@ -22,8 +22,8 @@ from layers import (
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from physgraph_usd.errors import LayerError
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.writer import LayerWriter
 
 
 @pytest.fixture

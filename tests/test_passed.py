@@ -17,7 +17,7 @@ from physgraph_usd.samples import write_sample
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.sweep import Sweep, through_shape
 from physgraph_usd.solver.contact.passed import Passed
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 EDGE = 0.05
 MESH, REST = sheet(8, 8, EDGE)

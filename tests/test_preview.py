@@ -20,7 +20,7 @@ from physgraph_usd.preview import preview
 from physgraph_usd.raycast import Surface, draw, encode_color, fit_view
 from physgraph_usd.samples import write_sample
 from physgraph_usd.shot import refine_shot
-from physgraph_usd.usd.meshes import DrawnStage, refined_in, shot_of
+from physgraph_usd.usd.read.meshes import DrawnStage, refined_in, shot_of
 
 SIZE = (320, 160)
 

@@ -11,8 +11,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.usd.provenance import file_hashes, mute_refined, read_record, refined_layers, write_root
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.writer import LayerWriter
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from stages import (
 )
 
 from physgraph_usd.errors import GarmentError, SchemaError, StageError, UsageError
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 
 def world(shot: Shot, time: float | None, index: int = 0) -> np.ndarray:

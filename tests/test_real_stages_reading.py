@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from physgraph_usd.errors import GarmentError, PhysGraphError, StageError
-from physgraph_usd.usd.reader import Shot, open_shot
-from physgraph_usd.usd.survey import survey
+from physgraph_usd.usd.read.reader import Shot, open_shot
+from physgraph_usd.usd.read.survey import survey
 
 SHOTS = {
     "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], [1426], 56),

@@ -9,8 +9,8 @@ import pytest
 from layers import errors, fine_points, open_over, refine_all, world_metres
 from shots import VALID
 
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.writer import LayerWriter
 
 
 @pytest.mark.real_data

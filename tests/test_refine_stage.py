@@ -27,7 +27,7 @@ import physgraph_usd as pg
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.report import RefineReport
 from physgraph_usd.shot import inspect_shot, refine_stage
-from physgraph_usd.usd.validate import validate_layer
+from physgraph_usd.usd.check.validate import validate_layer
 
 BEND = "physgraph:material:bendStiffness"
 SKINNED = "/World/rig/cloth"

@@ -23,8 +23,8 @@ from physgraph_usd.page.plot import plot
 from physgraph_usd.page.report import page
 from physgraph_usd.page.series import add_jerk, read_series, third_difference
 from physgraph_usd.report import RefineReport
-from physgraph_usd.usd.readback import RefinedLayer
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.check.readback import RefinedLayer
+from physgraph_usd.usd.read.reader import open_shot
 
 
 @pytest.fixture(scope="module")

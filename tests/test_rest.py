@@ -10,7 +10,7 @@ from pxr import Sdf, UsdGeom, Vt
 from stages import add_sheet, affine, author, new_stage, save, set_matrix, sheet_points, vec3
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 FLAT = sheet_points() * [1.0, 1.0, 0.0]
 

@@ -27,7 +27,7 @@ from physgraph_usd.usd.schema import (
     schema_path,
 )
 from physgraph_usd.usd.schema_files import attribute_table, schema_files
-from physgraph_usd.usd.tag import fabric_values
+from physgraph_usd.usd.write.tag import fabric_values
 
 TYPES = {GARMENT_API: UsdGeom.Mesh, COLLIDER_API: UsdGeom.Sphere, MATERIAL_API: UsdShade.Material}
 

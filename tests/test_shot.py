@@ -17,7 +17,7 @@ from stages import author
 from physgraph_usd.errors import LayerError, SchemaError, StageError, UsageError
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.shot import inspect_shot, refine_shot
-from physgraph_usd.usd.validate import validate_layer
+from physgraph_usd.usd.check.validate import validate_layer
 
 BEND = "physgraph:material:bendStiffness"
 

@@ -10,7 +10,7 @@ from pxr import Sdf, UsdGeom
 from stages import add_sheet, clip_shot, new_stage, save, set_matrix, sheet_points, sheet_shot
 
 from physgraph_usd.errors import StageError, UsageError
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 
 def world(shot: Shot, time: float | None, index: int = 0) -> np.ndarray:

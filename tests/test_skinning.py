@@ -22,7 +22,7 @@ from stages import (
 )
 
 from physgraph_usd.errors import StageError
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 ROOT = "/World/rig"
 JOINTS = [int(x > 2) for x in sheet_points()[:, 0]]

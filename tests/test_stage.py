@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom
 from stages import add_sheet, add_skeleton, bind_skin, new_stage, save, sheet_shot
 
 from physgraph_usd.errors import StageError
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.stage import composition_problems, open_stage, pxr_errors, read_units
 
 

@@ -17,10 +17,10 @@ from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageError
 from physgraph_usd.joined import check_seams, stitch
-from physgraph_usd.usd.chunk import read_chunk
+from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record
-from physgraph_usd.usd.stitch import SEAM_BOUND
-from physgraph_usd.usd.validate import validate_layer
+from physgraph_usd.usd.write.chunk import read_chunk
+from physgraph_usd.usd.write.stitch import SEAM_BOUND
 
 TIMES = tuple(float(time) for time in range(1, 49))
 SPANS = ((1.0, 12.0), (13.0, 24.0), (25.0, 36.0), (37.0, 48.0))

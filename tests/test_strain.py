@@ -15,7 +15,7 @@ from physgraph_usd.errors import GarmentError, UsageError
 from physgraph_usd.shot import inspect_shot
 from physgraph_usd.solver.mesh.fit import median_shape
 from physgraph_usd.solver.strain import strayed
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 SLEEVE = "/World/sleeve"
 AROUND, ROWS, RADIUS, LENGTH = 16, 13, 0.06, 0.4

@@ -8,7 +8,7 @@ import numpy as np
 from pxr import UsdGeom
 from stages import add_sheet, instanced_shot, new_stage, save, set_matrix
 
-from physgraph_usd.usd.survey import survey, survey_meshes
+from physgraph_usd.usd.read.survey import survey, survey_meshes
 
 
 def test_every_mesh_is_told_and_broken_ones_say_why(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from pxr import Sdf, Usd, UsdGeom
 
 from physgraph_usd.errors import StageError, UsageError
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.tag import tag
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.tag import tag
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from physgraph_usd.cli.printing import outline
 from physgraph_usd.errors import SchemaError, UsageError
 from physgraph_usd.shot import inspect_shot
 from physgraph_usd.solver.scene import Garment
-from physgraph_usd.usd.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 CLOTH = "/World/rig/cloth"
 

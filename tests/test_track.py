@@ -21,8 +21,8 @@ from layers import (
 )
 from pxr import Gf, UsdGeom
 
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.writer import LayerWriter
 
 
 @pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])

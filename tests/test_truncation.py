@@ -17,7 +17,7 @@ from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import FAR, Budget, solve_level
 from physgraph_usd.solver.integrate.truncation import truncated
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 
 def problem() -> tuple[System, torch.Tensor]:

@@ -27,8 +27,8 @@ from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.tune.loop import SolveLoop
 from physgraph_usd.tune.session import Shown, TuneSession
 from physgraph_usd.tune.values import TUNABLES, painted_on
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.tag import tag
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.tag import tag
 
 STIFF = 3e-4
 

@@ -14,7 +14,7 @@ from layers import COAT, dress_up, errors, make_shot, vec3, write_layer
 from pxr import Sdf, Tf, Usd, UsdSkel, Vt
 
 from physgraph_usd.errors import AbsentError, LayerError
-from physgraph_usd.usd.validate import Problem, validate_layer
+from physgraph_usd.usd.check.validate import Problem, validate_layer
 
 Mutation = Callable[[Sdf.Layer], None]
 

@@ -13,9 +13,9 @@ import pytest
 from layers import COAT, dress_up, make_shot, write_layer
 from pxr import Sdf, Usd, Vt
 
-from physgraph_usd.usd import layer_rules
-from physgraph_usd.usd.rules import RULES
-from physgraph_usd.usd.validators import PLUGIN
+from physgraph_usd.usd.check import layer_rules
+from physgraph_usd.usd.check.rules import RULES
+from physgraph_usd.usd.check.validators import PLUGIN
 
 FOLDER = Path(__file__).parents[1] / "plugins" / "usdvalidation"
 CHECK = """

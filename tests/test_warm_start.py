@@ -20,7 +20,7 @@ from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.frame.start import STILL
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.resolution import edge_strain
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 MESH, REST = sheet(8, 6)
 

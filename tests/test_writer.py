@@ -24,8 +24,8 @@ from layers import (
 from pxr import Usd, UsdGeom
 
 from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.writer import LayerWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -20,10 +20,10 @@ from ..shot import MOST_LANES, prepare_device
 from ..solver.resolution import choose_levels, sample_frames
 from ..solver.scene import Frame, Scene
 from ..untagged import open_with_colliders
-from ..usd.atomic import check_place
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import file_hashes
-from ..usd.reader import Shot
+from ..usd.read.reader import Shot
+from ..usd.write.atomic import check_place
 from ..version import __version__
 from .journal import NAME as JOURNAL
 from .journal import Journal

@@ -98,7 +98,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
     """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
-    from ..usd.tag import tag as tag_shot
+    from ..usd.write.tag import tag as tag_shot
 
     given = {name: value for name, value in options.items() if value is not None}
     click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **given))
@@ -133,7 +133,7 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
 @json_option
 def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
     """Check a refined LAYER by our rules and by USD's own validators; exit with 1 when it breaks one."""
-    from ..usd.validate import validate_layer
+    from ..usd.check.validate import validate_layer
 
     problems = validate_layer(layer, shot)
     if as_json:

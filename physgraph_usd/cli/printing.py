@@ -50,7 +50,7 @@ class Saying:
             OSError: The file cannot be written.
             UsageError: The file is a link.
         """
-        from ..usd.atomic import check_no_link
+        from ..usd.write.atomic import check_no_link
 
         logger, on_stderr = logging.getLogger(LOGGER), _OnStderr(_LEVELS[min(self.verbose, 2)], self.several)
         handlers: list[logging.Handler] = [on_stderr]

@@ -14,8 +14,8 @@ from typing import Any
 from ..errors import LayerError, StageError
 from ..options import PAGE_NAME, REPORT_NAME
 from ..report import RefineReport
-from ..usd.atomic import write_text
-from ..usd.reader import Shot
+from ..usd.read.reader import Shot
+from ..usd.write.atomic import write_text
 from .document import document, table
 from .plot import SCRIPT, plot
 from .series import Series, add_jerk, read_series

@@ -12,8 +12,8 @@ import numpy as np
 from ..errors import LayerError, StageError
 from ..report import RefineReport
 from ..solver.frame.pipeline import Refiner
-from ..usd.readback import RefinedLayer
-from ..usd.reader import Shot
+from ..usd.check.readback import RefinedLayer
+from ..usd.read.reader import Shot
 
 Line = list[float | None]
 

@@ -51,6 +51,6 @@ def write_sample(name: str, directory: Path, *, overwrite: bool = False) -> Path
     module, _, variant = name.partition("_")
     build = import_module(f".{module}", __package__).build
     record = build(variant) if variant else build()
-    from ..usd.sample_stage import write_stage  # noqa: PLC0415
+    from ..usd.write.sample_stage import write_stage  # noqa: PLC0415
 
     return write_stage(record, Path(directory) / f"{name}.usdc", overwrite=overwrite)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from ..solver.fabric import PRESETS
-from ..usd.plain import Look, PlainMesh, PlainStage
+from ..usd.write.plain import Look, PlainMesh, PlainStage
 from .grid import ease
 from .panel import sew
 from .solids import Solid, ellipsoid, join, lathe

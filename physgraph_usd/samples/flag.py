@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..solver.fabric import Fabric
-from ..usd.plain import Look, PlainMesh, PlainStage
+from ..usd.write.plain import Look, PlainMesh, PlainStage
 from .grid import grid_uv, quad_grid
 
 ROWS, COLUMNS = 28, 42

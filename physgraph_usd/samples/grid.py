@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..usd.plain import FaceVarying
+from ..usd.write.plain import FaceVarying
 
 
 def quad_grid(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:

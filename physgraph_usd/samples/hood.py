@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..solver.fabric import PRESETS
-from ..usd.plain import FaceVarying, Look, PlainMesh, PlainStage
+from ..usd.write.plain import FaceVarying, Look, PlainMesh, PlainStage
 from .grid import ease, grid_uv, quad_grid
 from .solids import ellipsoid, join
 

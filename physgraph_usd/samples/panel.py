@@ -12,7 +12,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ..usd.plain import FaceVarying
+from ..usd.write.plain import FaceVarying
 
 
 @dataclass(frozen=True)

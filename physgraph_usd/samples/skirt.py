@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..solver.fabric import PRESETS
-from ..usd.plain import Look, PlainMesh, PlainStage
+from ..usd.write.plain import Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
 from .grid import ease, grid_uv, quad_grid
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from ..solver.fabric import PRESETS
-from ..usd.plain import FaceVarying, Look, PlainMesh, PlainStage
+from ..usd.write.plain import FaceVarying, Look, PlainMesh, PlainStage
 from .grid import ease
 
 AROUND, ROWS, EXTRA = 32, 52, 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..solver.fabric import PRESETS
-from ..usd.plain import Look, PlainMesh, PlainStage, Skeleton, Skin
+from ..usd.write.plain import Look, PlainMesh, PlainStage, Skeleton, Skin
 from .grid import ease, quad_grid
 from .panel import Cut, Pillow, sew
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..usd.plain import FaceVarying
+from ..usd.write.plain import FaceVarying
 from .grid import ease, grid_uv, quad_grid
 from .solids import Solid
 

@@ -26,7 +26,7 @@ from ..solver.resolution import choose_levels, sample_frames
 from ..solver.scene import Frame, State
 from ..untagged import AUTO, bodies_beside, open_with_colliders, told_beside
 from ..usd.schema import AUTO_LEVEL, GARMENT
-from ..usd.tag import fabric_values, tag
+from ..usd.write.tag import fabric_values, tag
 from .solver import FrameSolver
 from .values import TUNABLES
 

@@ -13,7 +13,7 @@ from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.pipeline import Refiner
 from ..solver.frame.settings import SolveSettings
 from ..solver.scene import State
-from ..usd.reader import Shot
+from ..usd.read.reader import Shot
 
 BUDGET_MS = 1000.0
 """Milliseconds of a quick solve after which no step begins: with contact a large change asks for more."""

@@ -16,9 +16,9 @@ import numpy as np
 from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError, StageError
-from .atomic import prepare_target, publish, temporary_path
 from .stage import TRAVERSAL, USD_ERRORS, reason_of
 from .view import root_over
+from .write.atomic import prepare_target, publish, temporary_path
 
 RECORD = "physgraph"
 CONTENTS = "contents"

@@ -13,8 +13,8 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ..errors import UsageError
-from ..sides import SIDES
 from ..solver.fabric import PRESETS
+from .sides import SIDES
 
 GARMENT_API = "PhysGraphGarmentAPI"
 COLLIDER_API = "PhysGraphColliderAPI"

@@ -17,7 +17,7 @@ from physgraph_usd.errors import GarmentError, PhysGraphError
 from physgraph_usd.options import RefineOptions
 from physgraph_usd.report import RefineReport
 from physgraph_usd.shot import inspect_shot, refine_shot
-from physgraph_usd.usd.validate import validate_layer
+from physgraph_usd.usd.check.validate import validate_layer
 
 from .files import sizes
 from .mutant import Draft, Kind, make

@@ -1,0 +1,1 @@
+"""Checking: the rules that a refined layer must keep."""

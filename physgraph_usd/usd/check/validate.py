@@ -1,0 +1,242 @@
+"""Checks a refined layer: our rules, on it alone and over its shot, and USD's own validators."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Usd, UsdUtils
+
+from ...errors import LayerError
+from ..provenance import read_record, recorded_shot
+from ..read.variants import same_variants
+from ..stage import USD_ERRORS, bad_rate, check_there, is_there, pxr_errors, quiet, reason_of
+from ..view import StageView
+from . import layer_rules
+from .rules import RULES, Fine, Problem, subsets
+from .validators import PLUGIN
+
+__all__ = ["Problem", "check_layer", "validate_layer"]
+_COUNTS = "InvalidSubsetFamily"
+"""USD's rule whose message lists indices: the same fault reads otherwise on the fine mesh."""
+
+
+def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage | None = None) -> list[Problem]:
+    """Check a refined layer.
+
+    Args:
+        layer: The layer, a file or in memory.
+        shot: The shot that it goes over, a file or an open stage; by default the one named in its record.
+
+    Returns:
+        Problems, errors first; each names its path and time. A recorded shot that is not there is one of them.
+
+    Raises:
+        AbsentError: The layer or the shot is not there.
+        LayerError: The layer or the shot cannot be opened or read.
+    """
+    opened = layer if isinstance(layer, Sdf.Layer) else _open(layer)
+    below = shot if shot is not None else recorded_shot(opened)
+    lost = isinstance(below, str) and shot is None and not is_there(below)
+    view = None if lost else _view(below)
+    with pxr_errors(f"cannot read {layer} over {below}", LayerError):
+        if said := _bad_rate(opened, view):
+            return [Problem("error", "/", None, said, "time_scale")]
+        opened = _played(opened)
+        problems = check_layer(opened, view)
+        if lost:
+            said = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
+            problems.append(Problem("error", "/", None, said, "record"))
+        elif view is not None and not any(problem.rule == "composition" for problem in problems):
+            problems += _own_validators(opened, view)
+    return sorted(problems, key=lambda problem: problem.severity != "error")
+
+
+def _bad_rate(layer: Sdf.Layer, shot: StageView | None) -> str:
+    """What is wrong with the rate of a layer or of its shot, or ""."""
+    nothing = Usd.StagePopulationMask()
+    stages = [Usd.Stage.OpenMasked(layer, nothing)] + ([] if shot is None else [shot.open(mask=nothing)])
+    return next(filter(None, map(bad_rate, stages)), "")
+
+
+def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None = None) -> list[Problem]:
+    """Run our rules.
+
+    Args:
+        layer: The refined layer.
+        shot: The shot, or None to check the layer alone.
+        samples: How many time samples to look at, spread over the range; None for all.
+
+    Returns:
+        Problems in the order of the rules.
+    """
+    problems = [replace(problem, rule=rule.__name__) for rule in layer_rules.RULES for problem in rule(layer)]
+    if shot is None:
+        return problems
+    paths = _garments(layer)
+    # Only the garments are composed: a set around them may be large.
+    mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
+    with quiet():
+        problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
+        composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
+    problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
+    for path in paths:
+        fault = layer_rules.is_mesh(path, composed)
+        if fault:
+            problems.append(Problem("error", path, None, fault, "composition"))
+            continue
+        coarse = alone.GetPrimAtPath(_coarse_path(layer, path))
+        problems += _check_garment(composed.GetPrimAtPath(path), layer, samples, coarse=coarse)
+        if coarse:
+            problems += _named("against_shot", layer_rules.against_shot(layer, coarse, Sdf.Path(path)))
+    return problems
+
+
+def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coarse: Usd.Prim) -> Iterator[Problem]:
+    """Run the rules for one garment; subsets that break a rule in the shot already are its own, and only told."""
+    written = list(layer.ListTimeSamplesForPath(prim.GetPath().AppendProperty("points")))
+    if samples is not None and len(written) > samples:
+        written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
+    fine = Fine(prim, layer, (None, *written))
+    of_the_shot = bool(coarse) and any(subsets(Fine(coarse, layer, (None,))))
+    for rule in RULES:
+        for problem in _named(rule.__name__, rule(fine)):
+            told = rule is subsets and of_the_shot
+            yield (
+                replace(problem, severity="warning", message=f"{problem.message}; so it is in the shot")
+                if told
+                else problem
+            )
+
+
+def _named(rule: str, problems: Iterable[Problem]) -> Iterator[Problem]:
+    """Name the rule in its problems."""
+    return (replace(problem, rule=rule) for problem in problems)
+
+
+def _garments(layer: Sdf.Layer) -> Sequence[str]:
+    """Fine meshes by the record, or else every prim with points."""
+    named = (read_record(layer) or {}).get("garments")
+    if named:
+        return [str(path) for path in named]
+    found: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(Sdf.Path(path)))
+    return sorted(str(path.GetPrimPath()) for path in found if path.name == "points")
+
+
+def _coarse_path(layer: Sdf.Layer, path: str) -> str:
+    """The coarse mesh of a fine one: the prim itself, or the sibling's reference."""
+    spec = layer.GetPrimAtPath(path)
+    references = list(spec.referenceList.prependedItems) if spec else []
+    return str(references[0].primPath) if references else path
+
+
+def _open(path: str | Path) -> Sdf.Layer:
+    """Open a layer."""
+    check_there(path)
+    try:
+        layer = Sdf.Layer.FindOrOpen(str(path))
+    except USD_ERRORS as error:
+        raise LayerError(f"cannot read {path}: {reason_of(error)}") from error
+    if not layer:
+        raise LayerError(f"cannot read {path}")
+    return layer
+
+
+def _played(layer: Sdf.Layer) -> Sdf.Layer:
+    """A layer that `stitch --clips` wrote, with what its clips play as samples of its own; any other as it is."""
+    stage = Usd.Stage.Open(layer) if "chunks" in (read_record(layer) or {}) and layer.subLayerPaths else None
+    moving = [prim for prim in stage.TraverseAll() if prim.HasAuthoredMetadata("clips")] if stage else []
+    if stage is None or not moving:
+        return layer
+    whole = UsdUtils.FlattenLayerStack(stage)
+    for prim in moving:
+        whole.GetPrimAtPath(prim.GetPath()).ClearInfo("clips")
+        for attribute in prim.GetAuthoredAttributes():
+            for time in attribute.GetTimeSamples():
+                whole.SetTimeSample(attribute.GetPath(), time, attribute.Get(time))
+    return whole
+
+
+def _view(shot: str | Path | Usd.Stage | None) -> StageView | None:
+    """What a shot shows; None for no shot."""
+    if shot is None:
+        return None
+    return StageView.of(shot) if isinstance(shot, Usd.Stage) else StageView.of_layer(_open(shot))
+
+
+def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
+    """Run USD's validators, as many as there are here; what the shot itself already has is left out."""
+    try:
+        from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
+    except ImportError:
+        return []
+    if not hasattr(UsdValidation, "ValidationContext"):
+        return []
+    # Both with an anonymous session, whose name the messages repeat and `_without_names` drops.
+    (before, after), missing = _findings(UsdValidation, [shot.open(), shot.open(over=[layer])])
+    fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
+    sites = {key[:2] for key in before}
+    new = [
+        problem
+        for key, problem in after.items()
+        if _on_coarse(key, fine) not in before
+        and not (problem.rule.endswith(_COUNTS) and _on_coarse(key, fine)[:2] in sites)
+    ]
+    return missing + [problem for problem in new if not _is_meant(problem, fine)]
+
+
+def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]:
+    """A finding on a sibling as it would read on its coarse mesh, whose faults it repeats."""
+    for path, coarse in fine.items():
+        key = tuple(part.replace(path, coarse) for part in key)
+    return key
+
+
+def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
+    """Whether a finding is what we did on purpose.
+
+    Skinning is taken off, its coarse properties stay below; a family whose faces were all left out has none.
+    """
+    emptied = problem.rule.endswith(_COUNTS) and "No indices in family" in problem.message
+    return problem.path in fine and (emptied or problem.rule.endswith("MissingSkelBindingAPI"))
+
+
+def _findings(
+    module: Any, stages: Sequence[Usd.Stage]
+) -> tuple[list[dict[tuple[str, str, str], Problem]], list[Problem]]:
+    """Findings on each stage by validator, place and message, and a warning that names the validators that fail.
+
+    Some builds of USD lack the libraries of validators, or what those read: each one runs by itself.
+    """
+    registry, found, failed = module.ValidationRegistry(), [{} for _ in stages], []
+    names = (str(metadata.name) for metadata in registry.GetAllValidatorMetadata())
+    for name in sorted(name for name in names if not name.startswith(f"{PLUGIN}:")):  # Ours have run.
+        try:
+            context = module.ValidationContext([registry.GetOrLoadValidatorByName(name)])
+            own = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]
+        except USD_ERRORS:
+            failed.append(name)
+            continue
+        for findings, problems in zip(found, own, strict=True):
+            findings.update({(p.rule, p.path, _without_names(p.message)): p for p in problems})
+    said = f"{len(failed)} of USD's own validators do not run with this USD: {', '.join(failed)}"
+    return found, [Problem("warning", "/", None, said, "validators")] if failed else []
+
+
+def _as_problem(module: Any, found: Any) -> Problem:
+    """One finding of USD's as ours."""
+    sites = found.GetSites()
+    path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
+    if sites and not path:
+        path = str(sites[0].GetPrim().GetPath()) if sites[0].IsPrim() else "/"
+    severity = "error" if found.GetType() == module.ValidationErrorType.Error else "warning"
+    return Problem(severity, path or "/", None, found.GetMessage(), str(found.GetIdentifier()))
+
+
+def _without_names(message: str) -> str:
+    """A message without the name of the anonymous root, which differs between stages."""
+    return " ".join(word for word in message.split() if "anon:" not in word)

@@ -1,0 +1,139 @@
+"""The rules of `validate` as validators of UsdValidation, for usdchecker and host programs.
+
+What they check are refined layers in a stage's layer stack, as composed there. Rules that compare with the shot below
+stay with `validate`. Registering from Python takes USD 26.5; plugins/usdvalidation holds the plugInfo.json that names
+each rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, Vt
+
+from ..provenance import read_record
+from . import layer_rules
+from .rules import RULES, Fine, Problem, extent
+
+PLUGIN = "physgraph_validators"
+"""Name of the plug-in, by which its plugInfo.json and the names of the rules begin."""
+EXTENT_FIXER = "recomputeExtent"
+
+
+def register() -> bool:
+    """Register every rule as ``PLUGIN:RULE``.
+
+    Returns:
+        Whether this USD lets Python register validators.
+    """
+    try:
+        from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
+    except ImportError:
+        return False
+    registry = UsdValidation.ValidationRegistry()
+    if not hasattr(registry, "RegisterPluginPrimValidator"):
+        return False
+    for rule in layer_rules.RULES:
+        registry.RegisterPluginLayerValidator(f"{PLUGIN}:{rule.__name__}", _layer_task(UsdValidation, rule))
+    for rule in RULES:
+        name, task = f"{PLUGIN}:{rule.__name__}", _prim_task(UsdValidation, rule)
+        fixers = [_extent_fixer(UsdValidation)] if rule is extent else []
+        registry.RegisterPluginPrimValidator(name, task, fixers)
+    return True
+
+
+def _layer_task(module: Any, rule: Callable[[Sdf.Layer], Iterator[Problem]]) -> Callable[[Sdf.Layer], list[Any]]:
+    """A rule for layers; a layer that is no refined one breaks none."""
+
+    def task(layer: Sdf.Layer) -> list[Any]:
+        if read_record(layer) is None:
+            return []
+        return _errors(module, rule.__name__, rule(layer), lambda path: module.ValidationErrorSite(layer, path))
+
+    return task
+
+
+def _prim_task(module: Any, rule: Callable[[Fine], Iterator[Problem]]) -> Callable[[Usd.Prim, Any], list[Any]]:
+    """A rule for garments; a prim that no refined layer of the stage names breaks none."""
+
+    def task(prim: Usd.Prim, _times: Any) -> list[Any]:
+        fine = refined(prim)
+        stage = prim.GetStage()
+        problems = rule(fine) if fine else ()
+        return _errors(module, rule.__name__, problems, lambda path: module.ValidationErrorSite(stage, path))
+
+    return task
+
+
+def _errors(module: Any, name: str, problems: Iterable[Problem], site: Callable[[Sdf.Path], Any]) -> list[Any]:
+    """Our problems as UsdValidation's, by the rule's name."""
+    kinds = {"error": module.ValidationErrorType.Error, "warning": module.ValidationErrorType.Warn}
+    found = []
+    for problem in problems:
+        when = "" if problem.time is None else f" at time code {problem.time:g}"
+        message = f"<{problem.path}>{when}: {problem.message}"
+        found.append(module.ValidationError(name, kinds[problem.severity], [site(Sdf.Path(problem.path))], message))
+    return found
+
+
+def refined(prim: Usd.Prim) -> Fine | None:
+    """A mesh that a refined layer of its stage names, or None."""
+    if not UsdGeom.Mesh(prim):
+        return None
+    path = prim.GetPath()
+    for layer in prim.GetStage().GetLayerStack(includeSessionLayers=False):
+        if str(path) in map(str, (read_record(layer) or {}).get("garments", ())):
+            return Fine(prim, layer, (None, *layer.ListTimeSamplesForPath(path.AppendProperty("points"))))
+    return None
+
+
+def _extent_fixer(module: Any) -> Any:
+    said = "Writes the extent of the points, at the times of the points, into the refined layer."
+    return module.ValidationFixer(EXTENT_FIXER, said, _fix_extent, _can_fix_extent, [], extent.__name__)
+
+
+def _at(error: Any, target: Usd.EditTarget) -> Fine | None:
+    """The garment of an error, where the edit target is its refined layer."""
+    sites = error.GetSites()
+    prim = sites[0].GetProperty().GetPrim() if sites and sites[0].IsProperty() else Usd.Prim()
+    fine = refined(prim) if prim else None
+    return fine if fine and target.GetLayer() == fine.layer else None
+
+
+def _can_fix_extent(error: Any, target: Usd.EditTarget, _time: Usd.TimeCode) -> bool:
+    """Whether the layer has points to compute the extent from, all finite."""
+    fine = _at(error, target)
+    if fine is None or not fine.layer.permissionToEdit:
+        return False
+    arrays = [np.asarray(value) for value in _points(fine).values()]
+    return bool(arrays) and all(len(array) and np.isfinite(array).all() for array in arrays)
+
+
+def _fix_extent(error: Any, target: Usd.EditTarget, _time: Usd.TimeCode) -> bool:
+    """Write the extent at the default and at every sample of the points; drop samples at other times."""
+    fine = _at(error, target)
+    if fine is None:
+        return False
+    path = fine.prim.GetPath().AppendProperty("extent")
+    with Sdf.ChangeBlock():
+        prim = fine.layer.GetPrimAtPath(fine.prim.GetPath())
+        spec = fine.layer.GetAttributeAtPath(path) or Sdf.AttributeSpec(prim, "extent", Sdf.ValueTypeNames.Float3Array)
+        for time in set(fine.written("extent")) - set(fine.written("points")):
+            fine.layer.EraseTimeSample(path, time)
+        for time, value in _points(fine).items():
+            box = Vt.Vec3fArray.FromNumpy(np.stack([np.min(value, axis=0), np.max(value, axis=0)]).astype(np.float32))
+            if time is None:
+                spec.default = box
+            else:
+                fine.layer.SetTimeSample(path, time, box)
+    return True
+
+
+def _points(fine: Fine) -> dict[float | None, Any]:
+    """The layer's own points by time, the default under None."""
+    path = fine.prim.GetPath().AppendProperty("points")
+    spec = fine.layer.GetAttributeAtPath(path)
+    default = {None: spec.default} if spec and spec.HasDefaultValue() else {}
+    return default | {time: fine.layer.QueryTimeSample(path, time) for time in fine.written("points")}

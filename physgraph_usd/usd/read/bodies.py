@@ -1,0 +1,195 @@
+"""Colliders, read from meshes and primitives and posed in world metres.
+
+A collider never stops the work: a pose that cannot be used at some time is left out there, with a notice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ...solver.colliders.orient import FIXED
+from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
+from ...solver.mesh.topology import PolygonMesh
+from ...solver.scene import FARTHEST, out_of_bounds
+from ..lookup import COLLIDER_OFFSET, COLLIDER_SIDE, find_token, find_value
+from ..stage import Notice
+from .placement import is_flipped, place, timecode
+from .shapes import UPRIGHT, tessellated
+
+_EVEN = 1e-4
+"""Relative difference under which two scales count as the same."""
+_PLANE_START = ("plane", "start")
+_KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
+
+
+@dataclass(frozen=True, eq=False)
+class _Topology:
+    """Faces as authored, whether their front is clockwise in the world, and triangles turned to it."""
+
+    counts: np.ndarray
+    indices: np.ndarray
+    flip: bool
+    triangles: np.ndarray
+
+    def equals(self, counts: np.ndarray, indices: np.ndarray, flip: bool) -> bool:
+        return self.flip == flip and np.array_equal(self.counts, counts) and np.array_equal(self.indices, indices)
+
+
+@dataclass(eq=False)
+class ColliderReader:
+    """A collider with what is needed to pose it.
+
+    Attributes:
+        prim: Its prim.
+        collider: Its constant data.
+        metres: Length of one stage unit [m].
+    """
+
+    prim: Usd.Prim
+    collider: Collider
+    metres: float
+    _topology: _Topology | None = None
+
+    def pose(self, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        """Pose the collider at a time code, between its own samples as USD interpolates them.
+
+        Args:
+            time: Time code, or None for the default.
+
+        Returns:
+            The pose, or None where there is none, and why.
+        """
+        matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(self.prim), dtype=np.float64).T
+        matrix[:3] *= self.metres
+        if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            return None, (self._out(time, "its transform to the world is not an affine one"),)
+        pose, odd = (self._mesh if self.collider.kind == "mesh" else self._shape)(matrix, time)
+        return (None, odd) if pose is None else self._bounded(pose, time)
+
+    def _mesh(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        mesh = UsdGeom.Mesh(self.prim)
+        points, counts, indices = (
+            _array(attribute, time)
+            for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+        )
+        usable = points.ndim == 2 and points.shape[1] == 3 and len(indices) and counts.sum() == len(indices)
+        if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
+            return None, (self._out(time, "its points and faces do not fit together"),)
+        flip = self.collider.side in FIXED and is_flipped(self.prim, matrix)
+        first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
+        split_at = first if first.shape == points.shape else points
+        triangles = self._triangles(split_at, counts, indices, flip=flip)
+        return MeshPose(place(np.where(np.isfinite(points), points, np.nan).astype(np.float64), matrix), triangles), ()
+
+    def _triangles(self, points: np.ndarray, counts: np.ndarray, indices: np.ndarray, *, flip: bool) -> np.ndarray:
+        """Triangles of the faces; the same array as last time while the topology is the same.
+
+        Quads are split as they lie in the collider's first sample, whichever frame is read first.
+        """
+        known = self._topology
+        if known is None or not known.equals(counts, indices, flip):
+            triangles = PolygonMesh(counts, indices, len(points)).triangulate(np.nan_to_num(points)).triangles
+            known = _Topology(counts, indices, flip, np.ascontiguousarray(triangles[:, ::-1]) if flip else triangles)
+            self._topology = known
+        return known.triangles
+
+    def _shape(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        kind, size, axes = _measures(self.prim, time)
+        if axes is None or not (np.isfinite(size).all() and (size >= 0).all()):
+            return None, (self._out(time, "its sizes or its axis are none that a shape can have"),)
+        linear = matrix[:3, :3] @ axes
+        if kind == "plane":
+            linear = linear / max(float(np.abs(linear).max()), np.finfo(float).tiny)  # Cubes of a scale can overflow.
+            normal = np.cross(linear[:, 0], linear[:, 1]) * np.sign(np.linalg.det(linear) or 1.0)
+            if not np.linalg.norm(normal) > 0:
+                return None, (self._out(time, "its transform flattens it"),)
+            normal = -normal if self.collider.side == "back" else normal
+            return ShapePose(kind, _frame_about(normal), matrix[:3, 3], np.zeros(3)), ()
+        stretch = np.linalg.norm(linear, axis=0)
+        turn = linear / np.maximum(stretch, 1e-300)
+        square = np.allclose(turn.T @ turn, np.eye(3), atol=_EVEN)
+        even = {"sphere": (0, 1, 2), "capsule": (0, 1, 2), "cylinder": (0, 1), "cube": ()}.get(kind)
+        same = even is not None and np.allclose(stretch[list(even)], stretch[0] if even else 1.0, rtol=_EVEN)
+        if square and same and self.collider.side != "start":
+            return ShapePose(kind, turn, matrix[:3, 3], size * stretch), ()
+        points, triangles = tessellated(kind, size)
+        return MeshPose(points @ linear.T + matrix[:3, 3], triangles), ()
+
+    def _bounded(self, pose: Pose, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        """The pose without what is out of bounds: the faces with such points, or a primitive itself."""
+        if not (said := out_of_bounds(pose.corners())):
+            return pose, ()
+        if not isinstance(pose, MeshPose):
+            return None, (self._out(time, said),)
+        near = np.asarray((np.abs(pose.points) <= FARTHEST).all(axis=1))
+        said = f"{said}; faces with it, and with {(~near).sum() - 1} more such, are left out"
+        whole = MeshPose(np.where(near[:, None], pose.points, np.nan), pose.triangles)
+        return whole, (Notice(self.collider.path, time, said),)
+
+    def _out(self, time: float | None, why: str) -> Notice:
+        return Notice(self.collider.path, time, f"this collider is left out here: {why}")
+
+
+def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None, tuple[Notice, ...]]:
+    """Read a collider's identity.
+
+    Args:
+        prim: A gprim.
+        metres: Length of one stage unit [m].
+
+    Returns:
+        Its reader, or None for a kind of prim that cloth cannot touch, and notices.
+
+    Raises:
+        SchemaError: When its offset or its side cannot be used.
+    """
+    path, kind = str(prim.GetPath()), str(prim.GetTypeName()).removesuffix("_1")
+    if not UsdGeom.Mesh(prim) and kind not in _KINDS:
+        return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
+    kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
+    offset = find_value(prim, COLLIDER_OFFSET).at(None) or 0.0
+    side = find_token(prim, COLLIDER_SIDE)
+    odd = (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
+    return ColliderReader(prim, Collider(path, kind, offset, side), metres), odd
+
+
+def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
+    """An array at a time code; what has samples only gives its first for the default."""
+    value = attribute.Get(timecode(time))
+    if value is None:
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    return np.zeros(0, np.int32) if value is None else np.asarray(value)
+
+
+def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.ndarray | None]:
+    """Kind, half sizes in stage units, and the matrix whose columns are the shape's axes in the prim's space.
+
+    A size that is no number is NaN, and an axis that USD does not know has no matrix.
+    """
+
+    def number(name: str, fallback: float) -> float:
+        attribute = prim.GetAttribute(name)
+        value = attribute.Get(timecode(time)) if attribute else None
+        if value is None:
+            return fallback
+        return float(value) if isinstance(value, int | float) else np.nan
+
+    kind = str(prim.GetTypeName()).removesuffix("_1").lower()
+    half_height = 0.5 * number("height", 1.0 if kind == "capsule" else 2.0)
+    top, bottom = number("radiusTop", -1.0), number("radiusBottom", -1.0)
+    radius = max(top, bottom) if top >= 0 else number("radius", 0.5 if kind == "capsule" else 1.0)
+    half = 0.5 * number("size", 2.0)
+    size = {"sphere": [radius] * 3, "cube": [half] * 3}.get(kind, [radius, radius, half_height])
+    axis = prim.GetAttribute("axis").Get() if prim.GetAttribute("axis") else "Z"
+    return kind, np.array(size, dtype=np.float64), UPRIGHT.get(str(axis or "Z"))
+
+
+def _frame_about(normal: np.ndarray) -> np.ndarray:
+    """A rotation whose third column is a direction."""
+    third = normal / np.linalg.norm(normal)
+    first = np.cross(np.eye(3)[np.abs(third).argmin()], third)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(third, first), third], axis=1)

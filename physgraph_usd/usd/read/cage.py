@@ -1,0 +1,176 @@
+"""The coarse cage: a mesh prim's topology, checked.
+
+Faces that are holes or have fewer than three corners are left out. What no solver could use is refused, with the prim,
+the time code and the index.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ...errors import GarmentError
+from ...solver.mesh.topology import PolygonMesh
+from ...words import counted
+from ..stage import Notice
+
+_CONTROLS = {
+    "subdivisionScheme": ("catmullClark", "loop", "bilinear", "none"),
+    "orientation": ("rightHanded", "leftHanded"),
+}
+_SPLIT = "export the garment with one topology, or split the shot where it changes and use --frames"
+MOST_CORNERS, MOST_TWICE = 1000, 64
+"""Corners of a face beyond which a garment is refused, and of one that is there twice: subdivision joins all of them at
+one vertex, and what is near what there grows with their square. 1,000 take seconds, 2,000 on a body a minute, 500 twice
+half a minute."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cage:
+    """A garment's topology.
+
+    Attributes:
+        mesh: Kept faces, in authored order and winding.
+        kept_faces: Which authored faces these are, int32.
+        notices: What was left out.
+    """
+
+    mesh: PolygonMesh
+    kept_faces: np.ndarray
+    notices: tuple[Notice, ...]
+
+
+def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage:
+    """Read and check the topology.
+
+    Args:
+        prim: Mesh prim.
+        vertex_count: Number of points.
+        times: The garment's time codes; empty for a still one.
+
+    Raises:
+        GarmentError: When the topology is empty, broken or varies in time.
+    """
+    path, usd = str(prim.GetPath()), UsdGeom.Mesh(prim)
+    counts_attr, indices_attr = usd.GetFaceVertexCountsAttr(), usd.GetFaceVertexIndicesAttr()
+    holes_attr = usd.GetHoleIndicesAttr()
+    for attribute in (counts_attr, indices_attr, holes_attr):
+        refuse_varying(attribute, times)
+    time = times[0] if times else None
+    counts, indices = (read_integers(attribute, time) for attribute in (counts_attr, indices_attr))
+    check_topology(path, counts, indices, vertex_count=vertex_count, time=time)
+    holes = read_integers(holes_attr, time)
+    known = np.unique(holes[(holes >= 0) & (holes < len(counts))])
+    keep = counts >= 3
+    notices = _left_out(path, keep, len(holes) - np.isin(holes, known).sum())
+    keep[known] = False
+    if not keep.any():
+        raise GarmentError(path, f"every one of its {len(counts)} faces is a hole", remedy="clear holeIndices")
+    _refuse_large_faces(path, counts, indices, keep)
+    kept_indices = indices[np.repeat(keep, counts)]
+    mesh = PolygonMesh(counts[keep], kept_indices, vertex_count)
+    return Cage(mesh, np.flatnonzero(keep).astype(np.int32), (*notices, *_not_carried(usd), *_odd_controls(usd)))
+
+
+def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
+    """Integer array at a time code, or at the first sample where there is no default; empty when unauthored."""
+    value = attribute.Get(Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
+    if value is None:
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    array = np.zeros(0) if value is None else np.asarray(value)
+    if array.ndim != 1 or (len(array) and not np.issubdtype(array.dtype, np.integer)):
+        said = f"{attribute.GetName()} is {type(value).__name__}, not an array of integers"
+        raise GarmentError(str(attribute.GetPrim().GetPath()), said, time=time, remedy="author int[]")
+    return array.astype(np.int32)
+
+
+def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
+    """Refuse an attribute whose samples differ between the first and last time code; equal samples pass.
+
+    Raises:
+        GarmentError: With the first time code at which it changes.
+    """
+    samples = attribute.GetTimeSamples()
+    if len(samples) < 2 or not times:
+        return
+    first = read_integers(attribute, times[0])
+    for time in samples:
+        if times[0] < time <= times[-1] and not np.array_equal(first, read_integers(attribute, time)):
+            said = f"{attribute.GetName()} changes: the topology of a garment must stay the same over the shot"
+            raise GarmentError(str(attribute.GetPrim().GetPath()), said, time=time, remedy=_SPLIT)
+
+
+def check_topology(
+    path: str, counts: np.ndarray, indices: np.ndarray, *, vertex_count: int, time: float | None
+) -> None:
+    """Refuse a topology that no reader could use.
+
+    Raises:
+        GarmentError: With the faulty index or sum.
+    """
+    remedy = "export the mesh again or repair it in its host program"
+    if len(counts) == 0 or vertex_count == 0 or not (counts >= 3).any():
+        said = f"the mesh is empty: {vertex_count} points, {len(counts)} faces"
+        raise GarmentError(path, said, time=time, remedy="leave it out with --garment, or remove the schema from it")
+    if counts.min() < 0:
+        face = int(np.argmin(counts))
+        raise GarmentError(path, f"faceVertexCounts[{face}] is {counts[face]}", time=time, remedy=remedy)
+    if counts.sum(dtype=np.int64) != len(indices):
+        said = f"faceVertexCounts sum to {counts.sum(dtype=np.int64)} but there are {len(indices)} faceVertexIndices"
+        raise GarmentError(path, said, time=time, remedy=remedy)
+    outside = np.flatnonzero((indices < 0) | (indices >= vertex_count))
+    if len(outside):
+        corner = int(outside[0])
+        said = f"faceVertexIndices[{corner}] is {indices[corner]} but there are {vertex_count} points"
+        raise GarmentError(path, said, time=time, remedy=remedy)
+
+
+def _refuse_large_faces(path: str, counts: np.ndarray, indices: np.ndarray, keep: np.ndarray) -> None:
+    """Refuse faces of so many corners that no solve ends, or fewer where one lies on another."""
+    starts, known = np.cumsum(counts) - counts, dict[bytes, int]()
+    for face in np.flatnonzero(keep & (counts > MOST_TWICE)).tolist():
+        count = int(counts[face])
+        remedy = "remesh it, or triangulate it"
+        if count > MOST_CORNERS:
+            raise GarmentError(path, f"face {face} has {count:,} corners; {MOST_CORNERS:,} are the most", remedy=remedy)
+        first = known.setdefault(np.sort(indices[starts[face] :][:count]).tobytes(), face)
+        if first != face:
+            raise GarmentError(path, f"faces {first} and {face} have the same {count} corners", remedy="remove one")
+
+
+def _left_out(path: str, keep: np.ndarray, unknown_holes: int) -> list[Notice]:
+    notices = []
+    if not keep.all():
+        face = int(np.argmin(keep))
+        said = f"{counted(int(np.sum(~keep)), 'face')} with fewer than three corners left out, the first is face {face}"
+        notices.append(Notice(path, None, said))
+    if unknown_holes:
+        notices.append(Notice(path, None, f"{unknown_holes} holeIndices name no face and are ignored"))
+    return notices
+
+
+def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
+    """Say which subdivision features of the cage refining does not honour."""
+    authored = [
+        attribute.GetName()
+        for attribute in (usd.GetCreaseIndicesAttr(), usd.GetCornerIndicesAttr())
+        if attribute.HasAuthoredValue() and np.size(attribute.Get(Usd.TimeCode.EarliestTime()) or ())
+    ]
+    said = f"{' and '.join(authored)} sharpen the cage's limit surface; cloth has no sharp edges, so they are dropped"
+    return [Notice(str(usd.GetPath()), None, said)] if authored else []
+
+
+def _odd_controls(usd: UsdGeom.Mesh) -> list[Notice]:
+    """Tell of topology controls that USD does not define or that vary in time, which it forbids."""
+    path, notices = str(usd.GetPath()), []
+    for name, known in _CONTROLS.items():
+        attribute = usd.GetPrim().GetAttribute(name)
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+        if value not in known:
+            notices.append(Notice(path, None, f"{name} is {value!r}; USD knows {', '.join(known)}; {known[0]} assumed"))
+        if attribute.GetNumTimeSamples() > 1:
+            notices.append(Notice(path, None, f"{name} has time samples, which USD does not allow; the first is used"))
+    return notices

@@ -1,0 +1,268 @@
+"""One garment, read from its mesh prim."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
+
+from ...errors import GarmentError
+from ...solver.mesh.fit import median_shape
+from ...solver.mesh.topology import PolygonMesh, edges_of
+from ...solver.scene import Garment, GarmentFrame
+from ..lookup import Override, find_value
+from ..schema import GARMENT
+from ..stage import GarmentSource, Notice, Units
+from ..times import garment_times, merge, transform_times, within
+from .cage import read_cage
+from .deformable import rest_angle_notices
+from .materials import Values, find_values
+from .painted import read_painted
+from .placement import check_matrix, check_placement, is_flipped, place, to_metres
+from .points import PointReader
+from .rest import AUTO, Rest, checked, read_rest, rests_bent
+from .skinning import Bake
+
+_SMALL, _LARGE = 0.01, 100.0
+_MEDIAN_FRAMES = 9
+"""Time codes that `--rest auto` takes medians of: an edge that is odd in four of them does not count."""
+_THICK = 10.0
+"""Part of its size beyond which cloth keeps no distance: where all of it is near all of it, a query asks for V^2 pairs,
+and what is pushed out by more than it measures is no shape that the shot had."""
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What was asked for, and what the garments of one stage share.
+
+    Attributes:
+        units: What the stage's numbers mean.
+        bake: Baked skinning.
+        frames: First and last time code, or None.
+        level: Number of subdivisions for all, -1 for auto, or None.
+        overrides: What ``--set`` gave.
+        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to all, or None.
+        assumed_units: Whether metersPerUnit is not authored.
+    """
+
+    units: Units
+    bake: Bake
+    frames: tuple[float, float] | None = None
+    level: int | None = None
+    overrides: tuple[Override, ...] = ()
+    rest_frame: float | str | None = None
+    assumed_units: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentReader:
+    """A garment with what is needed to read its frames.
+
+    Attributes:
+        garment: Its constant data.
+        source: How it sits on the stage.
+        values: Sources of its animated values.
+        points: Its points.
+        edges: Its edges, shape (E, 2).
+        notices: What was found while reading.
+    """
+
+    garment: Garment
+    source: GarmentSource
+    values: Values
+    points: PointReader
+    edges: np.ndarray
+    notices: list[Notice] = field(default_factory=list)
+
+    def frame(self, matrix: np.ndarray, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
+        """Read one time code.
+
+        Args:
+            matrix: From local space to world metres, shape (4, 4).
+            time: Time code, or None for the default.
+
+        Returns:
+            The frame, and what was repaired in it.
+        """
+        local, notices = self.points.read(time, self.edges)
+        names = ("guide:stiffness", "refine:detail", "contact:offset")
+        guide, detail, offset = (self.values.number(name, time) for name in names)
+        fabric, most = self.values.fabric(time), float(np.linalg.norm(np.ptp(self.garment.rest, axis=0))) / _THICK
+        if max(fabric.thickness, offset) > most:
+            said = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
+            said += f" {1e3 * fabric.thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
+            notices = (*notices, Notice(self.garment.path, None, said))
+        fabric, offset = replace(fabric, thickness=min(fabric.thickness, most)), min(offset, most)
+        return GarmentFrame(place(local, matrix), fabric, guide, detail, offset), notices
+
+
+def all_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
+    """Every authored time code of a garment; a skinned one has its skeleton's, samples added by baking do not count."""
+    skinned = bake.skinned.get(prim.GetPath())
+    return merge([*skinned.times, *transform_times(prim)]) if skinned else garment_times(prim)
+
+
+def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) -> GarmentReader:
+    """Read a garment.
+
+    Args:
+        prim: Its mesh prim.
+        roots: The instances that hold it on the stage as opened.
+        request: What was asked for.
+
+    Raises:
+        GarmentError: When the garment is broken.
+        SchemaError: When one of its values cannot be used.
+    """
+    every = all_times(prim, request.bake)
+    times, first = within(every, request.frames), every[0] if every else None
+    points = PointReader(prim, times[0] if times else None)
+    cage = read_cage(prim, points.count, times)
+    edges = cage.mesh.half_edges.edges
+    notices = [*cage.notices, *rest_angle_notices(prim), *check_placement(prim, request.units.metres, times)]
+    matrix = to_metres(prim, request.units.metres, first)
+    start = place(points.read(first, edges)[0], matrix)
+    if request.rest_frame is None:
+        rest = _rest_on_stage(prim, matrix, request, edges=edges, start=start, first=first)
+    else:
+        rest = checked(prim, edges, _rest_asked(prim, points, request, mesh=cage.mesh, every=every), first=start)
+    values = find_values(prim, request.units, request.overrides)
+    level, level_source = _level(prim, request)
+    (own, own_source), (layer, layer_source) = _feels_itself(prim, request), _layer(prim, request)
+    garment = Garment(
+        path=str(prim.GetPath()),
+        mesh=cage.mesh,
+        rest=rest.points,
+        level=level,
+        flipped=is_flipped(prim, matrix),
+        bent_rest=rests_bent(prim),
+        self_contact=own,
+        layer=layer,
+        **_painted(prim, points.count, notices, values=values),
+    )
+    notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
+    named = {"contact:selfCollision": own_source, "contact:layer": layer_source, "rest": rest.source}
+    named |= values.sources | {"refine:level": level_source}
+    place_on_stage = (prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times)
+    source = GarmentSource(
+        *place_on_stage,
+        named,
+        values.animated,
+        left_out=tuple(time for time in every if time not in times),
+        velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
+        subsets=_subsets(prim, cage.kept_faces),
+    )
+    return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices])
+
+
+def _rest_asked(
+    prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
+) -> Rest:
+    """Rest shape that the user asked for: the points at a time code, or one fitted to all."""
+    if request.rest_frame == AUTO:
+        return _rest_auto(prim, points, request, mesh=mesh, every=every)
+    time = float(request.rest_frame or 0.0)
+    local, notices = points.read(time, mesh.half_edges.edges)
+    placed = place(local, to_metres(prim, request.units.metres, time))
+    return Rest(placed, f"points at time code {time:g} (--rest)", notices)
+
+
+def _rest_auto(
+    prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
+) -> Rest:
+    """Rest shape: fitted to the median lengths that the edges have over the whole shot, whatever part is refined."""
+    poses: dict[float | None, np.ndarray] = {}
+    picks = np.linspace(0, len(every) - 1, min(_MEDIAN_FRAMES, len(every))).round().astype(int)
+    for time in [every[pick] for pick in picks] or [None]:
+        with contextlib.suppress(GarmentError):  # The frame's own turn to be refined names what is wrong with it.
+            local = points.read(time, mesh.half_edges.edges)[0]
+            poses[time] = place(local, to_metres(prim, request.units.metres, time))
+    found = list(poses.values())
+    shape, nearest = median_shape(edges_of(mesh.triangulate(found[0]).triangles, mesh.vertex_count).vertices, found)
+    at = [*poses][nearest]
+    said = f"median edge lengths of {len(poses)} time codes" + ("" if at is None else f", from the points at {at:g}")
+    return Rest(shape, f"auto: {said} (--rest)")
+
+
+def _subsets(prim: Usd.Prim, kept: np.ndarray) -> dict[str, np.ndarray]:
+    """Faces of the cage in each of the mesh's subsets of faces, by name."""
+    named = {}
+    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
+        faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
+        named[subset.GetPrim().GetName()] = np.flatnonzero(np.isin(kept, [] if faces is None else np.asarray(faces)))
+    return named
+
+
+def _rest_on_stage(
+    prim: Usd.Prim, matrix: np.ndarray, request: Request, *, edges: np.ndarray, start: np.ndarray, first: float | None
+) -> Rest:
+    """Rest shape that the stage gives; a skinned one is placed by its bind transform, not by the mesh's own."""
+    bound = matrix
+    if prim.GetPath() in request.bake.skinned:
+        rows = request.bake.rest_transform(prim.GetPath(), first)
+        bound = check_matrix(prim, rows, request.units.metres, time=first)
+    return read_rest(prim, edges, start, place=lambda local: place(local, bound), baked=request.bake.layer)
+
+
+def _level(prim: Usd.Prim, request: Request) -> tuple[int, str]:
+    found = find_value(prim, GARMENT["refine:level"], request.overrides)
+    if request.level is not None and found.source != "--set":
+        return request.level, "--level"
+    return round(found.at(None) or 0.0), found.source
+
+
+def _layer(prim: Usd.Prim, request: Request) -> tuple[int | None, str]:
+    found = find_value(prim, GARMENT["contact:layer"], request.overrides)
+    place = found.at(None)
+    return None if place is None else round(place), found.source
+
+
+def _feels_itself(prim: Usd.Prim, request: Request) -> tuple[bool, str]:
+    found = find_value(prim, GARMENT["contact:selfCollision"], request.overrides)
+    return bool(found.at(None)), found.source
+
+
+def _painted(prim: Usd.Prim, count: int, notices: list[Notice], *, values: Values) -> dict[str, Any]:
+    """The painted arrays of a garment by field name, with the thickness's share; adds to the notices."""
+    names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
+    names |= {"detail_scale": "detailScale", "pin": "pin"}
+    arrays = {}
+    for name, short in names.items():
+        arrays[name], odd = read_painted(prim, short, count)
+        notices.extend(odd)
+    arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
+    arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
+    return arrays
+
+
+def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:
+    """Tell the garment's size in metres when units were assumed or the size is no garment's."""
+    size = np.ptp(points, axis=0)
+    largest = float(size.max())
+    if not request.assumed_units and _SMALL <= largest <= _LARGE:
+        return []
+    said = " x ".join(f"{length:.3g}" for length in size)
+    return [Notice(path, None, f"measures {said} m with {request.units.metres:g} m per unit; check metersPerUnit")]
+
+
+def _unit_notices(prim: Usd.Prim, matrix: np.ndarray, request: Request) -> list[Notice]:
+    """Tell of a layer in other units whose points no scale corrects; USD itself never converts."""
+    scale, metres = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3])))), request.units.metres
+    notices = []
+    for layer in dict.fromkeys(spec.layer for spec in UsdGeom.Mesh(prim).GetPointsAttr().GetPropertyStack()):
+        own = layer.pseudoRoot.GetInfo("metersPerUnit") if layer.pseudoRoot.HasInfo("metersPerUnit") else None
+        if isinstance(own, int | float) and not np.isclose(own, metres) and not np.isclose(own, scale, rtol=0.01):
+            said = f"its layer @{layer.GetDisplayName()}@ has {own:g} m per unit, the stage has {metres:g}"
+            notices.append(Notice(str(prim.GetPath()), None, f"{said}; USD does not convert, check its size"))
+    return notices
+
+
+def is_visible(prim: Usd.Prim, times: Sequence[float]) -> bool:
+    """Whether a prim is visible at any of the time codes, or by default when there are none."""
+    imageable = UsdGeom.Imageable(prim)
+    codes = [Usd.TimeCode(time) for time in times] or [Usd.TimeCode.Default()]
+    return any(imageable.ComputeVisibility(code) != UsdGeom.Tokens.invisible for code in codes)

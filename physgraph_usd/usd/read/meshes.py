@@ -1,0 +1,240 @@
+"""Reads meshes for drawing: world positions, triangles and colours at a time, from any stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+
+from ...errors import StageError
+from ..provenance import recorded_shot
+from ..stage import bad_rate, check_there, list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
+from ..times import garment_times, merge
+from ..view import root_over
+from .find import has_schema, traverse
+
+NEUTRAL = (0.55, 0.54, 0.52)
+"""Linear colour of a mesh that says nothing of its own."""
+
+
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Turns Z up into Y up."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMesh:
+    """One visible mesh at one time.
+
+    Attributes:
+        path: Prim path.
+        points: World positions [m], Y up, shape (V, 3).
+        triangles: Corners, counter-clockwise seen from outside, shape (T, 3).
+        edges: Whether the edge opposite each corner is a polygon's edge, shape (T, 3).
+        colors: Linear RGB per triangle, shape (T, 3).
+        faces: Number of authored polygons.
+    """
+
+    path: str
+    points: np.ndarray
+    triangles: np.ndarray
+    edges: np.ndarray
+    colors: np.ndarray
+    faces: int
+
+
+class DrawnStage:
+    """A shot, alone or under a layer, composed in an anonymous root.
+
+    Args:
+        shot: The shot's file, which gives units, axis and rates.
+        over: A layer put over the shot, or None.
+
+    Raises:
+        StageError: When a file cannot be opened, or its rate is none.
+    """
+
+    def __init__(self, shot: Path, over: Path | None = None) -> None:
+        """Compose and open."""
+        base = _open_layer(shot)
+        self._refined = _refined_times(over) if over is not None else ()
+        layers = [_open_layer(path) for path in (over, shot) if path is not None]
+        self._root = root_over(base, [layer.identifier for layer in layers])
+        with pxr_errors(f"cannot open {shot}"), quiet():
+            self.stage = Usd.Stage.Open(self._root)
+        if said := bad_rate(self.stage):
+            raise StageError(f"cannot draw {shot}: {said}")
+        self.rate = float(self.stage.GetTimeCodesPerSecond())
+        self._scale = metres_per_unit(self.stage)[0]
+        self._turn = Z_UP if up_vector(self.stage)[0][2] == 1.0 else np.eye(3)
+
+    def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
+        """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons.
+
+        Under a refined layer only those from its first sample to its last: outside it holds still.
+        """
+        found: list[float] = []
+        for prim in traverse(self.stage):
+            if (UsdGeom.Mesh(prim) and not paths) or str(prim.GetPath()) in paths:
+                found.extend(garment_times(prim))
+            elif animation := UsdSkel.Animation(prim):
+                for attribute in (animation.GetRotationsAttr(), animation.GetTranslationsAttr()):
+                    found.extend(attribute.GetTimeSamples())
+        if self._refined:
+            found = [time for time in found if self._refined[0] <= time <= self._refined[-1]]
+        return merge(found)
+
+    def bake(self, times: tuple[float, ...]) -> None:
+        """Skin the skinned meshes for the given times, in the anonymous root."""
+        span = Gf.Interval(min(times), max(times)) if times else Gf.Interval.GetFullInterval()
+        with quiet():
+            for prim in Usd.PrimRange.Stage(self.stage):
+                if UsdSkel.Root(prim):
+                    UsdSkel.BakeSkinning(UsdSkel.Root(prim), span)
+
+    def paths(self) -> tuple[str, ...]:
+        """Return the paths of all meshes, drawn or not."""
+        return list_meshes(self.stage)
+
+    def garments(self) -> tuple[str, ...]:
+        """Return the paths of meshes with the garment schema applied, registered or not."""
+        applied = [prim for prim in traverse(self.stage) if has_schema(prim, "PhysGraphGarmentAPI")]
+        return tuple(str(prim.GetPath()) for prim in applied if UsdGeom.Mesh(prim))
+
+    def meshes(self, time: float | None) -> list[DrawnMesh]:
+        """Read every visible mesh of purpose default or render.
+
+        Args:
+            time: Time code, or None for the default values.
+
+        Returns:
+            The meshes in stage order; those without usable faces are left out.
+        """
+        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        transforms = UsdGeom.XformCache(code)
+        drawn = []
+        for prim in traverse(self.stage):
+            mesh = UsdGeom.Mesh(prim)
+            if not mesh or not _is_seen(mesh, code):
+                continue
+            matrix = np.array(transforms.GetLocalToWorldTransform(prim))
+            read = _read(mesh, code, matrix)
+            if read is not None:
+                points = self._scale * (read.points @ matrix[:3, :3] + matrix[3, :3]) @ self._turn.T
+                drawn.append(DrawnMesh(read.path, points, read.triangles, read.edges, read.colors, read.faces))
+        return drawn
+
+
+def shot_of(layer: Path) -> Path | None:
+    """Find the shot that a refined layer was made from.
+
+    Args:
+        layer: A layer with ``customLayerData["physgraph"]["shot"]``, or any other.
+
+    Returns:
+        The shot's file, or None when the layer does not name one.
+    """
+    shot = recorded_shot(_open_layer(layer))
+    return Path(shot) if shot else None
+
+
+def refined_in(layer: Path) -> tuple[str, ...]:
+    """Return the paths whose points a layer authors itself."""
+    opened, found = _open_layer(layer), []
+
+    def visit(path: Sdf.Path | str) -> None:
+        path = Sdf.Path(str(path))
+        if path.IsPropertyPath() and path.name == "points":
+            found.append(str(path.GetPrimPath()))
+
+    opened.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return tuple(sorted(found))
+
+
+def _refined_times(layer: Path) -> tuple[float, ...]:
+    """Time codes at which a refined layer has points."""
+    opened = _open_layer(layer)
+    return merge(time for path in refined_in(layer) for time in opened.ListTimeSamplesForPath(f"{path}.points"))
+
+
+def _open_layer(path: Path) -> Sdf.Layer:
+    """Open a layer or say that it cannot be read."""
+    check_there(path)
+    with pxr_errors(f"cannot open {path}"), quiet():
+        layer = Sdf.Layer.FindOrOpen(str(path)) if path.is_file() else None
+    if not layer:
+        raise StageError(f"cannot open {path}: it is no USD file")
+    return layer
+
+
+def _is_seen(mesh: UsdGeom.Mesh, code: Usd.TimeCode) -> bool:
+    """Whether a renderer would draw the mesh."""
+    purpose = mesh.ComputePurpose()
+    return purpose in {"default", "render"} and mesh.ComputeVisibility(code) != "invisible"
+
+
+def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMesh | None:
+    """Read one mesh in its own space and units, or None when it cannot be drawn."""
+    points, counts, indices = (
+        attribute.Get(code)
+        for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    )
+    if not points or not counts or not indices:
+        return None
+    place = np.asarray(points, dtype=np.float64)
+    counts, indices = np.asarray(counts), np.asarray(indices)
+    usable = counts.sum() == len(indices) and indices.min() >= 0 and indices.max() < len(place)
+    if not usable or not np.isfinite(place).all():
+        return None
+    face, triangles, edges = _fan(counts, indices)
+    left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
+    # By the signs of stretches: a scale's cube can overflow.
+    if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
+        triangles, edges = triangles[:, ::-1], edges[:, ::-1]
+    colors = _colors(mesh, code, len(counts))[face]
+    return DrawnMesh(str(mesh.GetPath()), place, triangles, edges, colors, len(counts))
+
+
+def _fan(counts: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split polygons into fans: face of each triangle, corners, and which edges are polygon edges."""
+    starts = np.cumsum(counts) - counts
+    pieces = np.maximum(counts - 2, 0)
+    face = np.repeat(np.arange(len(counts)), pieces)
+    step = np.arange(len(face)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 1
+    start = starts[face]
+    triangles = np.stack([indices[start], indices[start + step], indices[start + step + 1]], axis=1)
+    last = step + 1 == counts[face] - 1
+    edges = np.stack([np.ones(len(face), bool), last, step == 1], axis=1)
+    return face, triangles, edges
+
+
+def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
+    """Linear colour per authored face: subset's material, else the mesh's, else displayColor, else neutral."""
+    colors = np.tile(np.array(NEUTRAL), (faces, 1))
+    shown = mesh.GetDisplayColorPrimvar().ComputeFlattened(code)
+    if shown:
+        values = np.asarray(shown, dtype=float)
+        colors[:] = values if len(values) == faces else values.mean(axis=0)
+    whole = _material_color(mesh.GetPrim())
+    if whole is not None:
+        colors[:] = whole
+    for subset in UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets():
+        own = _material_color(subset.GetPrim())
+        members = np.asarray(subset.GetIndicesAttr().Get(code) or [], dtype=int)
+        if own is not None:
+            colors[members[members < faces]] = own
+    return colors
+
+
+def _material_color(prim: Usd.Prim) -> np.ndarray | None:
+    """Diffuse colour of the preview surface bound to a prim, or None when it has none or a texture."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    if not material:
+        return None
+    shader = material.ComputeSurfaceSource()[0]
+    diffuse = shader.GetInput("diffuseColor") if shader else None
+    if not diffuse or diffuse.HasConnectedSource():
+        return None
+    value = diffuse.Get()
+    return None if value is None else np.array(value, dtype=float)

@@ -1,0 +1,88 @@
+"""How a prim is placed in the world, in metres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pxr import Gf, Usd, UsdGeom
+
+from ...errors import GarmentError
+from ..stage import Notice
+
+_SINGULAR = 1e-9
+_EXTREME = 1e30
+"""A scale beyond which, or under one over which, no volume is a number."""
+_REMEDY = "give the prim and its ancestors a scale other than zero there, or leave that time out with --frames"
+
+
+def timecode(time: float | None) -> Usd.TimeCode:
+    """USD's time code for ours: None is the default value."""
+    return Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+
+
+def to_metres(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
+    """Matrix from a prim's local space to world metres.
+
+    Args:
+        prim: Any prim.
+        metres: Length of one stage unit [m].
+        time: Time code, or None for the default.
+
+    Returns:
+        Matrix for column vectors, shape (4, 4), float64.
+
+    Raises:
+        GarmentError: When it cannot be inverted.
+    """
+    return check_matrix(prim, UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(prim), metres, time=time)
+
+
+def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: float | None) -> np.ndarray:
+    """Turn USD's row-vector matrix into a column-vector matrix to metres, refusing what cannot be inverted.
+
+    Raises:
+        GarmentError: When it is singular, not finite, projective or of a scale that is no length.
+    """
+    matrix = np.array(rows, dtype=np.float64).T.copy()
+    path = str(prim.GetPath())
+    if not np.isfinite(matrix).all():
+        raise GarmentError(path, "its transform to the world is NaN or infinite", time=time, remedy=_REMEDY)
+    stretches = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if stretches[2] <= _SINGULAR * stretches[0]:
+        said = f"its transform to the world is singular: it scales by {stretches[0]:.3g}, {stretches[1]:.3g}"
+        raise GarmentError(path, f"{said} and {stretches[2]:.3g}", time=time, remedy=_REMEDY)
+    if not 1.0 / _EXTREME < stretches[0] < _EXTREME:
+        said = f"its transform to the world scales by {stretches[0]:.3g}"
+        raise GarmentError(path, said, time=time, remedy=f"give a scale of {1 / _EXTREME:g} to {_EXTREME:g}")
+    if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise GarmentError(
+            path, "its transform to the world is projective", time=time, remedy="author affine transforms"
+        )
+    matrix[:3] *= metres
+    return matrix
+
+
+def place(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Apply a (4, 4) column-vector matrix to points, shape (V, 3); what is not finite stays so, for who reads it."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
+    """Whether the authored winding is clockwise seen from outside, in the world."""
+    left_handed = UsdGeom.Mesh(prim).GetOrientationAttr().Get(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.leftHanded
+    linear = matrix[:3, :3] / max(float(np.abs(matrix[:3, :3]).max()), np.finfo(float).tiny)
+    return left_handed != bool(np.linalg.det(linear) < 0)
+
+
+def check_placement(prim: Usd.Prim, metres: float, times: Sequence[float]) -> tuple[Notice, ...]:
+    """See that a prim can be placed at every time code; say when mirroring switches on or off.
+
+    Raises:
+        GarmentError: At the first time code where it cannot.
+    """
+    mirrored = [bool(np.linalg.det(to_metres(prim, metres, time)[:3, :3]) < 0) for time in times]
+    switches = [time for time, now, then in zip(times[1:], mirrored[1:], mirrored, strict=False) if now != then]
+    said = "its transform starts or stops mirroring here; the winding of its first time code is used throughout"
+    return tuple(Notice(str(prim.GetPath()), time, said) for time in switches[:1])

@@ -1,0 +1,344 @@
+"""A shot, opened for reading: its scene, its frames, and how its garments sit on the stage.
+
+    with contextlib.closing(open_shot("shot.usda")) as shot:
+        for time in shot.scene.times:
+            frame = shot.frame(time)
+
+Everything handed out is in metres and world space with the stage's own axes. A shot without samples has no times; its
+one frame is ``shot.frame(None)``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+from pxr import Sdf, Usd
+
+from ...errors import AbsentError, SchemaError, StageError, UsageError
+from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
+from ..lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
+from ..provenance import mute_refined, refuse_refined, unsaved_layers
+from ..schema import GARMENT
+from ..stage import (
+    GarmentSource,
+    Notice,
+    check_metadata,
+    open_stage,
+    pxr_errors,
+    quiet,
+    read_units,
+    refuse_missing_arcs,
+    root_metadata,
+    shot_name,
+)
+from ..times import merge, snap, within
+from ..view import StageView
+from .apart import read_apart
+from .bodies import ColliderReader, read_collider
+from .find import felt_by, find_colliders, find_garments, instance_roots
+from .garment import GarmentReader, Request, all_times, is_visible, read_garment
+from .limits import beyond_limits_of_all
+from .materials import find_values
+from .placement import to_metres
+from .rest import AUTO
+from .skinning import Bake
+from .unread import unread
+from .variants import selections
+
+
+class Shot:
+    """An opened stage, ready to be asked for frames.
+
+    Attributes:
+        stage: The composed stage, with skinning baked in an anonymous session layer; never edited on disk.
+        path: The shot file, or the name of a stage that has none.
+        view: What the stage showed before anything was baked into it or muted on it.
+        unsaved: Names of its layers whose content is in no file.
+        scene: What stays the same over the shot.
+        sources: How each garment sits on the stage, in the scene's order.
+        colliders: Paths of the collider prims found.
+        selections: Variant selections in force on what the garments depend on, as paths `/World/coat{fit=loose}`.
+        warnings: What the user should know; grows as frames are read.
+        metres_per_unit: Length of one stage unit [m].
+    """
+
+    def __init__(
+        self, path: str, stage: Usd.Stage, view: StageView, *, request: Request, readers: Sequence[GarmentReader]
+    ) -> None:
+        """Put together what ``open_shot`` read."""
+        self.path, self.stage, self.view = path, stage, view
+        self.colliders: tuple[str, ...] = ()
+        self.selections: tuple[str, ...] = ()
+        self.unsaved: tuple[str, ...] = ()
+        self.warnings: list[Notice] = []
+        self.metres_per_unit = request.units.metres
+        times = merge(time for reader in readers for time in reader.source.times)
+        self.sources: tuple[GarmentSource, ...] = tuple(
+            replace(reader.source, times=snap(reader.source.times, times)) for reader in readers
+        )
+        self.scene = Scene(tuple(reader.garment for reader in readers), request.units.gravity, times)
+        self._readers, self._request = tuple(readers), request
+        self._bodies: tuple[ColliderReader, ...] = ()
+
+    def add_colliders(
+        self, bodies: Sequence[ColliderReader], felt: Sequence[tuple[int, ...]], apart: Sequence[dict[str, str]]
+    ) -> None:
+        """Take colliders into the scene.
+
+        Args:
+            bodies: The colliders.
+            felt: For each garment, the numbers of those that it feels.
+            apart: For each garment, the paths of colliders and garments that it never touches, and what says so.
+        """
+        self._bodies = tuple(bodies)
+        paths = {garment.path for garment in self.scene.garments}
+        garments = (
+            replace(garment, colliders=own, apart_from=tuple(path for path in excluded if path in paths))
+            for garment, own, excluded in zip(self.scene.garments, felt, apart, strict=True)
+        )
+        colliders = tuple(body.collider for body in bodies)
+        self.scene = replace(self.scene, garments=tuple(garments), colliders=colliders)
+        self.sources = tuple(replace(s, apart_from=excluded) for s, excluded in zip(self.sources, apart, strict=True))
+
+    def to_metres(self, index: int, time: float | None) -> np.ndarray:
+        """Matrix from a garment's local space to world metres.
+
+        Args:
+            index: Which garment.
+            time: Time code, or None for the default.
+
+        Returns:
+            Matrix for column vectors, shape (4, 4), float64: ``world = M @ [local; 1]``.
+
+        Raises:
+            GarmentError: When it cannot be inverted.
+        """
+        return to_metres(self.stage.GetPrimAtPath(self.sources[index].path), self.metres_per_unit, time)
+
+    def times_until(self, last: float) -> list[float]:
+        """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
+        every = merge(time for source in self.sources for time in (*source.times, *source.left_out))
+        return [time for time in every if time < last] + [last]
+
+    def frame(self, time: float | None) -> Frame:
+        """Read one time code; None reads the default values.
+
+        Raises:
+            GarmentError: When a garment is broken or out of bounds at this time.
+            SchemaError: When an animated value cannot be used.
+            StageError: When USD cannot read the files any more.
+        """
+        garments, told = [], []
+        with pxr_errors(f"cannot read {self.path}" + ("" if time is None else f" at time code {time:g}")):
+            for index, reader in enumerate(self._readers):
+                garment, notices = reader.frame(self.to_metres(index, time), time)
+                garments.append(garment)
+                told += notices
+            poses = []
+            for body in self._bodies:
+                pose, notices = body.pose(time)
+                poses.append(pose)
+                told += notices
+        self._tell(told)
+        frame = Frame(time, tuple(garments), tuple(poses))
+        refuse_far(self.scene, frame)
+        refuse_falling(self.scene, frame)
+        return frame
+
+    def with_values(self, overrides: Sequence[str]) -> Shot:
+        """The same shot, its frames read with other ``--set`` values; what only opening reads stays as it is.
+
+        Args:
+            overrides: As `open_shot` takes them, in place of those that it was given.
+
+        Raises:
+            UsageError: When one cannot be read, or is for no garment.
+        """
+        asked = parse_overrides(overrides)
+        check_overrides(asked, [source.path for source in self.sources])
+        other = copy(self)
+        found = [
+            find_values(self.stage.GetPrimAtPath(source.path), self._request.units, asked) for source in self.sources
+        ]
+        other._readers = tuple(
+            replace(reader, values=values) for reader, values in zip(self._readers, found, strict=True)
+        )
+        other.sources = tuple(
+            replace(source, sources=source.sources | values.sources, animated=values.animated)
+            for source, values in zip(self.sources, found, strict=True)
+        )
+        return other
+
+    def _tell(self, notices: Sequence[Notice]) -> None:
+        """Add what was not said before to the warnings."""
+        known = set(self.warnings) if notices else set()
+        self.warnings.extend(notice for notice in dict.fromkeys(notices) if notice not in known)
+
+    def close(self) -> None:
+        """Let go of the stage; nothing can be read afterwards."""
+        self._readers, self._bodies = (), ()
+        del self.stage, self.view, self._request
+
+
+def open_shot(
+    shot: str | os.PathLike[str] | Usd.Stage,
+    *,
+    garments: Sequence[str] = (),
+    colliders: Sequence[str] = (),
+    frames: tuple[float, float] | None = None,
+    level: int | None = None,
+    overrides: Sequence[str] = (),
+    rest_frame: float | str | None = None,
+    skip_invisible: bool = False,
+) -> Shot:
+    """Open a shot for refining.
+
+    Args:
+        shot: The shot file, any that USD opens; or an open stage, read as it stands and not changed.
+        garments: Prim paths, prim names, globs over paths or collections (``/Prim.collection:name``); empty: the
+            meshes with PhysGraphGarmentAPI.
+        colliders: The same for colliders; empty: what the garments name, else every prim with PhysGraphColliderAPI
+            or UsdPhysics' CollisionAPI.
+        frames: First and last time code in composed stage time; None: every authored one.
+        level: Number of subdivisions, -1 for auto; None: what each garment's schema says.
+        overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
+        rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to all of
+            the shot; it goes before authored rest shapes.
+        skip_invisible: Leave out garments that are invisible at all their time codes.
+
+    Returns:
+        The shot; its ``warnings`` tell what was assumed, left out or repaired.
+
+    Raises:
+        UsageError: When an option cannot be used.
+        StageError: When the stage cannot be read, or has no such garment or collider.
+        GarmentError: When a garment is broken.
+        SchemaError: When an attribute cannot be used.
+    """
+    asked = parse_overrides(overrides)
+    _check_options(frames, level, rest_frame)
+    source = shot if isinstance(shot, Usd.Stage) else os.fspath(shot)
+    path = shot_name(source)
+    stage, notices = open_stage(source)
+    view = StageView.of(stage)
+    notices += [Notice("", None, f"{layer} holds refined cloth and is left out") for layer in mute_refined(stage)]
+    with pxr_errors(f"cannot read {path}"), quiet():
+        unsaved = unsaved_layers(stage)
+        refuse_refined(stage)
+        check_metadata(stage)
+        prims = _find(stage, garments, notices)
+        refuse_refined(stage, [prim.GetPath() for prim in prims])
+        check_overrides(asked, [prim.GetPath() for prim in prims])
+        found = find_colliders(stage, prims, colliders)
+        for prim in (*prims, *found):
+            refuse_missing_arcs(prim, notices)
+        notices += unread([*prims, *found])
+        notices += [Notice(path, None, said) for path, said in dict.fromkeys(beyond_limits_of_all(prims, found))]
+        units, odd = read_units(stage)
+        assumed = root_metadata(stage, "metersPerUnit") is None
+        prims = [
+            prim for prim in prims if is_on(prim, ENABLED, asked) or notices.append(_left_out(prim, "is disabled"))
+        ]
+        bake = Bake(stage)
+        request = Request(units, bake, frames, level, asked, rest_frame, assumed)
+        bodies = [prim.GetPath() for prim in found]
+        readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
+        opened = Shot(path, stage, view, request=request, readers=readers)
+        _add_colliders(opened, bodies, colliders, notices=notices)
+        opened.selections = selections(
+            map(stage.GetPrimAtPath, [*(s.path for s in opened.sources), *bodies, *bake.prims()])
+        )
+    opened.unsaved = unsaved
+    opened.colliders = tuple(str(path) for path in bodies)
+    read_notices = [notice for reader in readers for notice in reader.notices]
+    opened.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
+    return opened
+
+
+def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:
+    """Refuse options that no stage could satisfy."""
+    if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
+        raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
+    if level is not None:
+        try:
+            check_limits(GARMENT["refine:level"], level, "--level")
+        except SchemaError as error:
+            raise UsageError(str(error)) from error
+    if not (rest_frame in (None, AUTO) or (isinstance(rest_frame, int | float) and math.isfinite(rest_frame))):
+        raise UsageError(f"rest frame {rest_frame!r} is neither a time code nor '{AUTO}'")
+
+
+def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) -> list[Usd.Prim]:
+    """Find the garments; when that fails, also tell what is missing from the stage."""
+    try:
+        return find_garments(stage, garments)
+    except StageError as error:
+        if not notices:
+            raise
+        kind = AbsentError if isinstance(error, AbsentError) else StageError
+        raise kind(f"{error}; missing: {'; '.join(notice.message for notice in notices)}") from error
+
+
+def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str], *, notices: list[Notice]) -> None:
+    """Read the colliders and which garment feels which; those that all are kept apart from are not read."""
+    prims = [shot.stage.GetPrimAtPath(source.path) for source in shot.sources]
+    named = felt_by(shot.stage, prims, wanted)
+    excluded, odd = read_apart(shot.stage, prims)
+    notices += odd
+    cloth = {prim.GetPath() for prim in prims}
+    apart = [{p: said for p, said in off.items() if p in own | cloth} for own, off in zip(named, excluded, strict=True)]
+    felt = [{str(path) for path in own - set(off)} for own, off in zip(named, apart, strict=True)]
+    bodies, anywhere = [], set[str]().union(*felt)
+    for path in paths:
+        if str(path) not in anywhere:
+            continue
+        body, odd = read_collider(shot.stage.GetPrimAtPath(path), shot.metres_per_unit)
+        notices += odd
+        bodies += [body] if body is not None else []
+    order = {body.collider.path: number for number, body in enumerate(bodies)}
+    numbers = [tuple(sorted(order[path] for path in own & order.keys())) for own in felt]
+    shot.add_colliders(bodies, numbers, [{str(path): said for path, said in off.items()} for off in apart])
+
+
+def _read(
+    stage: Usd.Stage,
+    prims: Sequence[Usd.Prim],
+    request: Request,
+    *,
+    bodies: Sequence[Sdf.Path],
+    notices: list[Notice],
+    skip_invisible: bool,
+) -> list[GarmentReader]:
+    """Bake the skinning of garments and bodies and read every garment that is not left out."""
+    roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in prims}
+    # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
+    frames = None if request.frames is None or request.rest_frame is not None else (-math.inf, request.frames[1])
+    notices += request.bake.add([*roots], frames, bodies=bodies)
+    readers, every = [], []
+    for path, held in roots.items():
+        prim = stage.GetPrimAtPath(path)
+        times = all_times(prim, request.bake)
+        every += times
+        if times and not within(times, request.frames):
+            span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}"
+            notices.append(_left_out(prim, f"has no sample in the frame range; {span}"))
+        elif skip_invisible and not is_visible(prim, within(times, request.frames)):
+            notices.append(_left_out(prim, "is invisible"))
+        else:
+            readers.append(read_garment(prim, held, request))
+    if request.frames and every and not within(every, request.frames):
+        said = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
+        raise StageError(f"{said}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
+    if not readers:
+        reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
+        raise StageError(f"no garment is left to refine: {reasons}")
+    return readers
+
+
+def _left_out(prim: Usd.Prim, why: str) -> Notice:
+    return Notice(str(prim.GetPath()), None, f"left out: it {why}")

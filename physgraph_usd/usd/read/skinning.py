@@ -1,0 +1,260 @@
+"""UsdSkel skinning and blend shapes, baked into an anonymous layer of the session.
+
+Nothing is written to disk and the stage's own layers are not touched. After baking, a skinned mesh has point samples
+like any other, in its own local space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from ...errors import GarmentError, StageError
+from ..lookup import with_ancestors
+from ..stage import TRAVERSAL, Notice
+from ..times import SAME_TIME, garment_times, merge, transform_times
+from .find import instance_roots
+
+_SHAPE_COUNT = (4, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Skinned:
+    """A mesh that UsdSkel deforms.
+
+    Attributes:
+        path: Prim path.
+        root: Its skel root.
+        times: Authored time codes of its skeleton's animation and placement, ascending.
+        query: UsdSkel's view of its binding.
+        skeleton: The skeleton's prim path.
+        animation: The animation's prim path, or None.
+    """
+
+    path: Sdf.Path
+    root: Sdf.Path
+    times: tuple[float, ...]
+    query: UsdSkel.SkinningQuery
+    skeleton: Sdf.Path
+    animation: Sdf.Path | None
+
+
+class Bake:
+    """The anonymous layer that holds baked points, on top of the stage.
+
+    Attributes:
+        skinned: What was baked, by prim path.
+        layer: The anonymous layer; keep it alive as long as the stage.
+    """
+
+    def __init__(self, stage: Usd.Stage) -> None:
+        """Put an empty anonymous layer on the stage's session layer."""
+        self._stage = stage
+        self.skinned: dict[Sdf.Path, Skinned] = {}
+        self.layer = Sdf.Layer.CreateAnonymous("physgraph-skinning.usda")
+        # Without its own rate a layer has 24 time codes per second, and USD would rescale the baked samples.
+        self.layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
+        stage.GetSessionLayer().subLayerPaths.insert(0, self.layer.identifier)
+
+    def add(
+        self, garments: Sequence[Sdf.Path], frames: tuple[float, float] | None, *, bodies: Sequence[Sdf.Path] = ()
+    ) -> list[Notice]:
+        """Bake those of the prims that are skinned, bodies also at the garments' times.
+
+        Args:
+            garments: Mesh prims; those inside instances become editable in the anonymous layer.
+            frames: First and last time code, or None for all.
+            bodies: Colliders.
+
+        Returns:
+            What looks skinned and is not.
+
+        Raises:
+            GarmentError: When UsdSkel bakes nothing for a skinned mesh.
+        """
+        paths = [*garments, *bodies]
+        bound = [path for path in paths if skel_root(self._stage.GetPrimAtPath(path))]
+        for path in bound:
+            make_editable(self._stage, self.layer, path)
+        found = {path: skinned for path in bound if (skinned := find_skinning(self._stage, path))}
+        if found:
+            cloth = merge(time for path in garments for time in _times_of(self._stage.GetPrimAtPath(path), found))
+            wanted = {skinned: cloth if path in bodies else () for path, skinned in found.items()}
+            _bake(self._stage, self.layer, wanted, frames=frames)
+        for skinned in found.values():
+            _check(self._stage, self.layer, skinned, frames=frames)
+        self.skinned.update(found)
+        return [notice for path in paths if path not in found for notice in _unskinned(self._stage.GetPrimAtPath(path))]
+
+    def prims(self) -> list[Sdf.Path]:
+        """Paths of the skeletons and animations that move what was baked."""
+        found = [path for skinned in self.skinned.values() for path in (skinned.skeleton, skinned.animation)]
+        return [path for path in dict.fromkeys(found) if path is not None]
+
+    def rest_transform(self, path: Sdf.Path, time: float | None) -> Gf.Matrix4d:
+        """Matrix (row vectors) from a skinned mesh's rest points to world: geomBindTransform, then the skeleton's."""
+        skinned = self.skinned[path]
+        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        skeleton = self._stage.GetPrimAtPath(skinned.skeleton)
+        return skinned.query.GetGeomBindTransform(code) * UsdGeom.XformCache(code).GetLocalToWorldTransform(skeleton)
+
+
+def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
+    """Return the skel root above a prim; None when there is none and UsdSkel leaves the prim alone."""
+    return next((each for each in with_ancestors(prim) if UsdSkel.Root(each)), None)
+
+
+def make_editable(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
+    """Author ``instanceable = false`` in a layer for every instance that holds a prim."""
+    while roots := instance_roots(stage.GetPrimAtPath(path)):
+        Sdf.CreatePrimInLayer(layer, roots[0]).instanceable = False
+
+
+def find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
+    """How UsdSkel deforms a mesh; None when it does not."""
+    prim = stage.GetPrimAtPath(path)
+    root = skel_root(prim)
+    if root is None:
+        return None
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(root), TRAVERSAL)
+    for binding in cache.ComputeSkelBindings(UsdSkel.Root(root), TRAVERSAL):
+        for query in binding.GetSkinningTargets():
+            if query.GetPrim() == prim and (query.HasJointInfluences() or query.HasBlendShapes()):
+                skeleton = cache.GetSkelQuery(binding.GetSkeleton())
+                animation = skeleton.GetAnimQuery()
+                return Skinned(
+                    path,
+                    root.GetPath(),
+                    _skeleton_times(skeleton),
+                    query,
+                    skeleton.GetPrim().GetPath(),
+                    animation.GetPrim().GetPath() if animation else None,
+                )
+    return None
+
+
+def _skeleton_times(skeleton: UsdSkel.SkeletonQuery) -> tuple[float, ...]:
+    times = transform_times(skeleton.GetPrim())
+    animation = skeleton.GetAnimQuery()
+    if animation:
+        times += [*animation.GetJointTransformTimeSamples(), *animation.GetBlendShapeWeightTimeSamples()]
+    return merge(times)
+
+
+def _times_of(prim: Usd.Prim, found: Mapping[Sdf.Path, Skinned]) -> Sequence[float]:
+    """Time codes of a garment that is yet to be baked."""
+    skinned = found.get(prim.GetPath())
+    return garment_times(prim) if skinned is None else [*skinned.times, *transform_times(prim)]
+
+
+def _bake(
+    stage: Usd.Stage,
+    layer: Sdf.Layer,
+    wanted: Mapping[Skinned, Sequence[float]],
+    *,
+    frames: tuple[float, float] | None,
+) -> None:
+    """Bake each skel root once, with all other skinned prims switched off meanwhile; some at further time codes."""
+    rates = {"timeCodesPerSecond": stage.GetTimeCodesPerSecond(), "framesPerSecond": stage.GetFramesPerSecond()}
+    for name, rate in rates.items():
+        if not rate > 0:  # UsdSkel steps by their ratio and would never come to an end
+            raise StageError(f"{name} is {rate:g}, so skinning cannot be baked; author a positive rate")
+    interval = (
+        Gf.Interval.GetFullInterval() if frames is None else Gf.Interval(frames[0] - SAME_TIME, frames[1] + SAME_TIME)
+    )
+    keep = [skinned.path for skinned in wanted]
+    roots = list(dict.fromkeys(skinned.root for skinned in wanted))
+    mask = Sdf.Layer.CreateAnonymous("physgraph-mask.usda")
+    mask.timeCodesPerSecond = rates["timeCodesPerSecond"]
+    for path in _others(stage, roots, keep):
+        Sdf.CreatePrimInLayer(mask, path).active = False
+    session = stage.GetSessionLayer()
+    session.subLayerPaths.insert(0, mask.identifier)
+    try:
+        for skinned, times in wanted.items():
+            _sample_animation(stage, mask, skinned, times, interval=interval)
+        with Usd.EditContext(stage, layer):
+            for root in roots:
+                UsdSkel.BakeSkinning(UsdSkel.Root.Get(stage, root), interval)
+    finally:
+        session.subLayerPaths.remove(mask.identifier)
+
+
+def _sample_animation(
+    stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, times: Sequence[float], *, interval: Gf.Interval
+) -> None:
+    """Give the animation a sample, in a passing layer, at each time code that only a transform or the cloth has.
+
+    UsdSkel bakes where the animation has samples; between them baked points would run along a chord.
+    """
+    animation = stage.GetPrimAtPath(skinned.animation) if skinned.animation else None
+    if animation is None or animation.IsInstanceProxy():
+        return
+    attributes = [animation.GetAttribute(name) for name in ("rotations", "translations", "scales", "blendShapeWeights")]
+    attribute = next((each for each in attributes if each and each.GetNumTimeSamples()), None)
+    if attribute is None:
+        return
+    own = attribute.GetTimeSamples()
+    wanted = merge([*own, *skinned.times, *transform_times(stage.GetPrimAtPath(skinned.path)), *times])
+    if len(wanted) == len(own):
+        return
+    values = {time: attribute.Get(time) for time in wanted if interval.Contains(time) or time in own}
+    with Usd.EditContext(stage, layer):
+        for time, value in values.items():
+            attribute.Set(value, time)
+
+
+def _others(stage: Usd.Stage, roots: Iterable[Sdf.Path], keep: Sequence[Sdf.Path]) -> list[Sdf.Path]:
+    """Skinnable prims below the roots that are not wanted and hold nothing that is."""
+    below = [prim for root in roots for prim in Usd.PrimRange(stage.GetPrimAtPath(root))]
+    skinnable = [prim.GetPath() for prim in below if UsdSkel.IsSkinnablePrim(prim)]
+    return [path for path in skinnable if not any(each.HasPrefix(path) for each in keep)]
+
+
+def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, frames: tuple[float, float] | None) -> None:
+    """See that baking gave points; turn a rigid mesh's baked transform into points.
+
+    Raises:
+        GarmentError: When it gave nothing although the animation has samples in range.
+    """
+    points = layer.GetAttributeAtPath(skinned.path.AppendProperty("points"))
+    if points is not None:
+        return
+    if layer.GetAttributeAtPath(skinned.path.AppendProperty(UsdGeom.Tokens.xformOpOrder)) is not None:
+        _rigid_points(stage, layer, skinned.path)
+        return
+    low, high = frames or (-np.inf, np.inf)
+    if any(low <= time <= high for time in skinned.times) or not skinned.times:
+        remedy = "check skel:skeleton, skel:animationSource and the joint influences"
+        raise GarmentError(str(skinned.path), "is skinned, but UsdSkel baked no points for it", remedy=remedy)
+
+
+def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
+    """Move a baked transform into the points, so that the prim keeps the transform of its own layers."""
+    mesh = UsdGeom.Mesh.Get(stage, path)
+    times = mesh.GetTimeSamples() or [None]
+    codes = [Usd.TimeCode.Default() if time is None else Usd.TimeCode(time) for time in times]
+    baked = [UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()) for code in codes]
+    spec = layer.GetPrimAtPath(path)
+    for each in [each for each in spec.properties if each.name.startswith("xformOp")]:
+        spec.RemoveProperty(each)
+    with Usd.EditContext(stage, layer):
+        for code, matrix in zip(codes, baked, strict=True):
+            own = UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim())
+            change = np.array(matrix * own.GetInverse()).reshape(_SHAPE_COUNT)
+            local = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.Default()), dtype=np.float64)
+            moved = local @ change[:3, :3] + change[3, :3]
+            mesh.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(moved, dtype=np.float32)), code)
+
+
+def _unskinned(prim: Usd.Prim) -> list[Notice]:
+    """Say when a mesh has joint influences that UsdSkel does not use."""
+    binding = UsdSkel.BindingAPI(prim)
+    if not binding.GetJointIndicesAttr().HasAuthoredValue():
+        return []
+    reason = "it has no SkelRoot above it" if skel_root(prim) is None else "it is bound to no skeleton"
+    return [Notice(str(prim.GetPath()), None, f"has joint influences but is not skinned: {reason}")]

@@ -1,0 +1,168 @@
+"""Meshes of a stage that are neither garments nor colliders, and where they are in a few frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
+
+from ...errors import GarmentError
+from ...solver.colliders.pose import Collider, MeshPose, Pose
+from ..lookup import with_ancestors
+from ..schema import COLLIDER_API, GARMENT_API
+from ..stage import TRAVERSAL, pxr_errors, quiet
+from .bodies import ColliderReader
+from .find import has_schema, traverse
+from .garment import is_visible
+from .placement import timecode, to_metres
+from .reader import Shot
+
+_MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")
+"""Schemas by which a prim, or one above it, says itself whether cloth touches it."""
+Box = np.ndarray
+"""Least and greatest corner [m], world space, shape (2, 3)."""
+
+
+def meshes_beside(
+    shot: Shot, times: Sequence[float | None], boxes: Sequence[Box], *, least: float
+) -> Iterator[tuple[str, Iterator[tuple[int, Pose]]]]:
+    """Meshes that nothing marks as garment or collider and whose bounds meet a garment's in one of some frames.
+
+    Invisible ones, and copies of colliders or of one another, are left out.
+
+    Args:
+        shot: An open shot.
+        times: Time codes of the frames.
+        boxes: Where garments and what is near them may be in each.
+        least: Longest side of the smallest mesh that counts [m].
+
+    Yields:
+        The path of each, in stage order, and the frames in which they meet, by number, with its pose there: to be taken
+        before the next path.
+
+    Raises:
+        StageError: USD cannot read the files any more.
+    """
+    known = {*shot.colliders, *(garment.path for garment in shot.scene.garments)}
+    known |= {path for source in shot.sources for path in source.apart_from}
+    with pxr_errors(f"cannot read {shot.path}"), quiet():
+        prims = [prim for prim in traverse(shot.stage) if UsdGeom.Mesh(prim) and str(prim.GetPath()) not in known]
+        prims = [prim for prim in prims if _is_plain(prim, times)]
+        skinned = _Skinning(shot, [prim.GetPath() for prim in prims if _is_skinned(prim)])
+        seen = [pose for time in times[:1] for pose in shot.frame(time).colliders] if prims else []
+        for prim in prims:
+            if not _is_skinned(prim) and not _may_meet(prim, shot.metres_per_unit, times, boxes, least=least):
+                continue
+            reader = ColliderReader(prim, Collider(str(prim.GetPath()), "mesh"), shot.metres_per_unit)
+            first = skinned.pose(reader, times[0])
+            if not any(_same_place(first, other) for other in seen):
+                seen.append(first)
+                poses = (first if index == 0 else skinned.pose(reader, time) for index, time in enumerate(times))
+                yield reader.collider.path, _meeting(poses, boxes, least=least)
+
+
+def _is_plain(prim: Usd.Prim, times: Sequence[float | None]) -> bool:
+    """Whether a mesh is seen, and nothing says whether cloth touches it."""
+    if any(has_schema(each, mark) for each in with_ancestors(prim) for mark in _MARKS):
+        return False
+    guide = UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
+    return not guide and is_visible(prim, [time for time in times if time is not None])
+
+
+def _is_skinned(prim: Usd.Prim) -> bool:
+    return bool(UsdSkel.BindingAPI(prim).GetJointIndicesAttr().HasAuthoredValue())
+
+
+def _may_meet(
+    prim: Usd.Prim, metres: float, times: Sequence[float | None], boxes: Sequence[Box], *, least: float
+) -> bool:
+    """Whether the bounds that USD gives a mesh meet the boxes; True where its points move and its extent does not."""
+    extent, points = UsdGeom.Mesh(prim).GetExtentAttr(), UsdGeom.Mesh(prim).GetPointsAttr()
+    if extent.HasAuthoredValue() and points.ValueMightBeTimeVarying() and not extent.ValueMightBeTimeVarying():
+        return True
+    every = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy]
+    for time, box in zip(times, boxes, strict=True):
+        bound = UsdGeom.BBoxCache(timecode(time), every).ComputeWorldBound(prim).ComputeAlignedRange()
+        own = metres * np.array([bound.GetMin(), bound.GetMax()], dtype=np.float64)
+        if not bound.IsEmpty() and _overlap(own, box) and np.ptp(own, axis=0).max() >= least:
+            return True
+    return False
+
+
+def _meeting(poses: Iterable[Pose | None], boxes: Sequence[Box], *, least: float) -> Iterator[tuple[int, Pose]]:
+    """Numbers and poses of the frames in which posed points meet the boxes, and are large enough."""
+    for index, (pose, box) in enumerate(zip(poses, boxes, strict=True)):
+        points = np.zeros((0, 3)) if pose is None else pose.corners()
+        points = points[np.isfinite(points).all(axis=1)]
+        if pose is None or not len(points):
+            continue
+        own = np.stack([points.min(axis=0), points.max(axis=0)])
+        if _overlap(own, box) and np.ptp(own, axis=0).max() >= least:
+            yield index, pose
+
+
+def _overlap(a: Box, b: Box) -> bool:
+    return bool((a[0] <= b[1]).all() and (b[0] <= a[1]).all())
+
+
+def _same_place(a: Pose | None, b: Pose | None) -> bool:
+    """Whether two poses have the same points, to float32's rounding of them."""
+    if not isinstance(a, MeshPose) or not isinstance(b, MeshPose) or a.points.shape != b.points.shape:
+        return False
+    return bool(np.allclose(a.points, b.points, rtol=1e-5, atol=1e-6, equal_nan=True))
+
+
+class _Skinning:
+    """Joint skinning of meshes at single time codes, without blend shapes: near enough to see what touches cloth."""
+
+    def __init__(self, shot: Shot, paths: Sequence[Sdf.Path]) -> None:
+        """Find what moves some meshes, on a stage that shows what the shot's did before garments were baked."""
+        self._metres, self._stage = shot.metres_per_unit, None
+        self._bound: Mapping[Sdf.Path, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]] = {}
+        if paths:
+            self._stage = shot.view.open(mask=Usd.StagePopulationMask(paths))
+            self._stage.ExpandPopulationMask()
+            self._cache = UsdSkel.Cache()
+            self._bound = dict(self._bindings({*paths}))
+
+    def _bindings(
+        self, paths: set[Sdf.Path]
+    ) -> Iterator[tuple[Sdf.Path, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]]:
+        assert self._stage is not None
+        for root in filter(None, map(UsdSkel.Root, traverse(self._stage))):
+            self._cache.Populate(root, TRAVERSAL)
+            for binding in self._cache.ComputeSkelBindings(root, TRAVERSAL):
+                skeleton = self._cache.GetSkelQuery(binding.GetSkeleton())
+                for query in binding.GetSkinningTargets():
+                    path = query.GetPrim().GetPath()
+                    if path in paths and query.HasJointInfluences() and not query.IsRigidlyDeformed():
+                        yield path, (skeleton, query)
+
+    def pose(self, reader: ColliderReader, time: float | None) -> Pose | None:
+        """A mesh at a time code, skinned where joints bend it."""
+        pose, _ = reader.pose(time)
+        points = self._points(reader.prim.GetPath(), time)
+        if not isinstance(pose, MeshPose) or points is None or points.shape != pose.points.shape:
+            return pose
+        return replace(pose, points=points)
+
+    def _points(self, path: Sdf.Path, time: float | None) -> np.ndarray | None:
+        """World positions of a skinned mesh [m], shape (V, 3), float64; None for one that no joints bend."""
+        if path not in self._bound or self._stage is None:
+            return None
+        skeleton, query = self._bound[path]
+        code = timecode(time)
+        points = UsdGeom.Mesh(query.GetPrim()).GetPointsAttr().Get(code)
+        if points is None:
+            return None
+        joints: Any = skeleton.ComputeSkinningTransforms(code)
+        if joints is None or not query.ComputeSkinnedPoints(joints, points, code):
+            return None
+        try:
+            matrix = to_metres(skeleton.GetPrim(), self._metres, time)
+        except GarmentError:
+            return None
+        return np.asarray(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,0 +1,1 @@
+"""Writing: layers, primvars, chunks and samples; a file is complete or not there."""

@@ -1,0 +1,189 @@
+"""A file that is either complete under its final name or not there at all.
+
+A file is written next to its target under a temporary name that carries the host and the process id, flushed to the
+disk, and moved over the target in one step. A killed process can leave only the temporary file; the next run on the
+same host removes it. Those of other hosts, whose processes cannot be asked, are never removed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from ...errors import LayerError, UsageError
+
+NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+"""Flag of `os.open` that follows no link; Windows has none."""
+ASSET_PATHS = ("relative", "absolute")
+"""How one file may name another: from its own folder, or from the root of the file system."""
+HOST = re.sub(r"[^\w-]", "_", socket.gethostname()) or "host"
+"""This machine in the names of temporary files."""
+
+
+def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
+    """Name a temporary file beside its target.
+
+    Args:
+        target: Final path.
+        suffix: Format of the temporary file.
+
+    Returns:
+        ``<target>.<host>.<pid>.tmp<suffix>``.
+    """
+    return target.with_name(f"{target.name}.{HOST}.{os.getpid()}.tmp{suffix}")
+
+
+def prepare_target(target: Path, *, overwrite: bool) -> None:
+    """Check that a target may be written and remove what dead processes left beside it.
+
+    Args:
+        target: Final path.
+        overwrite: Whether an existing file may be replaced.
+
+    Raises:
+        UsageError: The target exists and may not be replaced, or is a folder or a link.
+        LayerError: The folder cannot be made.
+    """
+    check_no_link(target)
+    if target.is_dir():
+        raise UsageError(f"{target} is a folder; name a layer such as {target / 'refined.usdc'}")
+    if target.exists() and not overwrite:
+        raise UsageError(f"{target} exists; choose another name or replace it by --overwrite")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LayerError(f"cannot make the folder {target.parent}: {error.strerror}") from error
+    remove_stale(target)
+
+
+def remove_stale(target: Path) -> list[Path]:
+    """Remove this host's temporary files of this target whose process is gone, and this process's own.
+
+    Args:
+        target: Final path.
+
+    Returns:
+        The files removed.
+    """
+    pattern = re.compile(re.escape(f"{target.name}.{HOST}.") + r"(\d+)\.tmp(\.\w+)?")
+    removed = []
+    for path in sorted(target.parent.iterdir()):
+        match = pattern.fullmatch(path.name)
+        if match and not _is_other_process(int(match[1])):
+            # Where the file is still open, Windows refuses and the file stays.
+            with suppress(OSError):
+                path.unlink()
+                removed.append(path)
+    return removed
+
+
+def _is_other_process(pid: int) -> bool:
+    """Whether another live process has this id; on Windows no process is asked, since os.kill would end it."""
+    if pid == os.getpid() or os.name == "nt":
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def check_no_link(target: Path) -> None:
+    """Refuse a link, for what it leads to is nothing that was named; one to a device, such as a terminal, is none.
+
+    Raises:
+        UsageError: The target is a link to a file or a folder, or to nothing.
+    """
+    if target.is_symlink() and (target.is_file() or target.is_dir() or not target.exists()):
+        raise UsageError(f"{target} is a link to {os.readlink(target)}; name that, or remove the link")
+
+
+def make_file(path: Path) -> BinaryIO:
+    """Open a file for writing, emptied where it is there.
+
+    Args:
+        path: The file; a link is not followed.
+
+    Raises:
+        OSError: It is a link, or cannot be written.
+    """
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | NO_LINK, 0o666), "wb")
+
+
+def write_text(target: Path, text: str) -> None:
+    """Write a text, whole or not at all; its folder is made where it is not there.
+
+    Args:
+        target: Final path.
+        text: What to write, as UTF-8.
+
+    Raises:
+        LayerError: The file cannot be written.
+    """
+    temporary = temporary_path(target, suffix="")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with make_file(temporary) as stream:
+            stream.write(text.encode())
+        publish(temporary, target)
+    except OSError as error:
+        raise LayerError(f"cannot write {target}: {error.strerror}") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def check_place(target: Path) -> None:
+    """Refuse a place where no file can be made; leaves nothing there.
+
+    Args:
+        target: A file to write later; its folder may be missing.
+
+    Raises:
+        UsageError: The target is a folder or a link, or a file stands where a folder is needed.
+        LayerError: The folder cannot be written.
+    """
+    check_no_link(target)
+    folder = next(each for each in target.absolute().parents if each.exists())
+    if target.is_dir() or not folder.is_dir():
+        raise UsageError(f"cannot write {target}: it is a folder, or {folder} is none")
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise LayerError(f"cannot write {target}: {error.strerror} in {folder}") from error
+
+
+def publish(temporary: Path, target: Path) -> None:
+    """Flush a finished temporary file to the disk and move it over the target.
+
+    Args:
+        temporary: Complete file in the target's folder.
+        target: Final path.
+
+    Raises:
+        LayerError: The disk is full or the target is held open by another program.
+    """
+    try:
+        _flush(temporary)
+        temporary.replace(target)
+        if os.name != "nt":
+            _flush(target.parent)
+    except OSError as error:
+        raise LayerError(f"cannot write {target}: {error.strerror}; nothing was left under that name") from error
+
+
+def _flush(path: Path) -> None:
+    """Ask the system to bring a file or folder to the disk."""
+    flags = os.O_RDONLY if os.name != "nt" else os.O_RDWR
+    handle = os.open(path, flags)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

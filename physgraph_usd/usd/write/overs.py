@@ -1,0 +1,206 @@
+"""What a garment's fine topology replaces on its prim: authored once, as defaults, all in one layer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
+
+from ...errors import LayerError
+from ..schema import GARMENT_API
+from ..stage import GarmentSource, Notice
+from .carry import FineMap
+from .stream import LayerStream
+
+_TYPES = Sdf.ValueTypeNames
+EMPTIED = {
+    "holeIndices": _TYPES.IntArray,
+    "creaseIndices": _TYPES.IntArray,
+    "creaseLengths": _TYPES.IntArray,
+    "creaseSharpnesses": _TYPES.FloatArray,
+    "cornerIndices": _TYPES.IntArray,
+    "cornerSharpnesses": _TYPES.FloatArray,
+}
+"""Written as empty arrays where authored: a block would read as None at the default time."""
+_REWRITTEN = {"points", "normals", "velocities", "accelerations", "extent", "faceVertexCounts", "faceVertexIndices"}
+REST_POINTS = "physics:restShapePoints"
+
+
+def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> None:
+    """Author counts, indices, ``subdivisionScheme`` none, and hide what belonged to the coarse topology.
+
+    Args:
+        stream: The layer.
+        target: Prim to author on.
+        prim: Coarse mesh as composed.
+        fine: Map to the fine mesh.
+    """
+    for name, values in (("faceVertexCounts", fine.fine.counts), ("faceVertexIndices", fine.fine.indices)):
+        path = target.AppendProperty(name)
+        stream.attribute(path, _TYPES.IntArray)
+        stream.set(path, Vt.IntArray.FromNumpy(np.ascontiguousarray(values, np.int32)))
+    path = target.AppendProperty("subdivisionScheme")
+    stream.attribute(path, _TYPES.Token, uniform=True)
+    stream.set(path, "none")
+    for name, type_name in EMPTIED.items():
+        if prim.GetAttribute(name).HasAuthoredValue():
+            stream.attribute(target.AppendProperty(name), type_name)
+            stream.set(target.AppendProperty(name), type(type_name.defaultValue)())
+    for name in ("velocities", "accelerations"):
+        if prim.GetAttribute(name).HasAuthoredValue():
+            stream.block(target.AppendProperty(name), _TYPES.Vector3fArray)
+
+
+def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
+    """Tell what becomes of the velocities and accelerations of a coarse mesh.
+
+    Args:
+        prim: Coarse mesh as composed.
+        written: Whether velocities are written for the fine mesh.
+    """
+    blocked = "are blocked: they belong to the coarse points"
+    said = {"velocities": "are written anew, from the refined points" if written else blocked, "accelerations": blocked}
+    path = str(prim.GetPath())
+    return [
+        Notice(path, None, f"its {name} {s}") for name, s in said.items() if prim.GetAttribute(name).HasAuthoredValue()
+    ]
+
+
+def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> list[Notice]:
+    """Refine the rest shape of the deformable-body schema; name other arrays that may no longer fit.
+
+    Args:
+        stream: The layer.
+        target: Prim to author on.
+        prim: Coarse mesh as composed.
+        fine: Map to the fine mesh.
+
+    Returns:
+        Arrays as long as the coarse mesh's elements that stay as authored.
+    """
+    notices = []
+    sizes = {fine.count(kind): kind for kind in ("faceVarying", "uniform", "vertex")}
+    for attribute in prim.GetAuthoredAttributes():
+        name = attribute.GetName()
+        if not attribute.GetTypeName().isArray or name in EMPTIED or name in _REWRITTEN or _is_elsewhere(name):
+            continue
+        value = attribute.Get()
+        if value is None or len(value) not in sizes:
+            continue
+        if name == REST_POINTS and len(value) == fine.count("vertex"):
+            path = target.AppendProperty(name)
+            stream.attribute(path, attribute.GetTypeName())
+            stream.set(path, Vt.Vec3fArray.FromNumpy(fine.interpolate(np.asarray(value, np.float32))))
+        elif len(value) > 1:
+            said = f"{name} has one entry per {sizes[len(value)]} element of the coarse mesh and stays as authored"
+            notices.append(Notice(str(prim.GetPath()), None, said))
+    return notices
+
+
+def _is_elsewhere(name: str) -> bool:
+    """Whether another function takes care of an attribute."""
+    return name.startswith(("primvars:", "skel:", "xformOp", "physgraph:"))
+
+
+def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, skinned: bool) -> None:
+    """Take a mesh out of skinning: its points are the skinned ones already.
+
+    Args:
+        stream: The layer.
+        target: Prim to author on.
+        prim: Coarse mesh as composed.
+        skinned: Whether the points came from skinning, perhaps by influences inherited from an ancestor.
+    """
+    for name in ("skel:joints", "skel:blendShapes"):
+        if prim.GetAttribute(name).HasAuthoredValue():
+            stream.block(target.AppendProperty(name), _TYPES.TokenArray)
+    if skinned and not prim.GetAttribute("primvars:skel:jointIndices").HasAuthoredValue():
+        # Influences of an ancestor reach the mesh whether or not it has the schema; no skeleton stops them.
+        edit_schemas(stream, target, added=["SkelBindingAPI"])
+        spec = stream.prim(target)
+        skeleton = spec.relationships.get("skel:skeleton") or Sdf.RelationshipSpec(spec, "skel:skeleton", False)
+        skeleton.targetPathList.ClearEditsAndMakeExplicit()
+    elif UsdSkel.BindingAPI(prim):
+        delete_schema(stream, target, "SkelBindingAPI")
+
+
+def delete_schema(stream: LayerStream, target: Sdf.Path, name: str) -> None:
+    """Remove an applied API schema, whatever weaker layer applies it."""
+    edit_schemas(stream, target, deleted=[name])
+
+
+def edit_schemas(
+    stream: LayerStream, target: Sdf.Path, *, added: Sequence[str] = (), deleted: Sequence[str] = ()
+) -> None:
+    """Add to and delete from a prim's applied API schemas, keeping earlier edits in this layer."""
+    spec = stream.prim(target)
+    edits = spec.GetInfo("apiSchemas") if spec.HasInfo("apiSchemas") else Sdf.TokenListOp()
+    edits.prependedItems = [*edits.prependedItems, *(name for name in added if name not in edits.prependedItems)]
+    edits.deletedItems = [*edits.deletedItems, *(name for name in deleted if name not in edits.deletedItems)]
+    spec.SetInfo("apiSchemas", edits)
+
+
+def open_instances(stream: LayerStream, source: GarmentSource) -> list[Notice]:
+    """Make the instances that hold a garment editable.
+
+    Args:
+        stream: The layer.
+        source: Where the garment is.
+
+    Returns:
+        One notice per instance.
+    """
+    notices = []
+    for root in source.instance_roots:
+        stream.prim(root).SetInfo("instanceable", False)
+        notices.append(Notice(str(root), None, f"no longer instanceable, so that <{source.path}> can be refined"))
+    return notices
+
+
+def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
+    """Define the refined sibling of a mesh and make the mesh its proxy.
+
+    The sibling references the mesh, so everything not refined (bindings, transforms, visibility) follows it.
+
+    Args:
+        stream: The layer.
+        prim: Coarse mesh as composed.
+
+    Returns:
+        Path of the sibling, ``<name>_refined``.
+
+    Raises:
+        LayerError: There is such a prim already.
+    """
+    coarse = prim.GetPath()
+    path = coarse.ReplaceName(f"{coarse.name}_refined")
+    if prim.GetStage().GetPrimAtPath(path):
+        raise LayerError(f"<{path}> is already on the stage; refine the shot without it, or use mode 'over'")
+    spec = stream.prim(path)
+    spec.specifier, spec.typeName = Sdf.SpecifierDef, "Mesh"
+    spec.referenceList.Prepend(Sdf.Reference(primPath=coarse))
+    for where, purpose in ((coarse, "proxy"), (path, "render")):
+        stream.attribute(where.AppendProperty("purpose"), _TYPES.Token, uniform=True)
+        stream.set(where.AppendProperty("purpose"), purpose)
+    relationship = Sdf.RelationshipSpec(spec, "proxyPrim", False)
+    relationship.targetPathList.explicitItems = [coarse]
+    delete_schema(stream, path, GARMENT_API)
+    for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
+        if UsdGeom.Xformable(child) or UsdSkel.BlendShape(child):
+            # Only subsets and looks belong to both; a nested mesh would be drawn twice.
+            stream.prim(path.AppendChild(child.GetName())).SetInfo("active", False)
+    _copy_collection_binding(stream, path, prim)
+    return path
+
+
+def _copy_collection_binding(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
+    """Bind directly a material that reaches the mesh through a collection, which does not hold the sibling."""
+    for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full):
+        material, relationship = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
+        if not material or "material:binding:collection" not in relationship.GetName():
+            continue
+        name = "material:binding" if not purpose else f"material:binding:{purpose}"
+        edit_schemas(stream, target, added=["MaterialBindingAPI"])
+        binding = Sdf.RelationshipSpec(stream.prim(target), name, False)
+        binding.targetPathList.explicitItems = [material.GetPath()]

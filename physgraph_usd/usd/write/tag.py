@@ -1,0 +1,144 @@
+"""Marks garments and colliders of a shot, in a new layer over it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pxr import Sdf, Usd, UsdGeom
+
+from ...errors import SchemaError, StageError, UsageError
+from ...solver.fabric import PRESETS, Fabric
+from ..files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
+from ..lookup import check_limits
+from ..provenance import asset_path, export_layer
+from ..read.find import find_colliders, find_garments
+from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, Property
+from ..sides import SIDES
+from ..stage import open_stage
+from ..view import root_over
+from .atomic import ASSET_PATHS, prepare_target
+
+
+def tag(
+    shot: str | Path,
+    out: str | Path,
+    *,
+    garments: Sequence[str] = (),
+    colliders: Sequence[str] = (),
+    preset: str | None = None,
+    layer: int | None = None,
+    side: str | None = None,
+    values: Mapping[str, Mapping[str, float]] | None = None,
+    asset_paths: str = "relative",
+    overwrite: bool = False,
+) -> Path:
+    """Apply the schemas to prims of a shot, in a new layer that shows the shot and can be refined.
+
+    Args:
+        shot: The shot file; never edited.
+        out: Layer to write; it sublayers the shot.
+        garments: Prim paths, names, globs or collections of meshes.
+        colliders: The same, of anything with a surface.
+        preset: Name of a fabric whose values are authored on the garments, or None.
+        layer: Place of the garments in the order of garments, lower is nearer to the body, or None.
+        side: Where cloth belongs at the colliders, one of `SIDES`, or None.
+        values: Of each garment, by its prim path: values to author, by the schema's short names, after the preset's.
+        asset_paths: "relative" or "absolute": how the layer names the shot.
+        overwrite: Whether an existing file may be replaced.
+
+    Returns:
+        The layer's path.
+
+    Raises:
+        UsageError: Nothing was named, the preset or the side is unknown or for nothing that was named, or the file
+            exists.
+        StageError: A named prim is not there, lies in an instance, or is no surface.
+        LayerError: The layer cannot be written.
+    """
+    if not garments and not colliders:
+        raise UsageError("nothing to tag; name a garment or a collider")
+    _check_word("preset", preset, sorted(PRESETS))
+    _check_word("side", side, SIDES)
+    _check_word("asset path", asset_paths, ASSET_PATHS)
+    if (layer is not None and not garments) or (side is not None and not colliders):
+        raise UsageError("a layer is for garments and a side for colliders; name one")
+    _check_values(values or {}, layer)
+    target = Path(out)
+    check_suffix("the layer", target, LAYER_SUFFIXES)
+    check_targets([("the layer", target)], files_of(shot))
+    prepare_target(target, overwrite=overwrite)
+    stage, _ = open_stage(str(shot))
+    cloth = find_garments(stage, garments) if garments else []
+    solid = find_colliders(stage, cloth, colliders) if colliders else []
+    root = root_over(stage.GetRootLayer(), [asset_path(shot, target.parent, absolute=asset_paths == "absolute")])
+    for prim in (*cloth, *solid):
+        _check_editable(prim)
+    for prim in cloth:
+        spec = _applied(root, prim, GARMENT_API)
+        own = {} if preset is None else fabric_values(PRESETS[preset])
+        own |= {} if layer is None else {"contact:layer": layer}
+        for name, value in (own | dict((values or {}).get(str(prim.GetPath()), {}))).items():
+            _author(spec, GARMENT[name], round(value) if GARMENT[name].type == "int" else value)
+            if prim.GetAttribute(GARMENT[name].name).HasAuthoredConnections():  # They would go before the value.
+                spec.attributes[GARMENT[name].name].connectionPathList.ClearEditsAndMakeExplicit()
+    for prim in solid:
+        spec = _applied(root, prim, COLLIDER_API)
+        if side is not None:
+            _author(spec, COLLIDER["collider:side"], side)
+    return export_layer(root, target)
+
+
+def _check_word(what: str, word: str | None, known: Sequence[str]) -> None:
+    """Refuse a word that is none of those known."""
+    if word is not None and word not in known:
+        raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(known)}")
+
+
+def _check_values(values: Mapping[str, Mapping[str, float]], layer: int | None) -> None:
+    """Refuse a value that refining would refuse."""
+    given = [(path, name, value) for path, own in values.items() for name, value in own.items()]
+    try:
+        for path, name, value in given + ([] if layer is None else [("/", "contact:layer", layer)]):
+            check_limits(GARMENT[name], value, f"<{path}>")
+    except SchemaError as error:
+        raise UsageError(str(error)) from error
+
+
+def _check_editable(prim: Usd.Prim) -> None:
+    """Refuse prims where an opinion would be ignored or mean nothing."""
+    if prim.IsInstanceProxy():
+        raise StageError(
+            f"<{prim.GetPath()}> lies in an instance, where a layer over the shot cannot reach; tag the prim in the "
+            "asset, or name it when refining"
+        )
+    if not UsdGeom.Gprim(prim):
+        raise StageError(f"<{prim.GetPath()}> is a {prim.GetTypeName() or 'prim without a type'}; it has no surface")
+
+
+def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
+    """The layer's over of a prim, with an API schema prepended."""
+    spec = Sdf.CreatePrimInLayer(layer, prim.GetPath())
+    schemas = Sdf.TokenListOp()
+    schemas.prependedItems = [schema]
+    spec.SetInfo("apiSchemas", schemas)
+    return spec
+
+
+def fabric_values(fabric: Fabric) -> dict[str, float]:
+    """What a fabric gives, by the schema's short names."""
+    values = {
+        "stretchStiffness": fabric.stretch,
+        "shearStiffness": fabric.shear,
+        "bendStiffness": fabric.bend,
+        "density": fabric.density,
+        "thickness": fabric.thickness,
+    }
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _author(spec: Sdf.PrimSpec, row: Property, value: float | str) -> None:
+    """Author one attribute's default."""
+    variability = Sdf.VariabilityUniform if row.uniform else Sdf.VariabilityVarying
+    kind = Sdf.ValueTypeNames.Find(row.type)  # pyright: ignore[reportCallIssue]  the stubs know no argument
+    Sdf.AttributeSpec(spec, row.name, kind, variability).default = value

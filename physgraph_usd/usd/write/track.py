@@ -1,0 +1,210 @@
+"""The animated part of one garment: points, normals, extent and velocities, one time code after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Sdf, UsdGeom, Vt
+
+from ...errors import LayerError
+from .normals import VertexNormals
+from .stream import LayerStream
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Local points at one time code, shape (V, 3), float32."""
+
+    time: float
+    points: np.ndarray
+
+
+class PointTrack:
+    """Writes one garment's samples as they come, holding at most three in memory.
+
+    A run of equal samples is written by its first and last only; USD gives the same value between them. With
+    velocities every sample is written, since a velocity belongs to its own time.
+    """
+
+    def __init__(
+        self,
+        stream: LayerStream,
+        target: Sdf.Path,
+        normals: VertexNormals,
+        *,
+        rest: np.ndarray | None,
+        still: bool,
+        rate: float | None,
+    ) -> None:
+        """Author the attributes, still without values.
+
+        Args:
+            stream: The layer.
+            target: Prim to author on.
+            normals: Computes normals from local points.
+            rest: Local points for the default time, shape (V, 3); None takes the first that come.
+            still: Whether the garment's input has no samples: only a default is written until something moves.
+            rate: Time codes per second for velocities; None leaves them out.
+        """
+        self._stream, self._normals, self._count = stream, normals, normals.vertex_count
+        types = Sdf.ValueTypeNames
+        self._paths = {name: target.AppendProperty(name) for name in ("points", "normals", "extent", "velocities")}
+        stream.attribute(self._paths["points"], types.Point3fArray)
+        stream.attribute(self._paths["normals"], types.Normal3fArray, interpolation=UsdGeom.Tokens.vertex)
+        stream.attribute(self._paths["extent"], types.Float3Array)
+        self._rest, self._still, self._rate = rest, still, rate
+        self._has_default = False
+        self._last: _Sample | None = None
+        self._matrix: np.ndarray | None = None
+        self._held: float | None = None
+        self._queue: list[_Sample] = []
+        self.box = np.zeros((2, 3), np.float32)
+
+    def check(self, points: np.ndarray, time: float | None) -> None:
+        """Refuse points that are not the fine mesh's.
+
+        Raises:
+            LayerError: The shape is wrong.
+        """
+        if points.shape != (self._count, 3):
+            place = f"<{self._paths['points'].GetPrimPath()}>" + ("" if time is None else f" at time code {time:g}")
+            raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {self._count} vertices")
+
+    def write(self, time: float | None, world: np.ndarray, to_metres: np.ndarray, *, changed: bool = True) -> None:
+        """Take one time code.
+
+        Args:
+            time: Time code, or None for the default of a shot without samples.
+            world: Fine points [m], world space, shape (V, 3).
+            to_metres: Local space to world metres, shape (4, 4), for column vectors.
+            changed: False when the world points are known to equal the last ones.
+
+        Raises:
+            LayerError: The points are not finite, or the matrix cannot be inverted.
+        """
+        same_matrix = self._matrix is not None and np.array_equal(self._matrix, to_metres)
+        if not changed and same_matrix and self._last is not None and time is not None:
+            self._repeat(_Sample(time, self._last.points))
+            return
+        self._matrix = to_metres
+        points = to_local(world, to_metres, str(self._paths["points"].GetPrimPath()), time)
+        if not self._has_default:
+            self._author(None, points if self._rest is None else self._rest)
+            self._has_default, self._rest = True, None
+        if time is None:
+            self.box = extent_of(points)
+            return
+        sample = _Sample(time, points)
+        if self._last is None:
+            self._begin(sample)
+        elif np.array_equal(points, self._last.points):
+            self._repeat(sample)
+        else:
+            self._move(sample)
+
+    def _begin(self, sample: _Sample) -> None:
+        """Take the first sample."""
+        self._last = sample
+        self.box = extent_of(sample.points)
+        if not self._still:
+            self._emit(sample)
+
+    def _repeat(self, sample: _Sample) -> None:
+        """Take a sample that equals the last one."""
+        if self._rate is not None and not self._still:
+            self._emit(sample)
+        else:
+            self._held = sample.time
+
+    def _move(self, sample: _Sample) -> None:
+        """Take a sample that differs from the last one, and close the run before it."""
+        last = self._last
+        assert last is not None
+        if self._still:
+            self._still = False
+            self._emit(last)
+        if self._held is not None:
+            self._emit(_Sample(self._held, last.points))
+            self._held = None
+        self._last = sample
+        self._emit(sample)
+
+    def _emit(self, sample: _Sample) -> None:
+        """Author one sample, and the velocity of the one before it."""
+        self._author(sample.time, sample.points)
+        if self._rate is None:
+            return
+        self._queue.append(sample)
+        if len(self._queue) == 2:
+            self._author_velocity(self._queue[0], self._queue[0], self._queue[1])
+        elif len(self._queue) == 3:
+            self._author_velocity(self._queue[1], self._queue[0], self._queue[2])
+            self._queue.pop(0)
+
+    def finish(self, *, hold: bool = False) -> None:
+        """Author what waited for a next sample.
+
+        Args:
+            hold: Whether the end of a run of equal samples is written too, because further samples are to follow it.
+        """
+        if hold and self._held is not None and self._last is not None and not self._still:
+            self._emit(_Sample(self._held, self._last.points))
+            self._held = None
+        if len(self._queue) == 1:
+            self._author_velocity(self._queue[0], self._queue[0], self._queue[0])
+        elif self._queue:
+            self._author_velocity(self._queue[-1], self._queue[-2], self._queue[-1])
+        self._queue.clear()
+
+    def _author(self, time: float | None, points: np.ndarray) -> None:
+        """Author points, normals and extent at one time."""
+        self.box = extent_of(points)
+        values = {"points": points, "normals": self._normals(points), "extent": self.box}
+        for name, value in values.items():
+            self._stream.set(self._paths[name], Vt.Vec3fArray.FromNumpy(value), time=time)
+
+    def _author_velocity(self, at: _Sample, before: _Sample, after: _Sample) -> None:
+        """Author the velocity at one time by finite differences [units/s]."""
+        path = self._paths["velocities"]
+        self._stream.attribute(path, Sdf.ValueTypeNames.Vector3fArray)
+        seconds = (after.time - before.time) / (self._rate or 24.0)
+        moved = after.points.astype(np.float64) - before.points
+        velocity = moved / seconds if seconds else np.zeros_like(moved)
+        self._stream.set(path, Vt.Vec3fArray.FromNumpy(velocity.astype(np.float32)), time=at.time)
+
+
+def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:
+    """Bring world metres to local units, shape (V, 3): float64 inside, float32 out.
+
+    Args:
+        world: Positions [m], shape (V, 3).
+        to_metres: Local space to world metres, shape (4, 4), for column vectors.
+        path: The prim, for the message.
+        time: The time code, for the message.
+
+    Raises:
+        LayerError: A position is not finite, or the matrix cannot be inverted.
+    """
+    when = "" if time is None else f" at time code {time:g}"
+    try:
+        inverse = np.linalg.inv(to_metres[:3, :3])
+    except np.linalg.LinAlgError as error:
+        raise LayerError(f"<{path}>{when}: its transform has no inverse (a scale of zero?)") from error
+    # Column by column: several times faster than one product with a small matrix.
+    x, y, z = (np.asarray(world[:, axis], np.float64) - to_metres[axis, 3] for axis in range(3))
+    with np.errstate(invalid="ignore", over="ignore"):
+        local = np.stack([(a * x + b * y + c * z).astype(np.float32) for a, b, c in inverse])
+    # NaN and infinity both show in the least or the greatest value.
+    if local.size and not (np.isfinite(local.min(axis=1)).all() and np.isfinite(local.max(axis=1)).all()):
+        vertex = int(np.flatnonzero(~np.isfinite(local).all(axis=0))[0])
+        raise LayerError(f"<{path}>{when}: point {vertex} is {world[vertex].tolist()}, not a finite position")
+    return np.ascontiguousarray(local.T)
+
+
+def extent_of(points: np.ndarray) -> np.ndarray:
+    """Least and greatest corner, shape (2, 3), float32."""
+    if not len(points):
+        return np.zeros((2, 3), np.float32)
+    columns = np.ascontiguousarray(points.T)
+    return np.stack([columns.min(axis=1), columns.max(axis=1)])

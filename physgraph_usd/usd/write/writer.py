@@ -1,0 +1,343 @@
+"""Writes refined garments into one new layer, frame after frame.
+
+The layer holds overs only (and, in sibling mode, the refined siblings). What depends on topology is authored once, when
+the writer opens; points, normals, extent and velocities come per time code. See `stream` for how it stays atomic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
+
+from ...errors import LayerError, UsageError
+from ...solver.mesh.subdivide import Refinement
+from .. import provenance
+from ..check.validate import check_layer
+from ..files import check_targets, files_of
+from ..read.reader import Shot
+from ..stage import Notice, pxr_errors
+from . import overs
+from .carry import FineMap
+from .chunk import CHUNK, Chunk
+from .heat import HeatTrack
+from .hints import ModelHints
+from .material_opinions import author_used_values
+from .normals import VertexNormals
+from .primvars import carry_primvars, carry_subsets
+from .stream import LayerStream
+from .track import PointTrack, extent_of, to_local
+
+MODES = ("over", "sibling")
+
+
+class LayerWriter:
+    """One refined layer; a context manager. Leaving it after an error leaves nothing under the final name.
+
+    Attributes:
+        notices: What was hidden, emptied or changed, and why.
+    """
+
+    def __init__(
+        self,
+        shot: Shot,
+        refinements: Sequence[Sequence[Refinement]],
+        out: Path | None,
+        *,
+        mode: str = "over",
+        velocities: bool = False,
+        provenance: Mapping[str, Any] | None = None,
+        overwrite: bool = False,
+        chunk: Chunk | None = None,
+    ) -> None:
+        """Start the layer and author everything that does not move.
+
+        Args:
+            shot: The opened shot; never edited.
+            refinements: Per garment, coarse to fine; none keeps the cage.
+            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``; None for one in memory.
+            mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
+            velocities: Whether to author velocities, by finite differences, where the shot has none too.
+            provenance: Further entries of the record in ``customLayerData["physgraph"]``.
+            overwrite: Whether an existing file may be replaced.
+            chunk: Which frames of the shot the layer is for; garments without a sample there are not in it. None for
+                all.
+
+        Raises:
+            UsageError: The mode is unknown, or the file exists or is one that the shot is made of.
+            LayerError: The layer cannot be written.
+        """
+        if mode not in MODES:
+            raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
+        if len(refinements) != len(shot.scene.garments):
+            raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
+        if out is not None:
+            check_targets([("the layer", out)], files_of(shot.path))
+        self._shot, self._mode, self._time = shot, mode, -np.inf
+        self._velocities, self._open = velocities, True
+        self._record = {"mode": mode} | dict(provenance or {})
+        self._chunk, self._meshes = chunk, dict[int, _RefinedMesh]()
+        self.notices: list[Notice] = []
+        with ExitStack() as stack:
+            self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
+            self._author_still(refinements)
+            self._cleanup = stack.pop_all()
+
+    def _author_still(self, refinements: Sequence[Sequence[Refinement]]) -> None:
+        """Author metadata and, per garment, what its topology decides."""
+        times = self._shot.scene.times
+        span = (times[0], times[-1]) if times else None
+        provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
+        how = {"sibling": self._mode == "sibling", "velocities": self._velocities}
+        with pxr_errors(f"cannot read {self._shot.path}"):
+            for index in _garments_in(self._shot, self._chunk):
+                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **how)
+                self.notices += mesh.notices
+                self._meshes[index] = mesh
+
+    def write(
+        self,
+        time: float | None,
+        points: Sequence[np.ndarray | None],
+        *,
+        changed: Sequence[bool] | None = None,
+        heat: Sequence[Mapping[str, np.ndarray] | None] = (),
+    ) -> None:
+        """Write one time code.
+
+        Args:
+            time: The stage's own time code, later than the last; None once, for a shot without samples.
+            points: Per garment, fine points [m], world space, shape (V_fine, 3), or None where the garment has no
+                sample at this time.
+            changed: Per garment, False where the points are known to equal the last ones.
+            heat: Per garment, its heat maps by name, each of shape (V_fine,), or None; () for no heat maps.
+
+        Raises:
+            LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
+        """
+        if not self._open:
+            raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
+        if self._time == np.inf or (time is not None and time <= self._time):
+            raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
+        _check_sizes(self._meshes, len(self._shot.sources), points, heat=heat, time=time)
+        if self._time == -np.inf:
+            self._author_values(time)
+        for index, mesh in self._meshes.items():
+            if (array := points[index]) is not None:
+                different = True if changed is None else bool(changed[index])
+                mesh.write(time, array, (heat[index] if heat else None) or {}, changed=different)
+        self._time = np.inf if time is None else time
+
+    def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
+        """Take a frame of a chunk's run-up into the chunk's record.
+
+        Args:
+            time: Its time code.
+            points: As `write` takes them.
+
+        Raises:
+            LayerError: A point is not finite.
+        """
+        assert self._chunk is not None, "only a chunk has a run-up"
+        found = {
+            str(mesh.target): mesh.before(time, array)
+            for index, mesh in self._meshes.items()
+            if (array := points[index]) is not None
+        }
+        self._chunk = replace(self._chunk, run_up={**self._chunk.run_up, time: found})
+
+    def _author_values(self, time: float | None) -> None:
+        """Leave the values used on the coarse prims."""
+        frame = self._shot.frame(time)
+        for index in self._meshes:
+            source, garment = self._shot.sources[index], self._shot.scene.garments[index]
+            author_used_values(self._stream, source, garment, frame.garments[index])
+
+    @property
+    def targets(self) -> list[Sdf.Path]:
+        """Path of each garment's fine mesh."""
+        return [mesh.target for mesh in self._meshes.values()]
+
+    def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path | None:
+        """Finish, validate and move the layer to its final name.
+
+        Args:
+            lacking: Entries of the record about what the layer lacks.
+
+        Returns:
+            The layer's path; None for a layer in memory.
+
+        Raises:
+            LayerError: The layer is invalid or cannot be written.
+        """
+        if self._time == -np.inf:
+            raise LayerError(f"no time code was written to {self._stream.target}")
+        for mesh in self._meshes.values():
+            mesh.finish(hold=self._chunk is not None)
+        facts = _facts(self._shot, self.targets, self._stream.target)
+        facts |= {CHUNK: self._chunk.record()} if self._chunk is not None else {}
+        provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
+        self._stream.flush()
+        self._check_written()
+        path = self._stream.commit()
+        self._open = False
+        self._cleanup.close()
+        return path
+
+    def _check_written(self) -> None:
+        """Validate the first, middle and last sample of what was written."""
+        with pxr_errors(f"cannot read {self._shot.path} under the layer written", LayerError):
+            problems = check_layer(self._stream.layer, self._shot.view, samples=3)
+        errors = [problem for problem in problems if problem.severity == "error"]
+        if errors:
+            raise LayerError(f"the layer written is invalid ({len(errors)} problems); first: {errors[0]}")
+
+    @property
+    def layer(self) -> Sdf.Layer:
+        """The layer being written, or in memory.
+
+        Raises:
+            LayerError: It is a file that is closed.
+        """
+        return self._stream.layer
+
+    def __enter__(self) -> LayerWriter:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close after success; after an error remove what was written."""
+        try:
+            if error is None and self._open:
+                self.close()
+        finally:
+            self._open = False
+            self._cleanup.close()
+
+
+class _RefinedMesh:
+    """The refined mesh of one garment as it is written.
+
+    Attributes:
+        target: Its path.
+        notices: What was hidden, emptied or changed, and why.
+    """
+
+    def __init__(
+        self,
+        stream: LayerStream,
+        shot: Shot,
+        index: int,
+        *,
+        steps: Sequence[Refinement],
+        sibling: bool,
+        velocities: bool,
+    ) -> None:
+        """Author one garment's defaults and start its tracks.
+
+        Args:
+            stream: The layer.
+            shot: The shot.
+            index: Which garment.
+            steps: Its refinements, coarse to fine.
+            sibling: Whether it goes beside the coarse mesh.
+            velocities: Whether to author velocities where the shot has none too.
+        """
+        source, times = shot.sources[index], shot.scene.times
+        prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
+        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
+        fine = FineMap(shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
+        self.notices = overs.open_instances(stream, source)
+        self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
+        overs.author_topology(stream, target, prim, fine)
+        overs.author_unskinned(stream, target, prim, skinned=source.skinned)
+        self.notices += carry_primvars(stream, target, prim, fine, span=span)
+        self.notices += carry_subsets(stream, target, prim, fine, span=span)
+        self.notices += overs.author_rest_points(stream, target, prim, fine)
+        left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        rest = None if source.skinned or not source.times else _refined_default(prim, fine)
+        normals = VertexNormals(fine.fine, left_handed=left)
+        rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
+        self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
+        self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
+        self._heat = HeatTrack(stream, target, normals.vertex_count, still=not source.times)
+        purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
+        self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
+        self._shot, self._index = shot, index
+
+    def write(self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool) -> None:
+        """Write one time code, as `LayerWriter.write` takes it."""
+        self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed)
+        self._hints.write(time, self._track.box)
+        self._heat.write(time, heat)
+
+    def before(self, time: float, points: np.ndarray) -> np.ndarray:
+        """Local points of a frame of the run-up, float32; the hints hold them, since `stitch` may show part of them."""
+        local = to_local(points, self._shot.to_metres(self._index, time), str(self.target), time)
+        self._hints.write(time, extent_of(local))
+        return local
+
+    def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
+        """Refuse points and heat maps that do not fit."""
+        if points is not None:
+            self._track.check(points, time)
+        self._heat.check(heat, time)
+
+    def finish(self, *, hold: bool) -> None:
+        """Author what waited for a next sample; ``hold`` as `PointTrack.finish` takes it."""
+        self._track.finish(hold=hold)
+        self._heat.finish(hold=hold)
+
+
+def _check_sizes(
+    meshes: Mapping[int, _RefinedMesh],
+    count: int,
+    points: Sequence[np.ndarray | None],
+    *,
+    heat: Sequence[Mapping[str, np.ndarray] | None],
+    time: float | None,
+) -> None:
+    """Refuse points and heat maps that do not fit the garments, of which there are ``count``."""
+    if len(points) != count:
+        raise LayerError(f"{len(points)} arrays of points for {count} garments")
+    if heat and len(heat) != count:
+        raise LayerError(f"heat maps of {len(heat)} garments for {count} garments")
+    for index, mesh in meshes.items():
+        mesh.check(points[index], (heat[index] if heat else None) or {}, time)
+
+
+def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
+    """What the record says of the garments, and of what they were read from."""
+    held = zip(targets, shot.sources, strict=False)
+    return {
+        "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
+        "garments": [str(path) for path in targets],
+        "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
+        "variants": shot.selections or None,
+    }
+
+
+def _garments_in(shot: Shot, chunk: Chunk | None) -> list[int]:
+    """Numbers of the garments that have a sample in a chunk; one without samples is in that of the first frame."""
+    every = range(len(shot.sources))
+    if chunk is None or not chunk.times:
+        return [*every]
+    first = shot.scene.times[0]
+    return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(chunk.times)]
+
+
+def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:
+    """Authored default points, refined linearly, shape (V_fine, 3), float32; None where there are none that fit."""
+    value = UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default())
+    if value is None or len(value) != fine.cage.vertex_count:
+        return None
+    points = fine.interpolate(np.asarray(value, np.float32))
+    return points if np.isfinite(points).all() else None
