@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from physgraph_usd.shot import prepare_device
+from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.weights import save_network
 from physgraph_usd.train import record

@@ -18,10 +18,10 @@ from PIL import Image
 from pxr import Usd, UsdGeom
 
 from benchmarks.sleeve import say
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.preview import preview
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.page.preview import preview
+from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.usd.read.reader import Shot, open_shot

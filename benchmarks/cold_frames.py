@@ -4,7 +4,7 @@
         [--linear] [--whole] [FOLDER]
 
 Solves frames spread over each sample and, where FOLDER holds real shots, over those, each by itself. Prints a row a
-shot: frames that did not settle (`physgraph_usd.settled`), those that ended with no step that lowers the energy, the
+shot: frames that did not settle (`shot/settled.py`), those that ended with no step that lowers the energy, the
 largest remaining move in tolerances, edges of cloth through cloth in the input and after, evaluations, the part of them
 that line searches spent in vain, the RMS angle between triangles at the cage's edges over that elsewhere (median and
 largest; of the smooth upsampled cage in brackets), and the median time. With --whole each frame has a row, and its
@@ -25,10 +25,10 @@ import click
 import numpy as np
 import torch
 
-from physgraph_usd.options import RefineOptions
 from physgraph_usd.samples import write_sample
-from physgraph_usd.settled import unsettled
-from physgraph_usd.shot import prepare_device
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.solver.frame import level_forces
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.pipeline import Refiner

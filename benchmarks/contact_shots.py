@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.crossing_count import crossing_count
 from benchmarks.temporal import detail_of
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import prepare_device
+from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.usd.read.reader import Shot, open_shot
@@ -170,7 +170,7 @@ def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSett
         settings: How contact is solved.
         device: Where to compute.
     """
-    from physgraph_usd.options import RefineOptions  # noqa: PLC0415
+    from physgraph_usd.shot.options import RefineOptions  # noqa: PLC0415
 
     solve = replace(RefineOptions().solve_settings(), contact=settings)
     refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), device=device, lanes=LANES)

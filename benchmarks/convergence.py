@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 
 from physgraph_usd.chart.reference import Reference
-from physgraph_usd.shot import prepare_device
+from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import METHODS

@@ -1,4 +1,4 @@
-"""Memory, layer size and time of the samples, measured and as `physgraph_usd.estimate` expects them.
+"""Memory, layer size and time of the samples, measured and as `physgraph_usd.shot.estimate` expects them.
 
     python -m benchmarks.estimate [--short]
 
@@ -16,9 +16,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from physgraph_usd.options import RefineOptions
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import inspect_shot, refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.usd.read.reader import open_shot
 
 CASES = (("sleeve", 1), ("sleeve", 2), ("flag", 2), ("skirt", 2), ("tshirt", 2), ("armpit", 2), ("layers", 2))

@@ -24,11 +24,11 @@ from PIL import Image, ImageDraw
 from benchmarks.crossing_count import crossing_count
 from benchmarks.shots import opened, problem_of
 from benchmarks.sleeve import say
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.preview import label, surface_of
-from physgraph_usd.raycast import View, draw, fit_view
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import prepare_device, refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.page.preview import label, surface_of
+from physgraph_usd.shot.page.raycast import View, draw, fit_view
+from physgraph_usd.shot.refine import prepare_device, refine_shot
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
 
 LEVEL, PANEL, RATE, QUALITY = 2, (480, 540), 12, "25"

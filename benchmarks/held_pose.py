@@ -18,8 +18,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import prepare_device
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.scene import Frame
 

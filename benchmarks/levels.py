@@ -20,8 +20,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import prepare_device
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.level import Level

@@ -10,10 +10,10 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.sleeve import say
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.preview import preview
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.page.preview import preview
+from physgraph_usd.shot.refine import refine_shot
 
 SHOWN = {"sleeve": 24.0, "skirt": 24.0, "flag": 24.0, "tshirt": 36.0}
 """Time code to draw, by sample."""

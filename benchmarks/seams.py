@@ -23,9 +23,9 @@ import numpy as np
 from pxr import Sdf
 
 from benchmarks.contact_shots import REAL, say
-from physgraph_usd.options import RefineOptions
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.chunk import read_chunk
 from physgraph_usd.usd.write.stitch import mean_edge, points_at

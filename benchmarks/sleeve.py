@@ -21,9 +21,9 @@ import torch
 
 from benchmarks.unseen import reference_of
 from physgraph_usd.chart.reference import Reference
-from physgraph_usd.options import RefineOptions
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import prepare_device, refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import prepare_device, refine_shot
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.pipeline import Refiner

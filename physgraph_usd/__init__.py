@@ -27,10 +27,10 @@ if TYPE_CHECKING:
         StageError,
         UsageError,
     )
-    from .joined import stitch
-    from .options import RefineOptions
-    from .report import RefineReport
-    from .shot import inspect_shot, refine_shot, refine_shots, refine_stage
+    from .shot.joined import stitch
+    from .shot.options import RefineOptions
+    from .shot.refine import inspect_shot, refine_shot, refine_shots, refine_stage
+    from .shot.report import RefineReport
     from .solver.fabric import PRESETS, Fabric
     from .usd.check.validate import validate_layer
     from .usd.read.reader import Shot, open_shot
@@ -74,12 +74,12 @@ _ROOMS = {
         "UsageError",
     ),
     "solver.fabric": ("PRESETS", "Fabric"),
-    "options": ("RefineOptions",),
-    "report": ("RefineReport",),
-    "shot": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
+    "shot.options": ("RefineOptions",),
+    "shot.report": ("RefineReport",),
+    "shot.refine": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
     "usd.read.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
-    "joined": ("stitch",),
+    "shot.joined": ("stitch",),
     "usd.write.tag": ("tag",),
     "usd.check.validate": ("validate_layer",),
 }

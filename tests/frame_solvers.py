@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.frames import Outcome
+from physgraph_usd.shot.frames import Outcome
 
 
 class Counting:

@@ -13,9 +13,9 @@ from layers import errors, open_over, world_metres
 from pxr import Sdf
 from stages import add_sheet, new_stage, save, vec3
 
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.report import RefineReport
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.shot.report import RefineReport
 
 VALID = {
     "01_newton_shirt_dab_cm.usdc": ["/shot/char/shirt_geo"],

@@ -17,11 +17,12 @@ from jsonschema import Draft202012Validator
 from pxr import Usd, UsdGeom
 from shots import CLOTH, cloth_shot, command, faults, sample_times
 
-from physgraph_usd import cli, summary
+from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
-from physgraph_usd.frames import frames_folder
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import refine_shot, refine_shots
+from physgraph_usd.shot import summary
+from physgraph_usd.shot.frames import frames_folder
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot, refine_shots
 
 SMALL = ("--level", "0")
 
@@ -137,13 +138,13 @@ class TestSummary:
         def interrupted(*_: object, **__: object):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("physgraph_usd.shot.refine_shots", interrupted)
+        monkeypatch.setattr("physgraph_usd.shot.refine.refine_shots", interrupted)
         shots = [cloth_shot(tmp_path / f"{name}.usda", times=(1.0,)) for name in "ab"]
         run("refine", *shots, "-o", tmp_path, "--summary", tmp_path / "summary.json", *SMALL)
         assert {row["state"] for row in rows_of(tmp_path / "summary.json").values()} == {"not done"}
 
     def test_crossings_of_garments_solved_together_count_once(self) -> None:
-        from physgraph_usd.report import RefineReport
+        from physgraph_usd.shot.report import RefineReport
 
         def entry(*together: str) -> dict[str, Any]:
             sides = {when: {"crossings": 3, "between_garments": 0} for when in ("before", "after")}

@@ -16,8 +16,8 @@ from blender import NEEDS_BLENDER
 from layers import world_metres
 from pxr import Usd, UsdGeom, UsdShade
 
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import inspect_shot, refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import inspect_shot, refine_shot
 
 pytestmark = NEEDS_BLENDER
 

@@ -13,7 +13,7 @@ from blender import NEEDS_BLENDER
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from stages import add_sheet, author, new_stage
 
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.fabric import PRESETS
 
 ADDON = Path(__file__).parents[1] / "plugins" / "blender"

@@ -11,7 +11,7 @@ from cloth import frame_of, refiner_of, sheet, solved, wave
 from folds import frame_with, named, refiner_with, square
 from sheets import garment_of
 
-from physgraph_usd.options import RefineOptions
+from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.integrate.choice import LONGER, LONGER_CUDA, Choice, choose
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 

@@ -18,10 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shots import EDGE, cloth_shot, faults, fine, refine, sample_times
 
-from physgraph_usd.chunks import RUN_UP, chunks_of, solve_in_chunks
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SolveError, UsageError
-from physgraph_usd.frames import FrameFolder, Outcome
-from physgraph_usd.processes import memory_is_named
+from physgraph_usd.shot.chunks import RUN_UP, chunks_of, solve_in_chunks
+from physgraph_usd.shot.frames import FrameFolder, Outcome
+from physgraph_usd.shot.processes import memory_is_named
 
 SEAM = 5e-2
 """Largest difference that the number of workers makes, RMS over a frame, in fine edge lengths; 0.036 was measured."""

@@ -25,7 +25,7 @@ from physgraph_usd import cli, errors
 from physgraph_usd.cli.options import INTEGRATORS
 from physgraph_usd.cli.printing import Saying
 from physgraph_usd.cli.refine import refine
-from physgraph_usd.report import RefineReport
+from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.words import counted
 
 pytest.importorskip("pxr", reason="the commands read stages with usd-core")
@@ -54,7 +54,7 @@ def refined(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
         calls.append(SimpleNamespace(shot=shot, out=out, options=options))
         return RefineReport(shot, out, {})
 
-    monkeypatch.setattr("physgraph_usd.shot.refine_shot", refine_shot)
+    monkeypatch.setattr("physgraph_usd.shot.refine.refine_shot", refine_shot)
     return calls
 
 
@@ -191,7 +191,7 @@ class TestRefine:
         assert (options.temporal, options.rest_frame, options.velocities) == ("off", 4.0, True)
 
     def test_what_is_left_out_keeps_its_default(self, refined: list[SimpleNamespace], tmp_path: Path) -> None:
-        from physgraph_usd.options import RefineOptions
+        from physgraph_usd.shot.options import RefineOptions
 
         run("refine", "a.usda", "-o", tmp_path / "a.usdc")
         for field in fields(RefineOptions):
@@ -199,7 +199,7 @@ class TestRefine:
                 assert getattr(refined[0].options, field.name) == getattr(RefineOptions(), field.name), field.name
 
     def test_every_option_is_one_of_the_call(self) -> None:
-        from physgraph_usd.options import RefineOptions
+        from physgraph_usd.shot.options import RefineOptions
 
         own = {"shots", "out", "summary", "config", "verbose", "log_file", "seam_bound", "openjd"}
         declared = {parameter.name for parameter in refine.params} - own
@@ -228,7 +228,7 @@ class TestSeveralShots:
             asked.extend(jobs)
             return [RefineReport(shot, out, {}) for shot, out, _ in jobs]
 
-        monkeypatch.setattr("physgraph_usd.shot.refine_shots", refine_shots)
+        monkeypatch.setattr("physgraph_usd.shot.refine.refine_shots", refine_shots)
         return asked
 
     def test_each_gets_its_files(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
@@ -293,8 +293,8 @@ class TestSeveralShots:
         assert result.exit_code == (1 if "torn" in names else 2), result.stderr
 
     def test_one_that_dies_leaves_the_others(self, tmp_path: Path) -> None:
-        from physgraph_usd.options import RefineOptions
-        from physgraph_usd.shot import refine_shots
+        from physgraph_usd.shot.options import RefineOptions
+        from physgraph_usd.shot.refine import refine_shots
 
         jobs = [(name, tmp_path / f"{name}.usdc", RefineOptions()) for name in ("dies", "raises", "returns")]
         died, raised, returned = refine_shots(jobs, workers=2, refine=as_named)
@@ -330,7 +330,7 @@ class TestErrors:
         def fail(*_: object) -> None:
             raise error
 
-        monkeypatch.setattr("physgraph_usd.shot.refine_shot", fail)
+        monkeypatch.setattr("physgraph_usd.shot.refine.refine_shot", fail)
         result = run("refine", "a.usda", "-o", tmp_path / "a.usdc")
         assert (result.exit_code, result.stdout, result.stderr) == (code, "", f"error: {error}\n")
 
@@ -378,12 +378,12 @@ class TestErrors:
             report.warn("frame 3 failed")
             return report
 
-        monkeypatch.setattr("physgraph_usd.shot.refine_shot", refine_shot)
+        monkeypatch.setattr("physgraph_usd.shot.refine.refine_shot", refine_shot)
         result = run("refine", "a.usda", "-o", report.out)
         assert (result.exit_code, result.stderr) == (3, "warning: frame 3 failed\n")
 
     def test_missing_extra_is_named(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.delitem(sys.modules, "physgraph_usd.preview", raising=False)
+        monkeypatch.delitem(sys.modules, "physgraph_usd.shot.page.preview", raising=False)
         monkeypatch.setitem(sys.modules, "PIL", None)
         result = run("preview", "a.usdc", "-o", tmp_path / "x.png")
         assert result.exit_code == 1

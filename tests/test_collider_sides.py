@@ -15,7 +15,7 @@ from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix,
 from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.errors import SchemaError
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.sign import _sides, signed_distances

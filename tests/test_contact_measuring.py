@@ -13,7 +13,7 @@ from cloth import sheet
 from folds import levels_of, named
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.options import RefineOptions
+from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.contact.bodies import FrameBodies, Touching

@@ -13,7 +13,7 @@ import pytest
 from shots import cloth_shot, command, faults, refine
 
 from physgraph_usd.errors import GarmentError, PhysGraphError, SolveError, UsageError
-from physgraph_usd.farm import connected
+from physgraph_usd.shot.farm import connected
 
 distributed = pytest.importorskip("distributed", reason="needs Dask (extra farm)")
 TIMES = tuple(float(time) for time in range(1, 49))
@@ -116,7 +116,7 @@ def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exceptio
 def test_workers_of_another_version_or_checkout_are_refused(
     cluster: Any, monkeypatch: pytest.MonkeyPatch, name: str, other: Any, said: str
 ):
-    monkeypatch.setattr(f"physgraph_usd.farm.{name}", other)
+    monkeypatch.setattr(f"physgraph_usd.shot.farm.{name}", other)
     with connected(cluster.scheduler_address) as start, pytest.raises(UsageError, match=said):
         start(fails, "").result()
 
@@ -133,7 +133,7 @@ def test_workers_of_several_threads_are_refused():
 
 
 def test_a_scheduler_that_is_not_there_is_named(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("physgraph_usd.farm.CONNECT_SECONDS", 0.2)
+    monkeypatch.setattr("physgraph_usd.shot.farm.CONNECT_SECONDS", 0.2)
     for address in (NOWHERE, "farm"):
         with pytest.raises(UsageError, match=f"no Dask scheduler answers at {address}"):
             refine(shot, tmp_path / "fine.usdc", scheduler=address)

@@ -16,8 +16,8 @@ from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API
 
 from physgraph_usd.errors import LayerError
-from physgraph_usd.frames import FrameFolder, Outcome
-from physgraph_usd.options import RefineOptions
+from physgraph_usd.shot.frames import FrameFolder, Outcome
+from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.primitives import ShapeSurface

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from shots import cloth_shot, command, faults, sample_times
 
-from physgraph_usd.frames import frames_folder
-from physgraph_usd.lock import LOCK
+from physgraph_usd.shot.frames import frames_folder
+from physgraph_usd.shot.lock import LOCK
 from physgraph_usd.usd.write.atomic import HOST
 
 TIMES = tuple(float(t) for t in range(1, 61))

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from shots import cloth_shot
 
-from physgraph_usd.frames import Lead, Outcome
-from physgraph_usd.joined import Looking, joined
-from physgraph_usd.options import RefineOptions
+from physgraph_usd.shot.frames import Lead, Outcome
+from physgraph_usd.shot.joined import Looking, joined
+from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.seams import between
 

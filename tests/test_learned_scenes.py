@@ -12,7 +12,7 @@ import torch
 from cloth import FABRIC, GUIDE, group_of, sheet, wave
 from shots import refine
 
-from physgraph_usd.report import RefineReport
+from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.scene import GarmentFrame

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from physgraph_usd import lock
 from physgraph_usd.errors import LayerError
-from physgraph_usd.lock import LOCK, FolderLock, is_held
+from physgraph_usd.shot import lock
+from physgraph_usd.shot.lock import LOCK, FolderLock, is_held
 
 
 def test_one_holds_it_at_a_time(tmp_path: Path):

@@ -16,8 +16,8 @@ from sheets import garment_of
 from shots import refine
 from stages import add_sheet, new_stage
 
-from physgraph_usd.report import of_a_kind
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.shot.report import of_a_kind
 from physgraph_usd.solver.contact.broad_phase import Parts
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 from physgraph_usd.usd.read.find import felt_by, find_colliders

@@ -13,7 +13,7 @@ from meshes import grid
 from sheets import equilateral, garment_of, level_of
 from test_forces import crumple
 
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces.membrane import Membrane, in_plane_terms
 from physgraph_usd.solver.forces.stretch import Stretch

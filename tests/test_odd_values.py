@@ -12,8 +12,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_shot
 
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SchemaError, StageError
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.stage import LONGEST_REASON, in_brief, pxr_errors, read_units

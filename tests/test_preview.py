@@ -15,11 +15,11 @@ from PIL import Image, ImageSequence
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from physgraph_usd.errors import StageError, UsageError
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.preview import preview
-from physgraph_usd.raycast import Surface, draw, encode_color, fit_view
 from physgraph_usd.samples import write_sample
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.page.preview import preview
+from physgraph_usd.shot.page.raycast import Surface, draw, encode_color, fit_view
+from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.usd.read.meshes import DrawnStage, refined_in, shot_of
 
 SIZE = (320, 160)

@@ -20,8 +20,8 @@ from pxr import Sdf, UsdGeom, Vt
 from sheets import garment_of, rotation
 from stages import GARMENT_API, affine, author, new_stage, save, set_matrix, vec3
 
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces.guide import GuideMap
 from physgraph_usd.solver.level import build_levels, refine_garments

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physgraph_usd.solver.mesh.rays import Rays
+from physgraph_usd.shot.page.rays import Rays
 
 
 @pytest.fixture(scope="module")

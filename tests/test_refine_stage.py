@@ -24,9 +24,9 @@ from stages import (
 )
 
 import physgraph_usd as pg
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.report import RefineReport
-from physgraph_usd.shot import inspect_shot, refine_stage
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import inspect_shot, refine_stage
+from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.check.validate import validate_layer
 
 BEND = "physgraph:material:bendStiffness"

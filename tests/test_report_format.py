@@ -12,11 +12,12 @@ from click.testing import CliRunner
 from jsonschema import Draft202012Validator, ValidationError
 from shots import cloth_shot, refine
 
-from physgraph_usd import __version__, cli, summary
+from physgraph_usd import __version__, cli
 from physgraph_usd.errors import PhysGraphError
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.report import FORMAT, SCHEMA
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot import summary
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.shot.report import FORMAT, SCHEMA
 
 VALIDATOR = Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
 

@@ -18,11 +18,11 @@ from browser import opened
 from shots import CLOTH, TIMES, cloth_shot, refine
 
 from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.options import json_of
-from physgraph_usd.page.plot import plot
-from physgraph_usd.page.report import page
-from physgraph_usd.page.series import add_jerk, read_series, third_difference
-from physgraph_usd.report import RefineReport
+from physgraph_usd.shot.options import json_of
+from physgraph_usd.shot.page.plot import plot
+from physgraph_usd.shot.page.report import page
+from physgraph_usd.shot.page.series import add_jerk, read_series, third_difference
+from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.check.readback import RefinedLayer
 from physgraph_usd.usd.read.reader import open_shot
 

@@ -89,7 +89,7 @@ def test_it_is_not_where_the_shot_was_edited(shot: Path, tmp_path: Path):
 
 def test_it_is_not_where_another_checkout_made_it(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     refine(shot, tmp_path / "fine.usdc")
-    monkeypatch.setattr("physgraph_usd.finished.code_digest", lambda: "other")
+    monkeypatch.setattr("physgraph_usd.shot.finished.code_digest", lambda: "other")
     with pytest.raises(UsageError, match=r"fine\.usdc exists"):
         refine(shot, tmp_path / "fine.usdc", resume=True)
 

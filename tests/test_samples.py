@@ -20,7 +20,7 @@ from physgraph_usd.errors import UsageError
 from physgraph_usd.samples import SAMPLES, write_sample
 from physgraph_usd.samples.grid import ease, quad_grid, springs
 from physgraph_usd.samples.panel import Cut, sew
-from physgraph_usd.solver.mesh.rays import Rays
+from physgraph_usd.shot.page.rays import Rays
 from physgraph_usd.usd.write.plain import PlainMesh, PlainStage
 
 GARMENT, COLLIDER = "PhysGraphGarmentAPI", "PhysGraphColliderAPI"

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from shots import CLOTH, cloth_shot, command, refine
 
-from physgraph_usd.report import RefineReport
-from physgraph_usd.settled import told_contact, told_energy, unsettled
+from physgraph_usd.shot.report import RefineReport
+from physgraph_usd.shot.settled import told_contact, told_energy, unsettled
 
 
 def told(level: int, remaining: float, stopped: str = "steps") -> dict[str, Any]:

@@ -15,8 +15,8 @@ from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_t
 from stages import author
 
 from physgraph_usd.errors import LayerError, SchemaError, StageError, UsageError
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import inspect_shot, refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.usd.check.validate import validate_layer
 
 BEND = "physgraph:material:bendStiffness"

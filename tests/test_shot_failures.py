@@ -17,7 +17,7 @@ from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import GarmentError, PhysGraphError, UsageError
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 
 
 @pytest.fixture

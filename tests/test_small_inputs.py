@@ -12,7 +12,7 @@ from shots import cloth_shot, refine
 from stages import GARMENT_API, new_stage, save, vec3
 
 from physgraph_usd.errors import GarmentError, PhysGraphError, StageError
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 
 WEAK = ("physgraph:guide:stiffness=1e-30",)
 

@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdPhysics
 from shots import CLOTH, cloth_shot
 
 from physgraph_usd.cli import main
-from physgraph_usd.plain_json import to_json
+from physgraph_usd.shot.plain_json import to_json
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.usd.schema import COLLIDER, GARMENT
 

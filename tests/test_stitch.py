@@ -16,7 +16,7 @@ from shots import CLOTH, EDGE, cloth_shot, command, faults, fine, refine, sample
 from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageError
-from physgraph_usd.joined import check_seams, stitch
+from physgraph_usd.shot.joined import check_seams, stitch
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record
 from physgraph_usd.usd.write.chunk import read_chunk
@@ -130,7 +130,7 @@ class TestRefused:
             stitch([*runs.chunks[:3], other], tmp_path / "joined.usdc")
 
     def test_another_checkout(self, runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.setattr("physgraph_usd.finished.code_digest", lambda: "other")
+        monkeypatch.setattr("physgraph_usd.shot.finished.code_digest", lambda: "other")
         (other,) = refine_chunks(runs.shot, tmp_path, SPANS[3:])
         with pytest.raises(UsageError, match=r"were made with other code; refine one anew"):
             stitch([*runs.chunks[:3], other], tmp_path / "joined.usdc")

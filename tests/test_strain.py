@@ -12,7 +12,7 @@ from shots import command, fine, refine, sample_times
 from stages import GARMENT_API, new_stage, save, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.mesh.fit import median_shape
 from physgraph_usd.solver.strain import strayed
 from physgraph_usd.usd.read.reader import open_shot

@@ -10,7 +10,7 @@ from stages import COLLIDER_API, add_sheet, author, new_stage, save
 
 from physgraph_usd.cli.printing import outline
 from physgraph_usd.errors import SchemaError, UsageError
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.scene import Garment
 from physgraph_usd.usd.read.reader import Shot, open_shot
 

@@ -14,7 +14,7 @@ from shots import refine
 from stages import COLLIDER_API, GARMENT_API, add_sheet, add_skeleton, author, bind_skin, new_stage, save, vec3
 
 from physgraph_usd.cli import main
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.tune.session import TuneSession
 
 COUNTS = [4] * 6

@@ -9,7 +9,7 @@ import pytest
 from layers import COAT, grid, make_shot, open_over, vec3, write_layer
 from pxr import Sdf, Usd, UsdGeom, Vt
 
-from physgraph_usd.shot import inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.usd.check.rules import Problem
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record

@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.subplots import make_subplots
 
-from ..page.document import document, table
+from ..shot.page.document import document, table
 from .methods import DEFAULT, SMOOTH, UPSAMPLED
 from .styles import Style, styles
 from .table import JUDGED, Chart

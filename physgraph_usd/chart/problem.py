@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..options import RefineOptions
+from ..shot.options import RefineOptions
 from ..solver.contact.settings import ContactSettings
 from ..solver.frame.pipeline import Refiner
 from ..solver.frame.settings import SolveSettings

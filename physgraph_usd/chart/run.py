@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 from ..errors import UsageError
-from ..options import RefineOptions
-from ..shot import MOST_LANES, prepare_device
+from ..shot.options import RefineOptions
+from ..shot.refine import MOST_LANES, prepare_device
+from ..shot.untagged import open_with_colliders
 from ..solver.resolution import choose_levels, sample_frames
 from ..solver.scene import Frame, Scene
-from ..untagged import open_with_colliders
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import file_hashes
 from ..usd.read.reader import Shot

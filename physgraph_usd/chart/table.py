@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ..plain_json import to_json
+from ..shot.plain_json import to_json
 from .journal import Journal
 from .methods import DEFAULT
 from .reference import Reference

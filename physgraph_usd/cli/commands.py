@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from ..errors import UsageError
-from ..plain_json import to_json
+from ..shot.plain_json import to_json
 from ..solver.fabric import PRESETS
 from .options import (
     asset_paths_option,
@@ -53,7 +53,7 @@ def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, sea
 
     A folder stands for all layers in it. How far each seam moves goes to stderr.
     """
-    from .. import joined
+    from ..shot import joined
 
     if check_seams:
         for seam in joined.check_seams(chunks, seam_bound=seam_bound):
@@ -78,7 +78,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 
     Exits with 1 when SHOT cannot be refined as asked, with 2 when what was named is not there.
     """
-    from ..shot import inspect_shot
+    from ..shot.refine import inspect_shot
 
     values, _ = values_for(ctx, shot, refine)
     found = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})
@@ -168,7 +168,7 @@ def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) 
 
     A PNG shows one time code, a GIF all of them.
     """
-    from ..preview import preview as draw
+    from ..shot.page.preview import preview as draw
 
     click.echo(draw(layer, out, times=times or None, **options))
 
@@ -208,7 +208,7 @@ def chart(shot: str, out: Path, **options: Any) -> None:
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
 def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
     """Train a learned integrator and print its weights' path."""
-    from ..shot import prepare_device
+    from ..shot.refine import prepare_device
     from ..train.record import run_training
 
     prepare_device(device)
@@ -222,7 +222,7 @@ def warm_up(device: str) -> None:
 
     They are kept in the folder that WARP_CACHE_PATH names, by default in the user's cache.
     """
-    from ..shot import prepare_device
+    from ..shot.refine import prepare_device
     from ..solver.mesh.lanes import compile_kernels
 
     prepare_device(device)
@@ -233,7 +233,7 @@ def warm_up(device: str) -> None:
 @click.argument("name", type=click.Choice(["report", "summary"]), default="report")
 def report_schema(name: str) -> None:
     """Print the JSON Schema of the report of a run, or of the summary of several."""
-    from .. import report, summary
+    from ..shot import report, summary
 
     click.echo({"report": report.SCHEMA, "summary": summary.SCHEMA}[name].read_text(encoding="utf-8"), nl=False)
 

@@ -30,9 +30,9 @@ from .show_file import values_for
 from .structure import FAILED, GroupedCommand
 
 if TYPE_CHECKING:
-    from ..options import RefineOptions
-    from ..report import RefineReport
-    from ..summary import Row
+    from ..shot.options import RefineOptions
+    from ..shot.report import RefineReport
+    from ..shot.summary import Row
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 NOT_OF_THE_CALL = {
@@ -72,8 +72,8 @@ def refine(
     Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
     comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
     """
-    from ..finished import check_jobs
     from ..interrupts import signals_raise
+    from ..shot.finished import check_jobs
 
     jobs = _jobs(ctx, shots, out)
     layers = [layer for _, layer, _ in jobs]
@@ -93,7 +93,7 @@ def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -
     """Say how far the seams of chunks to those beside them move, and fail where one moves too far."""
     if bound is None:
         return
-    from ..joined import check_seams
+    from ..shot.joined import check_seams
 
     for layer in filter(Path.exists, layers):
         for seam in check_seams([layer.parent], of=layer, seam_bound=bound):
@@ -102,7 +102,7 @@ def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -
 
 def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
     """Each shot with its layer and its options, those of its show's file among them."""
-    from ..options import RefineOptions
+    from ..shot.options import RefineOptions
 
     report, root = ctx.params["report"], ctx.params["root"]
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
@@ -120,7 +120,7 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
 def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -> int:
     """Refine the jobs and say of each what became of it; returns the exit code."""
     from .. import interrupts
-    from ..summary import check_summary, exit_code_of, row_of
+    from ..shot.summary import check_summary, exit_code_of, row_of
 
     if summary is not None:
         check_summary(summary, overwrite=jobs[0][2].overwrite)
@@ -146,7 +146,7 @@ def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -
 
 def _say_all(rows: Sequence[Row], saying: Saying, summary: Path | None, *, exit_code: int) -> None:
     """Print and write what became of all shots."""
-    from ..summary import table_of, write_summary
+    from ..shot.summary import table_of, write_summary
 
     if saying.several:
         say("\n".join(table_of(rows)), err=True)
@@ -168,7 +168,7 @@ def _results(jobs: Sequence[Job], saying: Saying) -> Iterator[RefineReport | Phy
 
     What was finished before is passed over without the solver, whose import takes seconds.
     """
-    from ..finished import check_jobs, finished, in_order
+    from ..shot.finished import check_jobs, finished, in_order
 
     check_jobs(jobs)
     found = [finished(*job) for job in jobs]
@@ -179,7 +179,7 @@ def _solved(jobs: Sequence[Job], saying: Saying) -> Generator[RefineReport | Phy
     """What becomes of the jobs that are not finished."""
     if not jobs:
         return
-    from ..shot import refine_shots
+    from ..shot.refine import refine_shots
 
     if not saying.several:
         try:
@@ -202,7 +202,7 @@ def _refine_shown(
     shot: str, layer: Path, options: RefineOptions, *, saying: Saying, alone: bool = True
 ) -> RefineReport:
     """Refine a shot and show how far it is where it is alone at work."""
-    from ..shot import refine_shot
+    from ..shot.refine import refine_shot
 
     with saying.progress(Path(shot).name) if alone else nullcontext() as progress:
         return refine_shot(shot, layer, replace(options, progress=progress))
@@ -232,8 +232,8 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
 
     Finished frames that an interruption or an error left are named.
     """
-    from ..frames import kept_for
-    from ..lock import is_held
+    from ..shot.frames import kept_for
+    from ..shot.lock import is_held
 
     made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
     try:

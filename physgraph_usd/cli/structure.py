@@ -21,7 +21,7 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
-        from ..processes import memory_is_named
+        from ..shot.processes import memory_is_named
 
         try:
             with memory_is_named():

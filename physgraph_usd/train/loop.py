@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import UsageError
-from ..plain_json import to_json
+from ..shot.plain_json import to_json
 from ..solver.integrate.base import Integrator
 from ..solver.integrate.learned import integrator_of
 from ..solver.integrate.network import Physgraph, PhysgraphConfig

@@ -20,7 +20,7 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ..shot import prepare_device
+from ..shot.refine import prepare_device
 from ..solver.fabric import Fabric
 from ..solver.frame.group import Group
 from ..solver.frame.settings import SolveSettings

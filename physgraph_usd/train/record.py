@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import torch
 
 from ..errors import UsageError
-from ..plain_json import to_json
+from ..shot.plain_json import to_json
 from ..solver.integrate.network import VECTORS, PhysgraphConfig
 from ..solver.integrate.paper_network import PaperConfig
 from ..solver.integrate.weights import save_network

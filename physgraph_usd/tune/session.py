@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from ..errors import UsageError
-from ..shot import prepare_device
+from ..shot.refine import prepare_device
+from ..shot.untagged import AUTO, bodies_beside, open_with_colliders, told_beside
 from ..solver.fabric import PRESETS
 from ..solver.mesh.subdivide import Refinement
 from ..solver.resolution import choose_levels, sample_frames
 from ..solver.scene import Frame, State
-from ..untagged import AUTO, bodies_beside, open_with_colliders, told_beside
 from ..usd.schema import AUTO_LEVEL, GARMENT
 from ..usd.write.tag import fabric_values, tag
 from .solver import FrameSolver

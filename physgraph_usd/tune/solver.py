@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from ..options import RefineOptions
-from ..shot import MOST_LANES, sampled_at
+from ..shot.options import RefineOptions
+from ..shot.refine import MOST_LANES, sampled_at
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.pipeline import Refiner
 from ..solver.frame.settings import SolveSettings

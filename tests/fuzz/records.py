@@ -7,8 +7,8 @@ from typing import Any
 
 from pxr import Sdf, UsdUtils
 
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.shot import refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
 
 from .damage import NAN, ODD_INTS, WORDS
 from .files import ALL

@@ -14,9 +14,9 @@ from types import TracebackType
 from pxr import Tf
 
 from physgraph_usd.errors import GarmentError, PhysGraphError
-from physgraph_usd.options import RefineOptions
-from physgraph_usd.report import RefineReport
-from physgraph_usd.shot import inspect_shot, refine_shot
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import inspect_shot, refine_shot
+from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.check.validate import validate_layer
 
 from .files import sizes

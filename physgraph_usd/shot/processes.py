@@ -15,8 +15,8 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
 
-from .errors import PhysGraphError, SolveError
-from .interrupts import signals_raise
+from ..errors import PhysGraphError, SolveError
+from ..interrupts import signals_raise
 
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0

@@ -13,36 +13,36 @@ from typing import Any
 
 import torch
 
+from ..errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
+from ..interrupts import SIGNALLED, exit_code_of, signals_raise
+from ..solver.contact.passed import told
+from ..solver.frame.history import told_broken, told_jumped
+from ..solver.frame.lead_in import cages_walked
+from ..solver.frame.pipeline import Refiner
+from ..solver.integrate.metric import FACTOR
+from ..solver.mesh.lanes import kernels_are_kept, start_warp
+from ..solver.resolution import too_coarse
+from ..usd.files import check_targets, files_of
+from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED, is_result_of, write_root
+from ..usd.read.reader import Shot
+from ..usd.stage import shot_name
+from ..usd.view import Layer, Stage
+from ..usd.write.atomic import check_place
+from ..usd.write.chunk import Chunk, chunk_of
+from ..usd.write.writer import LayerWriter
+from ..words import NOTICE, counted
 from .chunks import RUN_UP, solve_in_chunks
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
-from .errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
 from .farm import connected, shots_at_once
 from .finished import Job, check_jobs, finished, in_order, made_from, may_be_done, skipped, taken_as_done
 from .frames import FrameFolder, Outcome, frames_folder, kept_for
-from .interrupts import SIGNALLED, exit_code_of, signals_raise
 from .joined import Looking, joined
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .processes import call_each, memory_is_named
 from .report import LOG, RefineReport, is_of_failure
 from .settled import told_contact, told_energy, told_unsettled, unsettled_frames
-from .solver.contact.passed import told
-from .solver.frame.history import told_broken, told_jumped
-from .solver.frame.lead_in import cages_walked
-from .solver.frame.pipeline import Refiner
-from .solver.integrate.metric import FACTOR
-from .solver.mesh.lanes import kernels_are_kept, start_warp
-from .solver.resolution import too_coarse
 from .untagged import AUTO, open_with_colliders
-from .usd.files import check_targets, files_of
-from .usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED, is_result_of, write_root
-from .usd.read.reader import Shot
-from .usd.stage import shot_name
-from .usd.view import Layer, Stage
-from .usd.write.atomic import check_place
-from .usd.write.chunk import Chunk, chunk_of
-from .usd.write.writer import LayerWriter
-from .words import NOTICE, counted
 
 try:
     import resource

@@ -13,10 +13,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .errors import GarmentError
-from .solver.contact.crowding import Crowding
-from .solver.mesh.subdivide import fine_count
-from .solver.scene import Garment
+from ..errors import GarmentError
+from ..solver.contact.crowding import Crowding
+from ..solver.mesh.subdivide import fine_count
+from ..solver.scene import Garment
 
 PROCESS = 5.2e8
 """Memory of a process that has done nothing yet but import [bytes]: torch, Warp and its kernels, USD."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .solver.mesh.rays import Rays
+from .rays import Rays
 
 KEY = np.array([-0.62, 0.62, 0.48])
 """Direction to the key light in the camera's frame (right, up, towards the viewer)."""

@@ -10,11 +10,11 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from .errors import LayerError, StageError, UsageError
+from ...errors import LayerError, StageError, UsageError
+from ...usd.files import check_targets, files_of
+from ...usd.read.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
+from ...usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
 from .raycast import BACKGROUND, Surface, View, draw, encode_color, fit_view
-from .usd.files import check_targets, files_of
-from .usd.read.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
-from .usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
 
 STILL, LOOP = ".png", ".gif"
 """Formats by suffix."""

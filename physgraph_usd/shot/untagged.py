@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from .errors import StageError
-from .solver.colliders.mesh import MeshBody
-from .solver.colliders.pose import MeshPose
-from .solver.contact.broad_phase import bounds_of
-from .solver.contact.nearby import NEAR, share_at, smallest_body
-from .solver.mesh.lanes import start_warp
-from .solver.resolution import sample_frames
-from .solver.scene import Frame
-from .usd.read.reader import Shot, open_shot
-from .usd.read.untagged import meshes_beside
-from .usd.view import Stage
+from ..errors import StageError
+from ..solver.colliders.mesh import MeshBody
+from ..solver.colliders.pose import MeshPose
+from ..solver.contact.broad_phase import bounds_of
+from ..solver.contact.nearby import NEAR, share_at, smallest_body
+from ..solver.mesh.lanes import start_warp
+from ..solver.resolution import sample_frames
+from ..solver.scene import Frame
+from ..usd.read.reader import Shot, open_shot
+from ..usd.read.untagged import meshes_beside
+from ..usd.view import Stage
 
 AUTO = "auto"
 """In place of a collider: all that the shot names, and closed meshes that garments touch."""

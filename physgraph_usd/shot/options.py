@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import UsageError
-from .usd.write.atomic import ASSET_PATHS
+from ..errors import UsageError
+from ..usd.write.atomic import ASSET_PATHS
 
 if TYPE_CHECKING:
-    from .solver.contact.settings import ContactSettings
-    from .solver.frame.settings import SolveSettings
+    from ..solver.contact.settings import ContactSettings
+    from ..solver.frame.settings import SolveSettings
 
 AUTO = "auto"
 """The integrator that is chosen frame by frame; always known."""
@@ -126,7 +126,7 @@ class RefineOptions:
         }
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
         if self.weights:
-            from .solver.integrate.weights import weights_hash
+            from ..solver.integrate.weights import weights_hash
 
             values["weights"] = {"file": str(self.weights), "sha256": weights_hash(self.weights)}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
@@ -141,7 +141,7 @@ class RefineOptions:
 
     def contact_settings(self) -> ContactSettings:
         """The part that concerns contact."""
-        from .solver.contact.settings import ContactSettings
+        from ..solver.contact.settings import ContactSettings
 
         return ContactSettings(
             CONTACTS[self.contact], cloth=SELF_CONTACTS[self.self_contact], measured=self.report is not None
@@ -149,8 +149,8 @@ class RefineOptions:
 
     def solve_settings(self) -> SolveSettings:
         """The part that concerns the solver."""
-        from .solver.frame.settings import SolveSettings
-        from .solver.integrate import method_named
+        from ..solver.frame.settings import SolveSettings
+        from ..solver.integrate import method_named
 
         return SolveSettings(
             method=method_named(self.integrator, self.weights),
@@ -170,7 +170,7 @@ class RefineOptions:
             UsageError: An option is wrong.
         """
         if self.integrator != AUTO or self.weights is not None:
-            from .solver.integrate import method_named
+            from ..solver.integrate import method_named
 
             method_named(self.integrator, self.weights)
         for name, value, known in (

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .interrupts import SIGNALLED
+from ..interrupts import SIGNALLED
+from ..usd.write.atomic import write_text
+from ..version import __version__
 from .plain_json import to_json
-from .usd.write.atomic import write_text
-from .version import __version__
 
 FORMAT = 1
 """Version of the JSON's format; another one where a reader of the last one could fail. See report.schema.json."""

@@ -11,11 +11,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ..errors import LayerError, StageError
+from ...errors import LayerError, StageError
+from ...usd.read.reader import Shot
+from ...usd.write.atomic import write_text
 from ..options import PAGE_NAME, REPORT_NAME
 from ..report import RefineReport
-from ..usd.read.reader import Shot
-from ..usd.write.atomic import write_text
 from .document import document, table
 from .plot import SCRIPT, plot
 from .series import Series, add_jerk, read_series
@@ -107,7 +107,7 @@ def _pictures(report: RefineReport) -> str:
 
 def _picture(report: RefineReport, time: float | None) -> str:
     """One picture inside the page."""
-    draw = importlib.import_module("..preview", __package__).preview  # Needs an extra that a report can do without.
+    draw = importlib.import_module(".preview", __package__).preview  # Needs an extra that a report can do without.
     times = None if time is None else [time]
     with tempfile.TemporaryDirectory() as folder:
         file = draw(report.out, Path(folder) / "picture.png", shot=report.shot, times=times, size=SIZE)

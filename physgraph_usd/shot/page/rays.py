@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from .lanes import LEAST_QUERIES, Launch, start_warp
+from ...solver.mesh.lanes import LEAST_QUERIES, Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
 

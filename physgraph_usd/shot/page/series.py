@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LayerError, StageError
+from ...errors import LayerError, StageError
+from ...solver.frame.pipeline import Refiner
+from ...usd.check.readback import RefinedLayer
+from ...usd.read.reader import Shot
 from ..report import RefineReport
-from ..solver.frame.pipeline import Refiner
-from ..usd.check.readback import RefinedLayer
-from ..usd.read.reader import Shot
 
 Line = list[float | None]
 

@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from .errors import GarmentError, StageError
+from ..errors import GarmentError, StageError
+from ..solver.contact.crowding import Crowding, CrowdingMeter
+from ..solver.integrate import LEARNED
+from ..solver.mesh.defects import defects
+from ..solver.resolution import LevelChoice, carries_none, choose_levels, sample_frames
+from ..solver.scene import Frame, Garment, GarmentFrame
+from ..solver.strain import strained_parts, stretched
+from ..usd.read.reader import Shot
+from ..usd.read.survey import survey
+from ..usd.stage import GarmentSource
+from ..usd.times import within
+from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
 from .options import RefineOptions
 from .report import RefineReport, of_a_kind
-from .solver.contact.crowding import Crowding, CrowdingMeter
-from .solver.integrate import LEARNED
-from .solver.mesh.defects import defects
-from .solver.resolution import LevelChoice, carries_none, choose_levels, sample_frames
-from .solver.scene import Frame, Garment, GarmentFrame
-from .solver.strain import strained_parts, stretched
 from .untagged import bodies_beside, command_of, proposal, told_beside
-from .usd.read.reader import Shot
-from .usd.read.survey import survey
-from .usd.stage import GarmentSource
-from .usd.times import within
-from .usd.view import Stage
 
 
 def begin_report(

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-from .errors import PhysGraphError, SolveError, UsageError
-from .version import __version__, code_digest
+from ..errors import PhysGraphError, SolveError, UsageError
+from ..version import __version__, code_digest
 
 RETRIES = 2
 """How often a task is begun again after an error that nobody foresaw, such as a disk that was not there."""

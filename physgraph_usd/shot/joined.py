@@ -21,20 +21,20 @@ from typing import Any
 
 import numpy as np
 
-from .errors import LayerError
+from ..errors import LayerError
+from ..solver.frame.pipeline import Refiner
+from ..solver.mesh.lanes import start_warp
+from ..solver.scene import Frame
+from ..usd.read.reader import Shot
+from ..usd.stage import is_there
+from ..usd.write.seams import Look, Points, Seam, between
+from ..usd.write.stitch import SEAM_BOUND
+from ..usd.write.stitch import check_seams as look_at_seams
+from ..usd.write.stitch import stitch as stitch_layers
+from ..usd.write.track import to_local
 from .frames import Lead, Outcome
 from .options import RefineOptions
-from .solver.frame.pipeline import Refiner
-from .solver.mesh.lanes import start_warp
-from .solver.scene import Frame
 from .untagged import open_with_colliders
-from .usd.read.reader import Shot
-from .usd.stage import is_there
-from .usd.write.seams import Look, Points, Seam, between
-from .usd.write.stitch import SEAM_BOUND
-from .usd.write.stitch import check_seams as look_at_seams
-from .usd.write.stitch import stitch as stitch_layers
-from .usd.write.track import to_local
 
 _FINEST = 6
 _Pair = tuple[np.ndarray | None, np.ndarray | None]

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from .errors import LayerError, UsageError
+from ..errors import LayerError, UsageError
+from ..usd.write.atomic import make_file, temporary_path, write_text
+from ..words import counted
 from .lock import LOCK, FolderLock
-from .usd.write.atomic import make_file, temporary_path, write_text
-from .words import counted
 
 RUN = "run.json"
 """The file that says what decides the frames."""

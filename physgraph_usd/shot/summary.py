@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from .errors import PhysGraphError, UsageError
+from ..errors import PhysGraphError, UsageError
+from ..usd.write.atomic import check_place, write_text
+from ..version import __version__
 from .frames import kept_for
 from .plain_json import to_json
 from .report import DONE, FAILED, FORMAT, IN_PART, RefineReport
-from .usd.write.atomic import check_place, write_text
-from .version import __version__
 
 SCHEMA = Path(__file__).with_name("summary.schema.json")
 

@@ -10,15 +10,15 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
 
-from .errors import PhysGraphError
+from ..errors import PhysGraphError
+from ..usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
+from ..usd.provenance import asset_path, file_hashes, is_result_of, mute_refined, unsaved_layers
+from ..usd.stage import open_stage
+from ..usd.view import Stage, StageView
+from ..version import __version__, code_digest
 from .frames import frames_folder
 from .options import RefineOptions
 from .report import LOG, RefineReport
-from .usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
-from .usd.provenance import asset_path, file_hashes, is_result_of, mute_refined, unsaved_layers
-from .usd.stage import open_stage
-from .usd.view import Stage, StageView
-from .version import __version__, code_digest
 
 Job = tuple[str | Path, Path, RefineOptions]
 """A shot, the layer to write and options."""

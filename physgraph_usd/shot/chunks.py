@@ -16,7 +16,7 @@ from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
-from .errors import SolveError
+from ..errors import SolveError
 from .frames import FrameFolder, Lead, Outcome
 from .processes import POLL_SECONDS, Call, memory_is_named
 

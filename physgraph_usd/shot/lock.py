@@ -6,8 +6,8 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from .errors import LayerError
-from .usd.write.atomic import HOST, NO_LINK, check_no_link
+from ..errors import LayerError
+from ..usd.write.atomic import HOST, NO_LINK, check_no_link
 
 LOCK = "run.lock"
 """The file that is held; it says by whom."""

@@ -1,0 +1,1 @@
+"""A shot, from stage to layer: where reading, solving and writing meet."""
