@@ -17,8 +17,8 @@ from statistics import median
 
 from benchmarks.sleeve import say
 from physgraph_usd.samples import write_sample
-from physgraph_usd.tune.session import Shown, TuneSession
-from physgraph_usd.tune.values import TUNABLES
+from physgraph_usd.studio.session import Shown, TuneSession
+from physgraph_usd.studio.values import TUNABLES
 
 MOVED = ("stretchStiffness", "bendStiffness", "density", "guide:stiffness")
 MOVES, SHORT_MOVES = 24, 8

@@ -24,9 +24,9 @@ from physgraph_usd.cli import main
 from physgraph_usd.errors import PhysGraphError, UsageError
 from physgraph_usd.samples import write_sample
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.tune.loop import SolveLoop
-from physgraph_usd.tune.session import Shown, TuneSession
-from physgraph_usd.tune.values import TUNABLES, painted_on
+from physgraph_usd.studio.loop import SolveLoop
+from physgraph_usd.studio.session import Shown, TuneSession
+from physgraph_usd.studio.values import TUNABLES, painted_on
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.tag import tag
 
@@ -272,7 +272,7 @@ def test_changes_during_a_solve_are_solved_once_and_then_settled(session: TuneSe
 def test_the_page_in_a_browser(tmp_path: Path):
     pytest.importorskip("viser", reason="the page is served with viser")
     image = pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
-    from physgraph_usd.tune.page import TunePage
+    from physgraph_usd.studio.page import TunePage
 
     shot = cloth_shot(tmp_path / "sheet.usda", size=(8, 6))
     session = TuneSession(shot, garments=[CLOTH])

@@ -20,8 +20,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from physgraph_usd.tune.page import TunePage
-from physgraph_usd.tune.session import TuneSession
+from physgraph_usd.studio.page import TunePage
+from physgraph_usd.studio.session import TuneSession
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 FOREIGN = ("http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1", "http://127.0.0.1")

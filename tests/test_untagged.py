@@ -15,7 +15,7 @@ from stages import COLLIDER_API, GARMENT_API, add_sheet, add_skeleton, author, b
 
 from physgraph_usd.cli import main
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.tune.session import TuneSession
+from physgraph_usd.studio.session import TuneSession
 
 COUNTS = [4] * 6
 FACES = [0, 2, 3, 1, 4, 5, 7, 6, 0, 1, 5, 4, 2, 6, 7, 3, 0, 4, 6, 2, 1, 3, 7, 5]

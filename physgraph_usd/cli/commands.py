@@ -116,8 +116,8 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
 
     Prints the page's address, and serves it to this machine alone until it is interrupted.
     """
-    from ..tune.page import serve
-    from ..tune.session import TuneSession
+    from ..studio.page import serve
+    from ..studio.session import TuneSession
 
     with closing(TuneSession(shot, **options)) as session:
         if session.warning:
