@@ -16,11 +16,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from physgraph_usd.lab.train import record
+from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.weights import save_network
-from physgraph_usd.train import record
-from physgraph_usd.train.loop import TrainConfig, Trainer
 
 CONFIG = Path(record.__file__).parent / "physgraph.toml"
 BASE = ("secant", "metric", "metric1", "move1", "diagonal")

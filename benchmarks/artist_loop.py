@@ -18,7 +18,7 @@ from PIL import Image
 from pxr import Usd, UsdGeom
 
 from benchmarks.sleeve import say
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import preview
 from physgraph_usd.shot.refine import refine_shot

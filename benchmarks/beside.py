@@ -96,7 +96,7 @@ def walk_shot(*, sample: str, level: int, frames: int, out: str, shot: str | Non
     """Solve a shot's frames in order by whatever version is on the path, and write a line and the detail of each."""
     from benchmarks.contact_shots import groups_of  # noqa: PLC0415
     from benchmarks.temporal import detail_of  # noqa: PLC0415
-    from physgraph_usd.samples import write_sample  # noqa: PLC0415
+    from physgraph_usd.lab.samples import write_sample  # noqa: PLC0415
     from physgraph_usd.shot.options import RefineOptions  # noqa: PLC0415
     from physgraph_usd.solver.frame.pipeline import Refiner  # noqa: PLC0415
     from physgraph_usd.usd.read.reader import open_shot  # noqa: PLC0415

@@ -25,7 +25,7 @@ import click
 import numpy as np
 import torch
 
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.shot.settled import unsettled

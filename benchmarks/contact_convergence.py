@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 from benchmarks.sleeve import CORES, say
-from physgraph_usd.chart.problem import Problem
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.chart.problem import Problem
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.forces.base import ForceModule

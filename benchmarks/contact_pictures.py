@@ -21,7 +21,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from benchmarks.sleeve import say
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import label, surface_of
 from physgraph_usd.shot.page.raycast import BACKGROUND, View, draw, encode_color, fit_view

@@ -18,7 +18,7 @@ import torch
 from benchmarks.contact_shots import FORMS, SAMPLES, Sums, open_one, run
 from benchmarks.rows import Found, Row, run_alone, table, under
 from benchmarks.shots import frames_of, opened, problem_of
-from physgraph_usd.chart.problem import COLD, Problem
+from physgraph_usd.lab.chart.problem import COLD, Problem
 from physgraph_usd.solver.scene import Frame
 
 FRAMES = {True: 2, False: 5}

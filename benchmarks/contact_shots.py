@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.crossing_count import crossing_count
 from benchmarks.temporal import detail_of
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.pipeline import Refiner

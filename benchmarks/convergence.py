@@ -21,7 +21,8 @@ from pathlib import Path
 
 import torch
 
-from physgraph_usd.chart.reference import Reference
+from physgraph_usd.lab.chart.reference import Reference
+from physgraph_usd.lab.train.patches import PatchConfig, make_patches
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
@@ -33,7 +34,6 @@ from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.integrate.weights import FOLDER, load_network
 from physgraph_usd.solver.level import refine_garments
-from physgraph_usd.train.patches import PatchConfig, make_patches
 
 from .rows import Found, Row, run_alone, say, table
 from .unseen import cases, reference_of

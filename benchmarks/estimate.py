@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.usd.read.reader import open_shot

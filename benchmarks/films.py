@@ -24,7 +24,7 @@ from PIL import Image, ImageDraw
 from benchmarks.crossing_count import crossing_count
 from benchmarks.shots import opened, problem_of
 from benchmarks.sleeve import say
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import label, surface_of
 from physgraph_usd.shot.page.raycast import View, draw, fit_view

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from physgraph_usd.chart.reference import Reference
+from physgraph_usd.lab.chart.reference import Reference
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.integrate.base import Integrator
 from physgraph_usd.solver.integrate.guard import Guard

@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks.rows import Found, Row, run_alone, under
 from benchmarks.shots import frames_of, opened, problem_of
-from physgraph_usd.chart.problem import COLD
-from physgraph_usd.chart.reference import find_reference
+from physgraph_usd.lab.chart.problem import COLD
+from physgraph_usd.lab.chart.reference import find_reference
 from physgraph_usd.solver.level import Level
 
 TIME = 24.0

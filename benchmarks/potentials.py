@@ -23,8 +23,8 @@ import torch
 
 from benchmarks.rows import Found, Row, run_alone, table, under
 from benchmarks.shots import distances, frames_of, opened, problem_of
-from physgraph_usd.chart.problem import Problem, with_garments
-from physgraph_usd.chart.reference import Reference, find_reference
+from physgraph_usd.lab.chart.problem import Problem, with_garments
+from physgraph_usd.lab.chart.reference import Reference, find_reference
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import METHODS, Method

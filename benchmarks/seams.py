@@ -23,7 +23,7 @@ import numpy as np
 from pxr import Sdf
 
 from benchmarks.contact_shots import REAL, say
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.usd.read.reader import open_shot

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from physgraph_usd.chart.problem import Problem, plain_detail
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.chart.problem import Problem, plain_detail
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.colliders.sign import signed_distances
 from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.read.reader import Shot, open_shot

@@ -16,7 +16,7 @@ import torch
 
 from benchmarks.rows import Found, Row, run_alone, table
 from benchmarks.shots import frames_of, opened, problem_of
-from physgraph_usd.chart.problem import COLD, Problem
+from physgraph_usd.lab.chart.problem import COLD, Problem
 from physgraph_usd.solver.scene import Frame
 
 POSES = {"armpit": 15.0, "tshirt": 36.0}

@@ -5,7 +5,7 @@
 Prints the gap (Phi - Phi*) / (Phi0 - Phi*) of nested quasi-Newton against milliseconds, on the wall and of processor
 time, of all threads together, which other work on the machine lengthens less; force evaluation against torch autograd;
 and the whole frame's time, reading and writing included, against its solver time. Times are medians of one run; compare
-them as ratios. Phi* is that of `physgraph_usd.chart.reference`, as in every benchmark.
+them as ratios. Phi* is that of `physgraph_usd.lab.chart.reference`, as in every benchmark.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from pathlib import Path
 import torch
 
 from benchmarks.unseen import reference_of
-from physgraph_usd.chart.reference import Reference
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.chart.reference import Reference
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import prepare_device, refine_shot
 from physgraph_usd.solver.forces.base import ForceModule

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.rows import Found, Row, run_alone, say, table, under
 from benchmarks.shots import CORES, opened
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.frame.pipeline import Refiner

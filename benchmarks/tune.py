@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.sleeve import say
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.studio.session import Shown, TuneSession
 from physgraph_usd.studio.values import TUNABLES
 

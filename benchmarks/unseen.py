@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from physgraph_usd.chart.problem import ALONE, Problem
-from physgraph_usd.chart.reference import Reference, find_reference
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.chart.problem import ALONE, Problem
+from physgraph_usd.lab.chart.reference import Reference, find_reference
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from physgraph_usd.samples import SAMPLES, write_sample
+from physgraph_usd.lab.samples import SAMPLES, write_sample
 
 
 def main(folder: Path) -> None:

@@ -56,7 +56,7 @@ def real_data() -> Path:
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """A function from a sample's name to its shot file, written once per session; do not change the file."""
     pytest.importorskip("pxr", reason="samples are written with usd-core")
-    from physgraph_usd.samples import write_sample
+    from physgraph_usd.lab.samples import write_sample
 
     written: dict[str, Path] = {}
 

@@ -25,17 +25,17 @@ from pxr import Usd, UsdGeom
 from shots import cloth_shot, refine
 
 from physgraph_usd import cli
-from physgraph_usd.chart.journal import Journal
-from physgraph_usd.chart.measure import FURTHER, allowance, expected_ms, rungs
-from physgraph_usd.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
-from physgraph_usd.chart.options import LONG, SHORT, ChartOptions
-from physgraph_usd.chart.peers.run import PEERS, Peer, parse_peers
-from physgraph_usd.chart.plan import make_plan
-from physgraph_usd.chart.reference import Solutions
-from physgraph_usd.chart.run import chart_shot
-from physgraph_usd.chart.table import Chart, Point, typical
-from physgraph_usd.chart.words import settings
 from physgraph_usd.errors import UsageError
+from physgraph_usd.lab.chart.journal import Journal
+from physgraph_usd.lab.chart.measure import FURTHER, allowance, expected_ms, rungs
+from physgraph_usd.lab.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
+from physgraph_usd.lab.chart.options import LONG, SHORT, ChartOptions
+from physgraph_usd.lab.chart.peers.run import PEERS, Peer, parse_peers
+from physgraph_usd.lab.chart.plan import make_plan
+from physgraph_usd.lab.chart.reference import Solutions
+from physgraph_usd.lab.chart.run import chart_shot
+from physgraph_usd.lab.chart.table import Chart, Point, typical
+from physgraph_usd.lab.chart.words import settings
 from physgraph_usd.solver.integrate import METHODS, Method
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.scene import Frame
@@ -389,7 +389,7 @@ def test_the_command_prints_a_summary_and_tells_progress(made: tuple[Path, Path,
 
 @pytest.mark.parametrize("missing", ["matplotlib", "plotly"])
 def test_a_missing_library_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, missing: str):
-    for name in [name for name in sys.modules if name.startswith("physgraph_usd.chart")]:
+    for name in [name for name in sys.modules if name.startswith("physgraph_usd.lab.chart")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     result = CliRunner().invoke(cli.main, ["chart", "shot.usda", "-o", str(tmp_path / "out")])

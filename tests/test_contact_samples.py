@@ -18,10 +18,10 @@ from pxr import Usd
 from scipy.spatial import cKDTree
 from shots import faults, refine, sample_times
 
-from physgraph_usd.samples import write_sample
-from physgraph_usd.samples.panel import sew
-from physgraph_usd.samples.solids import box, join, lathe, off_box, off_torus, torus
-from physgraph_usd.samples.tshirt import SHIRT, dress
+from physgraph_usd.lab.samples import write_sample
+from physgraph_usd.lab.samples.panel import sew
+from physgraph_usd.lab.samples.solids import box, join, lathe, off_box, off_torus, torus
+from physgraph_usd.lab.samples.tshirt import SHIRT, dress
 from physgraph_usd.usd.write.plain import Look, PlainMesh, PlainStage
 
 DEEP = 1e-4
@@ -50,7 +50,7 @@ SHOTS = {
 
 @cache
 def build(name: str) -> PlainStage:
-    return import_module(f"physgraph_usd.samples.{name}").build()
+    return import_module(f"physgraph_usd.lab.samples.{name}").build()
 
 
 def of_role(name: str, role: str) -> list[PlainMesh]:

@@ -16,7 +16,7 @@ from pxr import Usd, UsdGeom
 from sheets import garment_of
 
 from physgraph_usd.cli import main
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.frame.group import Group

@@ -9,8 +9,8 @@ import pytest
 pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
 
 from benchmarks.front import SLOW_MS, TURNS, placed, timed
-from physgraph_usd.chart.problem import Solved
-from physgraph_usd.chart.table import quickest
+from physgraph_usd.lab.chart.problem import Solved
+from physgraph_usd.lab.chart.table import quickest
 
 
 def rows(*runs: tuple[str, int, float, float]) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from physgraph_usd.errors import StageError
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.frame.lead_in import lead_in

@@ -19,7 +19,7 @@ from sheets import rotation
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.integrate import METHODS, paper_network

@@ -19,7 +19,7 @@ from shots import CLOTH, TIMES, cloth_shot, command, faults, fine, refine, sampl
 from stages import COLLIDER_API, GARMENT_API, add_sheet, new_stage, save, sheet_points, vec3
 
 from physgraph_usd.errors import GarmentError, SolveError
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.colliders.pose import Collider, MeshPose
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.pipeline import Refiner

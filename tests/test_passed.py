@@ -13,7 +13,7 @@ from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API, vec3
 from touching import frame, measured, mesh_pose, refiner
 
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.sweep import Sweep, through_shape
 from physgraph_usd.solver.contact.passed import Passed

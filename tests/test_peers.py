@@ -13,11 +13,11 @@ pytest.importorskip("plotly", reason="charts are drawn with plotly")
 
 from shots import cloth_shot
 
-from physgraph_usd.chart.methods import UPSAMPLED
-from physgraph_usd.chart.options import ChartOptions
-from physgraph_usd.chart.peers.run import PEERS
-from physgraph_usd.chart.run import chart_shot
-from physgraph_usd.chart.table import Chart, Point
+from physgraph_usd.lab.chart.methods import UPSAMPLED
+from physgraph_usd.lab.chart.options import ChartOptions
+from physgraph_usd.lab.chart.peers.run import PEERS
+from physgraph_usd.lab.chart.run import chart_shot
+from physgraph_usd.lab.chart.table import Chart, Point
 
 VARIABLES = {
     "newton": "PHYSGRAPH_NEWTON_PYTHON",

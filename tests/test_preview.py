@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from physgraph_usd.errors import StageError, UsageError
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import preview
 from physgraph_usd.shot.page.raycast import Surface, draw, encode_color, fit_view

@@ -11,7 +11,7 @@ import torch
 from bodies import ball, together
 from folds import crumpled, frame_with, levels_of, named, refiner_with, square
 
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose

@@ -17,9 +17,9 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.samples import SAMPLES, write_sample
-from physgraph_usd.samples.grid import ease, quad_grid, springs
-from physgraph_usd.samples.panel import Cut, sew
+from physgraph_usd.lab.samples import SAMPLES, write_sample
+from physgraph_usd.lab.samples.grid import ease, quad_grid, springs
+from physgraph_usd.lab.samples.panel import Cut, sew
 from physgraph_usd.shot.page.rays import Rays
 from physgraph_usd.usd.write.plain import PlainMesh, PlainStage
 
@@ -28,7 +28,7 @@ GARMENT, COLLIDER = "PhysGraphGarmentAPI", "PhysGraphColliderAPI"
 
 def build(name: str) -> PlainStage:
     module, _, variant = name.partition("_")
-    make = import_module(f"physgraph_usd.samples.{module}").build
+    make = import_module(f"physgraph_usd.lab.samples.{module}").build
     return make(variant) if variant else make()
 
 

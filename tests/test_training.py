@@ -14,6 +14,11 @@ from click.testing import CliRunner, Result
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import UsageError
+from physgraph_usd.lab.train import loop, record
+from physgraph_usd.lab.train.bundle import Bundle, deal
+from physgraph_usd.lab.train.loop import TrainConfig, Trainer, loss_of, nested_gap
+from physgraph_usd.lab.train.patches import Patch, PatchConfig, describe, make_patches
+from physgraph_usd.lab.train.unroll import JointSystem, Twin, detached, unrolled
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.forces.contact import Contact
 from physgraph_usd.solver.integrate.base import Carry, System
@@ -21,11 +26,6 @@ from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.paper_network import PaperConfig
 from physgraph_usd.solver.integrate.weights import load_network, random_network
-from physgraph_usd.train import loop, record
-from physgraph_usd.train.bundle import Bundle, deal
-from physgraph_usd.train.loop import TrainConfig, Trainer, loss_of, nested_gap
-from physgraph_usd.train.patches import Patch, PatchConfig, describe, make_patches
-from physgraph_usd.train.unroll import JointSystem, Twin, detached, unrolled
 
 FEW = PatchConfig(count=3, levels=(1, 1), edges=(5, 6), reference_steps=20)
 TINY = """

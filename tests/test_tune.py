@@ -22,7 +22,7 @@ from shots import CLOTH, cloth_shot
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import PhysGraphError, UsageError
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio.loop import SolveLoop
 from physgraph_usd.studio.session import Shown, TuneSession

@@ -12,7 +12,7 @@ import torch
 from cloth import frame_of, group_of, sheet, wave
 from folds import frame_with, named, refiner_with, square
 
-from physgraph_usd.samples import write_sample
+from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.group import Group

@@ -150,7 +150,7 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
 @overwrite_option
 def sample(name: str, out: Path, *, overwrite: bool) -> None:
     """Write the sample shot NAME and print its path; an unknown name lists those there are."""
-    from ..samples import write_sample
+    from ..lab.samples import write_sample
 
     click.echo(write_sample(name, out, overwrite=overwrite))
 
@@ -190,8 +190,8 @@ def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) 
 @overwrite_option
 def chart(shot: str, out: Path, **options: Any) -> None:
     """Measure SHOT's frames by every method, draw speed against accuracy, and print a summary."""
-    from ..chart.options import ChartOptions
-    from ..chart.run import chart_shot
+    from ..lab.chart.options import ChartOptions
+    from ..lab.chart.run import chart_shot
 
     given = {name: value for name, value in options.items() if value not in (None, ())}
     done = chart_shot(shot, out, ChartOptions(**given, progress=tell))
@@ -208,8 +208,8 @@ def chart(shot: str, out: Path, **options: Any) -> None:
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
 def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
     """Train a learned integrator and print its weights' path."""
+    from ..lab.train.record import run_training
     from ..shot.refine import prepare_device
-    from ..train.record import run_training
 
     prepare_device(device)
     click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))

@@ -1,0 +1,1 @@
+"""Measured and made here: charts, training, sample shots; nothing above imports it."""

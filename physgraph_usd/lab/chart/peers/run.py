@@ -1,0 +1,218 @@
+"""Hands a frame's problem to a peer's own Python and takes its results as rows of the chart."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+
+from ....errors import SolveError, UsageError
+from ....solver.forces.base import ForceModule
+from ....solver.forces.bending import Bending
+from ....solver.forces.guide import Guide
+from ....solver.forces.stretch import Stretch
+from ....solver.frame.group import Group
+from ....solver.level import Level
+from ....solver.scene import Frame
+from ..journal import Journal
+from ..plan import Clock, Plan
+from ..problem import Problem
+from ..reference import Solutions
+
+HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A solver outside.
+
+    Attributes:
+        name: Its name in the chart.
+        adapter: The script that its Python runs.
+        note: What of the problem it was given, in words.
+        options: What its script is told beside the problem.
+        follows: Whether it computes where we do; otherwise on the CPU.
+    """
+
+    name: str
+    adapter: str
+    note: str
+    options: tuple[str, ...] = ()
+    follows: bool = False
+
+
+OURS = "our springs, hinges, guide and gravity; no bodies; 3 iterations a step"
+PEERS = {
+    "newton": Peer("Newton VBD", "newton_adapter.py", OURS, ("--solver", "vbd"), follows=True),
+    "newton-xpbd": Peer("Newton XPBD", "newton_adapter.py", OURS, ("--solver", "xpbd"), follows=True),
+    "blender": Peer(
+        "Blender cloth (own energy)",
+        "blender_adapter.py",
+        "an energy of its own, made from our springs, hinges, gravity and rest shape, with a goal at each vertex in "
+        "place of the guide; no bodies; its gap is by our potential and tells how far the two energies are apart, too: "
+        "compare its strain and its shape",
+    ),
+}
+"""Peers by the name that ``--peer`` takes."""
+
+
+def parse_peers(given: Sequence[str]) -> list[tuple[Peer, str]]:
+    """Peers with the Python of each, from ``NAME=PYTHON``.
+
+    Raises:
+        UsageError: A name is unknown or there is no such Python.
+    """
+    found = []
+    for each in given:
+        name, _, python = each.partition("=")
+        if name not in PEERS or not python:
+            raise UsageError(f"peer '{each}': write NAME=PYTHON; known names: {', '.join(PEERS)}")
+        if not Path(python).is_file():
+            raise UsageError(f"peer '{each}': {python} is no program; give the Python that has {name}")
+        found.append((PEERS[name], python))
+    return found
+
+
+def measure_peers(
+    journal: Journal,
+    problems: tuple[Problem, Problem],
+    frames: Sequence[Frame],
+    *,
+    peers: Sequence[tuple[Peer, str]],
+    plan: Plan,
+    clock: Clock,
+    clock_name: str,
+    steps: Sequence[int],
+    solutions: Solutions,
+) -> None:
+    """Measure peers into the journal, frame by frame.
+
+    Args:
+        journal: Where rows go.
+        problems: The problem in float32, whose terms are handed over, and in float64, which judges.
+        frames: The frames.
+        peers: The peers and their Pythons.
+        plan: Repeats and the longest time.
+        clock: Says what is going on.
+        clock_name: "wall" or "cpu".
+        steps: Budgets.
+        solutions: What the results are compared to.
+    """
+    timed, judge = problems
+    for peer, python in peers:
+        for frame in frames:
+            key = {"method": peer.name, "frame": frame.time}
+            if journal.one("point", **key) or journal.one("failed", **key):
+                continue
+            clock.say(peer.name)
+            try:
+                found = _run(peer, python, timed, frame, plan=plan, clock_name=clock_name, steps=steps)
+            except SolveError as error:
+                journal.add("failed", steps=0, error=str(error), **key)
+                continue
+            for nested, count, points, times in found:
+                name = f"{peer.name}, nested" if nested else peer.name
+                judged = asdict(judge.judge(frame, points)) | {"apart_mm": solutions.apart_mm(frame, points)}
+                about = {"integrator": peer.name, "nested": nested, "note": peer.note, "made": count}
+                for repeat, ms in enumerate(times):
+                    more = judged if not repeat else {}
+                    journal.add(
+                        "point", method=name, frame=frame.time, steps=count, repeat=repeat, ms=ms, **about, **more
+                    )
+
+
+def _run(
+    peer: Peer, python: str, problem: Problem, frame: Frame, *, plan: Plan, clock_name: str, steps: Sequence[int]
+) -> list[tuple[bool, int, tuple[np.ndarray, ...], list[float]]]:
+    """Results of one frame: nested or flat, steps, positions [m] and times [ms]."""
+    parts = problem.refiner.parts_of(frame)
+    if len(parts) != 1:
+        raise SolveError(f"{peer.name} is given one problem a frame, and here are {len(parts)} that do not touch")
+    [part] = parts
+    group = problem.refiner.group_of(part)
+    with tempfile.TemporaryDirectory() as folder:
+        given, result = Path(folder) / "problem.npz", Path(folder) / "result.npz"
+        np.savez(given, **dict(_problem(problem, frame, part)))
+        line = [python, str(HERE / peer.adapter), str(given), str(result)]
+        line += ["--steps", ",".join(map(str, steps)), "--repeats", str(plan.repeats)]
+        line += ["--most-ms", str(plan.most_ms), "--clock", clock_name, *peer.options]
+        if peer.follows:
+            line += ["--device", str(group.levels[-1].device)]
+        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        if done.returncode:
+            last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
+            raise SolveError(f"{peer.name} ended with code {done.returncode}: {last}")
+        with np.load(result) as data:
+            return list(_results(data, group, frame, part))
+
+
+def _results(
+    data: Any, group: Group, frame: Frame, part: tuple[int, ...]
+) -> Iterator[tuple[bool, int, tuple[np.ndarray, ...], list[float]]]:
+    origin = np.concatenate([frame.garments[index].points for index in part]).mean(axis=0)
+    for name in data.files:
+        kind, nested, steps = name.split("_")
+        if kind == "x":
+            world = data[name] + origin
+            points = {index: world[span] for index, span in zip(part, group.levels[-1].spans, strict=True)}
+            times = data[f"ms_{nested}_{steps}"].tolist()
+            yield nested == "1", int(steps), tuple(points[index] for index in sorted(points)), times
+
+
+def _problem(problem: Problem, frame: Frame, part: tuple[int, ...]) -> Iterator[tuple[str, Any]]:
+    """The arrays of every level, under names that end in its number."""
+    group, chains = problem.refiner.group_of(part), [problem.refiner.refinements[index] for index in part]
+    modules, coarse = group.modules([frame.garments[index] for index in part])
+    yield "levels", np.array(len(group.levels))
+    for index, (level, module) in enumerate(zip(group.levels, modules, strict=True)):
+        yield from _level(index, level, module, level.base.apply(coarse))
+        if index:
+            maps = [
+                chain[index - 1].linear if index <= len(chain) else sp.identity(span.stop - span.start, format="csr")
+                for chain, span in zip(chains, level.spans, strict=True)
+            ]
+            yield from _sparse("map_", index, sp.csr_matrix(sp.block_diag(maps)))
+
+
+def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) -> Iterator[tuple[str, Any]]:
+    """Springs, hinges and the linear rest of one level."""
+    springs = next((term for term in module.forces if isinstance(term, Stretch)), None)
+    hinges = next(term for term in module.forces if isinstance(term, Bending))
+    guide = next(term for term in module.forces if isinstance(term, Guide))
+    others = [term for term in module.forces if term not in (springs, hinges)]
+    if springs is None or len(others) != 2:
+        raise SolveError("the peer has no membrane of triangles, which this garment asks for")
+    load = torch.zeros_like(base)
+    for term in others:
+        term.add_force(base, load)
+    values = {
+        "base": base,
+        "rest": level.rest,
+        "triangles": level.triangles,
+        "load": load,
+        "free": level.free[:, 0],
+        "edges": level.edges,
+        "rest_length": level.rest_length,
+        "spring": springs.stiffness,
+        "hinges": level.hinges,
+        "rest_angle": level.rest_angle,
+        "hinge": hinges.weight,
+    }
+    for name, value in values.items():
+        yield f"{name}{index}", value.double().cpu().numpy() if value.is_floating_point() else value.cpu().numpy()
+    yield f"bound{index}", guide.rest_matrix().diagonal()
+    yield f"diagonal{index}", springs.rest_matrix().diagonal()
+    yield from _sparse("", index, guide.hessian())
+
+
+def _sparse(prefix: str, index: int, matrix: sp.csr_matrix) -> Iterator[tuple[str, Any]]:
+    yield f"{prefix}values{index}", matrix.data
+    yield f"{prefix}columns{index}", matrix.indices
+    yield f"{prefix}starts{index}", matrix.indptr

@@ -1,0 +1,176 @@
+"""Frames of a shot that can be solved by any method, as often as one likes, and judged by one ruler."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...shot.options import RefineOptions
+from ...solver.contact.settings import ContactSettings
+from ...solver.frame.pipeline import Refiner
+from ...solver.frame.settings import SolveSettings
+from ...solver.frame.values import FrameInput, State
+from ...solver.level import Level
+from ...solver.scene import Frame, Scene
+from .judge import Judgement, judge
+
+DEFAULT = RefineOptions().solve_settings()
+"""What `refine` does by default."""
+COLD = replace(DEFAULT, temporal="off")
+"""The same, each frame by itself."""
+ALONE = replace(COLD, contact=ContactSettings("off", cloth="off"))
+"""The same of cloth that touches nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """One frame, solved.
+
+    Attributes:
+        points: Fine world positions [m] of each garment.
+        milliseconds: Time of preparing and solving the frame, without reading, writing and telemetry.
+        elapsed: Wall time of all of it [ms].
+        steps: Steps made at the finest levels.
+        waited: Milliseconds that its threads waited for a core that others had, or None where that is not known.
+    """
+
+    points: tuple[np.ndarray, ...]
+    milliseconds: float
+    elapsed: float
+    steps: int
+    waited: float | None
+
+
+class Problem:
+    """The frames of a scene with the solver's levels built, in one precision.
+
+    Attributes:
+        scene: The scene.
+        refiner: The solver.
+        has_bodies: Whether a garment may touch something.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        levels: Sequence[int],
+        *,
+        device: str,
+        lanes: int,
+        dtype: torch.dtype = torch.float32,
+        clock: str = "wall",
+    ) -> None:
+        """Build the levels.
+
+        Args:
+            scene: The scene; its gain of detail is left out, for it is no part of the potential.
+            levels: Subdivisions of each garment.
+            device: "cpu" or a CUDA device.
+            lanes: Most threads of a kernel.
+            dtype: Scalar type of the solve.
+            clock: "wall", or "cpu" to count the processor's time alone.
+        """
+        self._clock = clock
+        garments = tuple(replace(each, detail_scale=np.ones_like(each.detail_scale)) for each in scene.garments)
+        scene = replace(scene, garments=garments)
+        self.scene = scene
+        self.refiner = Refiner(scene, DEFAULT, levels=levels, dtype=dtype, device=device, lanes=lanes)
+        self.has_bodies = any(garment.colliders for garment in garments)
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of fine vertices."""
+        chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
+        return sum(chain[-1].mesh.vertex_count if chain else each.mesh.vertex_count for each, chain in chains)
+
+    def solve(self, frame: Frame, settings: SolveSettings) -> Solved:
+        """Solve a frame from a cold start."""
+        self.refiner.use(settings)
+        return self.next(frame)
+
+    def next(self, frame: Frame) -> Solved:
+        """Solve a frame from where the last one ended, with the settings in use."""
+        before, began, worked = _waited(), time.perf_counter(), time.process_time()
+        state = self.refiner.solve(frame)
+        after, elapsed, worked = _waited(), time.perf_counter() - began, time.process_time() - worked
+        entries: list[Any] = list({id(entry): entry for entry in state.telemetry}.values())
+        spent = [value for each in entries for name, value in each.get("milliseconds", {}).items() if name != "measure"]
+        reports = [each for entry in entries for each in entry.get("levels", [])]
+        last = max((each["level"] for each in reports), default=0)
+        steps = sum(each["steps"] for each in reports if each["level"] == last)
+        waited = None if before is None or after is None else after - before
+        share = worked / elapsed if self._clock == "cpu" else 1.0
+        points = tuple(p for p in state.points if p is not None)
+        return Solved(points, share * sum(spent), 1e3 * elapsed, steps, waited)
+
+    def go_on(
+        self, frame: Frame, settings: SolveSettings, kept: Sequence[State | None]
+    ) -> tuple[tuple[np.ndarray, ...], list[State]]:
+        """Solve a frame from a kept result of its own; cold where that is None.
+
+        Returns:
+            Fine world positions [m] of each garment, and what to go on from, for each part.
+        """
+        self.refiner.use(replace(settings, temporal="warm"))
+        points: dict[int, np.ndarray] = {}
+        states = []
+        for part, own in zip(self.refiner.parts_of(frame), kept, strict=True):
+            frames, touching = [frame.garments[index] for index in part], self.refiner.touching(part, frame)
+            solved = self.refiner.group_of(part).solve(FrameInput(frames, frame.time, touching), own)
+            points.update(zip(part, solved.points, strict=True))
+            states.append(solved.state)
+        return tuple(points[index] for index in sorted(points)), states
+
+    def judge(self, frame: Frame, points: Sequence[np.ndarray], settings: SolveSettings = COLD) -> Judgement:
+        """Energy, strain and contact of fine world positions [m], one array a garment, in a potential and a contact."""
+        self.refiner.use(settings)
+        return judge(self.refiner, frame, points)
+
+    def upsampled(self, frame: Frame, *, smooth: bool) -> tuple[np.ndarray, ...]:
+        """The cage's fine positions [m], by the linear or by the smooth map, without any physics."""
+        return self._of_finest(
+            frame,
+            lambda level, points: np.asarray((level.smooth_from_coarse if smooth else level.from_coarse) @ points),
+        )
+
+    def spacing(self, frame: Frame) -> tuple[np.ndarray, ...]:
+        """Mean rest edge at each fine vertex [m], one array a garment."""
+        return self._of_finest(frame, lambda level, _: level.spacing.double().cpu().numpy())
+
+    def _of_finest(self, frame: Frame, measure: Callable[[Level, np.ndarray], np.ndarray]) -> tuple[np.ndarray, ...]:
+        """A value per fine vertex from the finest levels and the cages' points, one array a garment."""
+        found: dict[int, np.ndarray] = {}
+        for part in self.refiner.parts_of(frame):
+            finest = self.refiner.group_of(part).levels[-1]
+            values = measure(finest, np.concatenate([frame.garments[index].points for index in part]))
+            found.update((index, values[span]) for index, span in zip(part, finest.spans, strict=True))
+        return tuple(found[index] for index in sorted(found))
+
+
+def plain_detail(frame: Frame) -> Frame:
+    """A frame whose result is the solution itself, whatever gain an artist gave its detail."""
+    return replace(frame, garments=tuple(replace(garment, detail=1.0) for garment in frame.garments))
+
+
+def with_garments(frame: Frame, change: Callable[[Any], Any]) -> Frame:
+    """A frame with every garment's values changed."""
+    return replace(frame, garments=tuple(change(garment) for garment in frame.garments))
+
+
+def _waited() -> float | None:
+    """Milliseconds that this process's threads have been ready to run and had no core; Linux alone tells."""
+    tasks = Path("/proc/self/task")
+    if not tasks.is_dir():
+        return None
+    total = 0
+    for file in tasks.glob("*/schedstat"):
+        with suppress(FileNotFoundError, ProcessLookupError):
+            total += int(file.read_text().split()[1])
+    return 1e-6 * total

@@ -1,0 +1,198 @@
+"""Phi*: the least energy known for a frame (DESIGN 4.5). One function for all charts and benchmarks.
+
+Cloth buckles in many ways, and a descent ends in the one that its start lies nearest to. So several are begun, in
+float64: each integrator of `STARTS` with its steps, then quasi-Newton at the finest level, for as long as that lowers
+the energy; last, Newton from each that was among the best two of those tried until then, as a search that ends early
+goes on from no other. Where a method that is measured finds less, that is Phi* in the end.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...solver.frame.settings import SolveSettings
+from ...solver.frame.values import State
+from ...solver.integrate import METHODS
+from ...solver.scene import Frame
+from .problem import COLD, Problem
+
+STARTS = (
+    ("quasi-newton", 6),
+    ("quasi-newton-flat", 48),
+    ("physgraph", 48),
+    ("quasi-newton", 24),
+    ("lbfgs", 48),
+    ("quasi-newton", 3),
+    ("quasi-newton", 96),
+)
+"""Integrators and steps: unlike one another, and what found the least first, for a short search ends early."""
+SHORT, LEAST = 3, 2
+"""How many of them a short search takes, and one whose time is out: with one alone nobody knows how good it is."""
+ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10
+"""How a start goes on, how often at most, and how often more where it is one of the finalists."""
+NEWTON, POLISHES = ("newton", 8), 6
+FINALISTS = 2
+"""How many starts of a search, and of each beginning of it, Newton goes on from."""
+SETTLED = 2e-4
+"""Fall of the energy, over the whole fall, under which going on is not worth it: gaps are told to a thousandth."""
+SOLUTION = "chart.solution.{}.npz"
+DESCENT = 0.6
+"""Part of the time after which no start is begun."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The least energy known for a frame.
+
+    Attributes:
+        start: Energy of the upsampled cage [J].
+        least: The least energy [J].
+        energies: The same by term [J].
+        by: Who found it.
+        apart: How far the least of the other starts lies above it, over the whole fall; None where there was no other.
+        seconds: Time spent [s].
+        points: Fine world positions [m] of each garment that have it.
+    """
+
+    start: float
+    least: float
+    energies: dict[str, float]
+    by: str
+    apart: float | None = None
+    seconds: float = 0.0
+    points: tuple[np.ndarray, ...] = field(repr=False, default=())
+
+    @staticmethod
+    def of(plain: dict[str, Any]) -> Reference:
+        """What `plain` gave."""
+        return Reference(**{each.name: plain[each.name] for each in fields(Reference) if each.name in plain})
+
+    def plain(self) -> dict[str, Any]:
+        """Ready for JSON, without the positions."""
+        return {name: value for name, value in vars(self).items() if name != "points"}
+
+    def gap(self, energy: float) -> float:
+        """(Phi - Phi*) / (Phi0 - Phi*) of an energy [J]."""
+        return (energy - self.least) / max(self.start - self.least, 1e-30)
+
+    def lowered(self, energies: dict[str, float], by: str) -> Reference:
+        """What is known when a method came to energies by term [J]: itself, unless those are less."""
+        energy = sum(energies.values())
+        if not energy < self.least:
+            return self
+        apart = (self.least - energy) / max(self.start - energy, 1e-30)
+        return replace(self, least=energy, by=by, apart=apart, energies=energies, points=())
+
+    def __str__(self) -> str:
+        """Phi*, who found it, and how well it is known."""
+        other = "nobody else looked" if self.apart is None else f"the next best ends {self.apart:.2%} of the fall above"
+        return f"Phi* {1e3 * self.least:.5g} mJ by {self.by}; {other}"
+
+
+class Solutions:
+    """The positions of each frame's reference, in files beside the chart's rows: a chart that goes on has them, too."""
+
+    def __init__(self, folder: Path, *, fresh: bool) -> None:
+        """Take those of a folder.
+
+        Args:
+            folder: Where they lie.
+            fresh: Drop what is there.
+        """
+        self._folder = folder
+        self._known: dict[float | None, tuple[np.ndarray, ...]] = {}
+        for file in folder.glob(SOLUTION.format("*")) if fresh else ():
+            file.unlink()
+
+    def keep(self, time: float | None, points: Sequence[np.ndarray]) -> None:
+        """Keep the fine world positions [m] of a frame, one array a garment."""
+        self._known.pop(time, None)
+        np.savez(self._file(time), *points)
+
+    def apart_mm(self, frame: Frame, points: Sequence[np.ndarray]) -> float | None:
+        """RMS distance of fine positions [m] from the frame's reference [mm]; None where none was kept."""
+        file = self._file(frame.time)
+        if frame.time not in self._known and file.exists():
+            with np.load(file) as data:
+                self._known[frame.time] = tuple(data.values())
+        known = self._known.get(frame.time)
+        return None if known is None else rms_mm(points, known)
+
+    def _file(self, time: float | None) -> Path:
+        return self._folder / SOLUTION.format("still" if time is None else f"{time:g}")
+
+
+def rms_mm(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
+    """RMS distance between two results, arrays of positions [m], shape (V, 3) each [mm]."""
+    apart = np.concatenate([p - q for p, q in zip(a, b, strict=True)])
+    return 1e3 * float(np.sqrt(np.square(apart).sum(axis=1).mean()))
+
+
+class _Descent:
+    """Ever longer runs from one start; the best is kept."""
+
+    def __init__(self, problem: Problem, frame: Frame, settings: SolveSettings, *, start: float) -> None:
+        self._problem, self._frame, self._settings, self._start = problem, frame, settings, start
+        self._kept: Sequence[State | None] = [None] * len(problem.refiner.parts_of(frame))
+        self.by, self.energy = "", math.inf
+        self.energies: dict[str, float] = {}
+        self.points: tuple[np.ndarray, ...] = ()
+
+    def go_on(self, name: str, method: tuple[str, int], *, most: int, until: float = math.inf) -> _Descent:
+        """Make so many runs at most, while there is time and each lowers the energy by much."""
+        for _ in range(most):
+            if time.perf_counter() > until:
+                break
+            settings = replace(self._settings, method=METHODS[method[0]], steps=method[1], tolerance=0.0)
+            points, kept = self._problem.go_on(self._frame, settings, self._kept)
+            found, before = self._problem.judge(self._frame, points, self._settings), self.energy
+            if found.energy < before:
+                self.by += name if not self.by.endswith(name) else ""
+                self.energy, self.energies, self.points, self._kept = found.energy, found.energies, points, kept
+            if not before - found.energy > SETTLED * (self._start - found.energy):
+                break
+        return self
+
+
+def _finalists(runs: Sequence[_Descent]) -> list[_Descent]:
+    """The best of all and the best of each beginning: what a search that ends earlier goes on from is among them."""
+    led = (run for k, run in enumerate(runs) if sum(each.energy < run.energy for each in runs[:k]) < FINALISTS)
+    return sorted(led, key=lambda run: run.energy)
+
+
+def find_reference(
+    problem: Problem, frame: Frame, *, settings: SolveSettings = COLD, seconds: float = math.inf, short: bool = False
+) -> Reference:
+    """Look for the least energy of a frame.
+
+    Args:
+        problem: The problem in float64.
+        frame: The frame.
+        settings: Its potential and contact.
+        seconds: Time to spend; one run may take longer. Without an end the answer depends on no machine's speed.
+        short: Whether to try fewer starts.
+    """
+    began = time.perf_counter()
+    start = problem.judge(frame, problem.upsampled(frame, smooth=False), settings).energy
+    runs: list[_Descent] = []
+    for method in STARTS[: SHORT if short else None]:
+        if len(runs) >= LEAST and time.perf_counter() - began > DESCENT * seconds:
+            break
+        descent = _Descent(problem, frame, settings, start=start).go_on(
+            f"{method[0]}, {method[1]} steps", method, most=1
+        )
+        runs.append(descent.go_on(", and on", ON, most=ROUNDS, until=began + DESCENT * seconds))
+    for each in _finalists(runs):
+        each.go_on(", and on", ON, most=MORE, until=began + seconds)
+        each.go_on(", and Newton", NEWTON, most=POLISHES, until=began + seconds)
+    best, *others = sorted(runs, key=lambda run: run.energy)
+    apart = (others[0].energy - best.energy) / max(start - best.energy, 1e-30) if others else None
+    spent = round(time.perf_counter() - began, 3)
+    return Reference(start, best.energy, best.energies, best.by, apart, spent, best.points)

@@ -1,0 +1,201 @@
+"""`chart_shot`: measures methods and budgets on a shot and writes the chart."""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...errors import UsageError
+from ...shot.options import RefineOptions
+from ...shot.refine import MOST_LANES, prepare_device
+from ...shot.untagged import open_with_colliders
+from ...solver.resolution import choose_levels, sample_frames
+from ...solver.scene import Frame, Scene
+from ...usd.files import check_targets, files_of
+from ...usd.provenance import file_hashes
+from ...usd.read.reader import Shot
+from ...usd.write.atomic import check_place
+from ...version import __version__
+from .journal import NAME as JOURNAL
+from .journal import Journal
+from .measure import measure_curves, rungs
+from .methods import Curve, find_curves
+from .options import LONG, ChartOptions
+from .page import write_page
+from .peers.run import measure_peers, parse_peers
+from .plan import Clock, Plan, make_plan
+from .plot import draw_chart
+from .problem import COLD, Problem, plain_detail
+from .reference import Solutions, find_reference
+from .table import Chart, collate
+from .terms import RUN, Bench, measure_terms
+
+DEFAULTS = ChartOptions()
+WRITTEN = ("chart.png", "chart.svg", "chart.html", "chart.csv", "chart.json")
+"""What a chart leaves beside its rows."""
+MOST_PEER_STEPS = 1024
+"""Largest budget of a solver outside."""
+
+
+def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEFAULTS) -> Chart:
+    """Chart speed against accuracy on a shot.
+
+    Args:
+        shot: The stage to read; never edited.
+        folder: Where the chart goes; one that was begun there goes on.
+        options: What to measure and how much.
+
+    Returns:
+        The chart. Written are ``chart.png``, ``chart.svg``, ``chart.html``, ``chart.csv`` and ``chart.json``, and
+        ``chart.rows.jsonl`` with every single measurement.
+
+    Raises:
+        UsageError: An option is wrong, or the folder holds the chart of another shot.
+        StageError: The stage cannot be read as asked.
+        SolveError: A frame cannot be solved.
+    """
+    options.check()
+    parse_peers(options.peers)
+    prepare_device(options.device)
+    folder = Path(folder)
+    _check_folder(folder, shot, overwrite=options.overwrite)
+    opened = open_with_colliders(
+        str(shot),
+        garments=options.garments,
+        colliders=options.colliders,
+        frames=options.frames,
+        level=options.level,
+        overrides=options.overrides,
+        rest_frame=options.rest_frame,
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        journal = _measure(opened, folder, options)
+    finally:
+        opened.close()
+    chart = collate(journal)
+    chart.write(folder)
+    draw_chart(chart, folder)
+    write_page(chart, folder / "chart.html")
+    return chart
+
+
+def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
+    """Refuse to write over what the shot is made of, and over a chart whose rows are gone."""
+    files = [folder / name for name in (*WRITTEN, JOURNAL)]
+    check_targets([("the chart", file) for file in files], files_of(shot))
+    there = next((file for file in files if file.exists()), None)
+    if there is not None and not overwrite and not files[-1].exists():
+        raise UsageError(f"{there} exists; choose another folder or replace it by --overwrite")
+    for file in files:
+        check_place(file)
+
+
+def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
+    """Measure what is not yet in the folder."""
+    clock = Clock(options.size().minutes, options.progress)
+    clock.say("reading and building")
+    levels = tuple(choice.level for choice in choose_levels(opened.scene, sample_frames(opened.scene, opened.frame)))
+
+    def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:
+        lanes = min(MOST_LANES, os.cpu_count() or 1) if options.clock == "wall" else 1
+        return Problem(scene, levels, device=options.device, lanes=lanes, dtype=dtype, clock=options.clock)
+
+    problems = build(opened.scene, levels), build(opened.scene, levels, torch.float64)
+    about = _about(opened, levels, options) | {"vertices": problems[0].vertex_count}
+    journal = Journal(folder, about, overwrite=options.overwrite)
+    solutions = Solutions(folder, fresh=not journal.rows("reference"))
+    curves = find_curves(options.methods)
+    plan = _plan(journal, problems, _frame(opened, _times(opened, 1)[0]), curves=curves, options=options)
+    clock.expect(60.0 * plan.minutes)
+    frames = tuple(_frame(opened, time) for time in _times(opened, plan.frames))
+    for frame in frames:
+        if not journal.one("reference", frame=frame.time):
+            clock.say("the least energy of a frame")
+            found = find_reference(problems[1], frame, seconds=plan.reference_seconds)
+            solutions.keep(frame.time, found.points)
+            journal.add("reference", frame=frame.time, **found.plain())
+    place: dict[str, Any] = {"plan": plan, "clock": clock, "solutions": solutions}
+    measure_curves(journal, problems, frames, curves=curves, **place)
+    budgets = [steps for steps in rungs(plan.growth) if steps <= MOST_PEER_STEPS]
+    place |= {"peers": parse_peers(options.peers), "clock_name": options.clock, "steps": budgets}
+    measure_peers(journal, problems, frames, **place)
+    run = tuple(_frame(opened, time) for time in _run_up_to(opened, frames[-1].time))
+    bench = Bench(*problems, opened.scene, levels, frames=frames, run=run, build=build)
+    measure_terms(journal, bench, clock)
+    return journal
+
+
+def _plan(
+    journal: Journal,
+    problems: tuple[Problem, Problem],
+    frame: Frame,
+    *,
+    curves: Sequence[Curve],
+    options: ChartOptions,
+) -> Plan:
+    """The plan of a chart that was begun, or a new one from a probe of a frame."""
+    if known := journal.one("plan"):
+        return Plan(**known["plan"])
+    timed, judge = problems
+    spent = [timed.solve(frame, COLD) for _ in range(3)]
+    judge.judge(frame, spent[-1].points)
+    began = time.perf_counter()
+    judge.judge(frame, spent[-1].points)
+    costs = {
+        "curves": len(curves),
+        "default_ms": statistics.median(each.milliseconds for each in spent[1:]),
+        "elapsed_ms": statistics.median(each.elapsed for each in spent[1:]),
+        "judge_ms": 1e3 * (time.perf_counter() - began),
+        "least_ms": timed.solve(frame, replace(COLD, steps=1, tolerance=0.0)).elapsed,
+    }
+    plan = make_plan(options.size(), **costs)
+    journal.add("plan", plan=plan.plain(), long_minutes=make_plan(LONG, **costs).minutes)
+    return plan
+
+
+def _about(opened: Shot, levels: Sequence[int], options: ChartOptions) -> dict[str, Any]:
+    """What is measured: rows of anything else do not belong to this chart."""
+    device = options.device
+    name = torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.processor()
+    return {
+        "shot": Path(opened.path).name,
+        "version": __version__,
+        "levels": list(levels),
+        "device": device,
+        "processor": name or platform.machine(),
+        "cores": os.cpu_count(),
+        "clock": options.clock,
+        "default": {"integrator": RefineOptions().integrator, "steps": COLD.steps, "tolerance": COLD.tolerance},
+        "options": options.plain(),
+        "frames": list(options.frames or ()),
+        "inputs": file_hashes(opened.stage, Path(opened.path).resolve().parent),
+    }
+
+
+def _frame(opened: Shot, time: float | None) -> Frame:
+    return plain_detail(opened.frame(time))
+
+
+def _times(opened: Shot, count: int) -> list[float | None]:
+    """Frames spread over the shot, the last one always among them."""
+    times = opened.scene.times
+    if not times:
+        return [None]
+    picks = np.unique(np.linspace(0, len(times) - 1, min(count, len(times)) + 1).round().astype(int)[1:])
+    return [times[i] for i in picks]
+
+
+def _run_up_to(opened: Shot, time: float | None) -> list[float | None]:
+    """Frames in a row that end at a time code."""
+    times: list[float | None] = list(opened.scene.times)
+    return times[max(0, times.index(time) + 1 - RUN) : times.index(time) + 1] if time in times else []

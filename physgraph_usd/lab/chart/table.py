@@ -1,0 +1,307 @@
+"""Rows to curves: gaps, medians, who is fastest to a gap, and whether refine's default is on the front."""
+
+from __future__ import annotations
+
+import csv
+import math
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from ...shot.plain_json import to_json
+from .journal import Journal
+from .methods import DEFAULT
+from .reference import Reference
+
+GAPS = (0.1, 0.03, 0.01)
+"""Gaps to which the time is told."""
+JUDGED = 0.03
+"""The one by which methods are put in order."""
+TOLERANCE = 1.1
+"""Times that differ by less than this factor count as equal: medians of a few runs are no better."""
+BUSY = 0.1
+"""Time waited for a core, over the time measured, from which a reader is told."""
+TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method with one budget.
+
+    Attributes:
+        method: The curve's name.
+        integrator: Name of the integrator, "" where none was asked for by name.
+        nested: Whether coarse levels are solved first.
+        steps: Steps at the finest level that it had.
+        made: Steps that it made there, mean over the frames.
+        tolerance: Remaining move at which it was to stop [edge lengths]; 0 where it took all its steps.
+        ms: Milliseconds a frame: `typical` over the repeats, mean over the frames.
+        ms_median: The same with the median of all repeats.
+        ms_least: The same of the fastest repeats.
+        gap: (Phi - Phi*) / (Phi0 - Phi*), both summed over the frames.
+        energy: Phi, mean over the frames [J].
+        energies: The same by term [J].
+        strain: The edges' 99th percentile, the worst frame's.
+        inside: Vertices inside bodies, summed over the frames.
+        percent: Their share.
+        deepest_mm: Depth of the deepest [mm].
+        crossings: Edges through faces, of cloth and bodies, summed over the frames.
+        tangles: Edges of cloth through faces of cloth, summed over the frames.
+        frames: Number of frames.
+        repeats: Number of times that the time was taken.
+        note: What a solver outside was given of the problem, "" for ours.
+        apart_mm: RMS distance from the reference's positions [mm], mean over the frames; None where they are not known.
+    """
+
+    method: str
+    integrator: str
+    nested: bool | None
+    steps: int
+    made: float
+    tolerance: float
+    ms: float
+    ms_median: float
+    ms_least: float
+    gap: float
+    energy: float
+    energies: dict[str, float]
+    strain: float
+    inside: int
+    percent: float
+    deepest_mm: float
+    crossings: int
+    tangles: int
+    frames: int
+    repeats: int
+    note: str = ""
+    apart_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """What was measured on a shot.
+
+    Attributes:
+        about: The shot, the machine, the plan and refine's default.
+        points: Every method with every budget, curve by curve, in the order of the budgets.
+        references: Per frame, Phi0, Phi*, who found it and how far the next best ended above it.
+        terms: What each term, the last frame's detail and each level cost and buy.
+        failed: Runs that ended in an error.
+    """
+
+    about: dict[str, Any]
+    points: tuple[Point, ...]
+    references: tuple[dict[str, Any], ...]
+    terms: tuple[dict[str, Any], ...]
+    failed: tuple[dict[str, Any], ...]
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the curves, the most accurate ones first."""
+        names = dict.fromkeys(point.method for point in self.points)
+        return tuple(sorted(names, key=lambda name: min(p.gap for p in self.points if p.method == name)))
+
+    @property
+    def busy(self) -> str:
+        """A warning where other programs had the cores, or ""."""
+        waited = self.about["waited"]
+        if waited < BUSY or self.about.get("clock") == "cpu":
+            return ""
+        return f"the machine was busy: threads waited for a core {waited:.0%} of the time, so trust no single time"
+
+    @property
+    def panels(self) -> dict[str, str]:
+        """What of contact there is to draw: fields of the points, and their titles."""
+        known = {
+            "percent": "vertices inside bodies [%]",
+            "crossings": "edges through faces of bodies",
+            "tangles": "edges of cloth through cloth",
+        }
+        touches = any("contact" in point.energies for point in self.points)
+        return {
+            name: words
+            for name, words in known.items()
+            if any(getattr(point, name) for point in self.points) or (touches and name != "tangles")
+        }
+
+    @property
+    def likeness(self) -> dict[str, str]:
+        """What compares with solvers outside, too, where there are any: fields of the points, and their titles."""
+        if not self.notes:
+            return {}
+        known = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from Phi*'s shape [mm]"}
+        return {name: words for name, words in known.items() if any(getattr(p, name) for p in self.points)}
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What each solver outside was given of the problem, by its name."""
+        return {point.integrator: point.note for point in self.points if point.note}
+
+    def curve(self, method: str) -> tuple[Point, ...]:
+        """The points of one method, in the order of the budgets."""
+        return tuple(sorted((p for p in self.points if p.method == method), key=lambda p: p.steps))
+
+    def time_to(self, method: str, gap: float) -> float | None:
+        """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there."""
+        return quickest([(point.ms, point.gap) for point in self.curve(method)], gap)
+
+    def times_to(self, gap: float) -> dict[str, float]:
+        """Milliseconds to a gap of the methods that get there, the fastest first."""
+        found = {name: t for name in self.methods if name != DEFAULT and (t := self.time_to(name, gap)) is not None}
+        return dict(sorted(found.items(), key=lambda item: item[1]))
+
+    def default_place(self) -> dict[str, Any] | None:
+        """Whether refine's default is on the front: its time over the least time to the same gap."""
+        default = next(iter(self.curve(DEFAULT)), None)
+        if default is None:
+            return None
+        fastest = next(iter(self.times_to(default.gap).items()), (DEFAULT, default.ms))
+        ratio = default.ms / fastest[1]
+        return {
+            "gap": default.gap,
+            "ms": default.ms,
+            "fastest": fastest[0],
+            "fastest_ms": fastest[1],
+            "ratio": ratio,
+            "on_front": ratio <= TOLERANCE,
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """The chart as plain values."""
+        times = {f"{gap:g}": self.times_to(gap) for gap in GAPS}
+        plain = asdict(self) | {"points": [asdict(point) for point in self.points]}
+        return {"default": self.default_place(), "milliseconds_to_gap": times, **plain}
+
+    def write(self, folder: Path) -> None:
+        """Write ``chart.json`` and ``chart.csv``."""
+        (folder / "chart.json").write_text(to_json(self.to_dict()) + "\n", encoding="utf-8")
+        terms = sorted({name for point in self.points for name in point.energies})
+        with (folder / "chart.csv").open("w", encoding="utf-8", newline="") as file:
+            rows = [_flat(point, terms) for name in self.methods for point in self.curve(name)]
+            writer = csv.DictWriter(file, list(rows[0]) if rows else ["method"])
+            writer.writeheader()
+            writer.writerows(rows)
+
+    def lines(self) -> Iterator[str]:
+        """The summary that the command prints: a table in Markdown, and where the default stands."""
+        yield "| method | " + " | ".join(f"ms to {gap:.0%}" for gap in GAPS) + " | least gap | at ms |"
+        yield "|" + "---|" * (len(GAPS) + 3)
+        for name in self.methods:
+            best = min(self.curve(name), key=lambda point: point.gap)
+            times = [self.time_to(name, gap) for gap in GAPS]
+            cells = ["-" if t is None else f"{t:.0f}" for t in times]
+            yield f"| {name} | {' | '.join(cells)} | {best.gap:.2%} | {best.ms:.1f} |"
+        place = self.default_place()
+        if place is not None:
+            where = "on the front" if place["on_front"] else "not on the front"
+            yield ""
+            yield (
+                f"refine's default: {place['gap']:.2%} in {place['ms']:.0f} ms, {place['ratio']:.2f} times the "
+                f"{place['fastest_ms']:.0f} ms of the fastest to that gap ({place['fastest']}): {where}"
+            )
+        for each in self.references:
+            where = "" if each["frame"] is None else f"frame {each['frame']:g}: "
+            yield f"{where}{Reference.of(each)}"
+        if self.busy:
+            yield self.busy
+        yield from (f"{name} was given {note}" for name, note in self.notes.items())
+        if longer := self.about.get("long_minutes"):
+            yield f"the long form would take about {longer:.0f} minutes here"
+
+
+def quickest(points: Sequence[tuple[float, float]], gap: float) -> float | None:
+    """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there.
+
+    Args:
+        points: Milliseconds and gap of its budgets, the smallest first.
+        gap: The gap.
+    """
+    best: list[tuple[float, float]] = []
+    for point in points:
+        if not best or point[1] < best[-1][1]:
+            best.append(point)
+    if best and best[0][1] <= gap:
+        return best[0][0]
+    for (ms, above), (more, below) in pairwise(best):
+        if below <= gap:
+            part = math.log(above / gap) / math.log(above / max(below, TINY))
+            return ms * (more / ms) ** part
+    return None
+
+
+def typical(times: Sequence[float]) -> float:
+    """Median of the faster half: whatever else a machine does only ever adds to a time."""
+    return statistics.median(sorted(times)[: -(-len(times) // 2)])
+
+
+def collate(journal: Journal) -> Chart:
+    """Put a journal's rows together."""
+    rows = journal.rows("point")
+    found = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
+    for row in rows:
+        if row["frame"] in found and "energies" in row:
+            by = f"{row['method']}, {row['steps']} steps"
+            found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
+    keys = dict.fromkeys((row["method"], row["steps"]) for row in rows)
+    points = [_point([r for r in rows if (r["method"], r["steps"]) == key], found) for key in keys]
+    plan = journal.one("plan") or {}
+    about = journal.rows("problem")[0]["problem"] | {name: plan.get(name) for name in ("plan", "long_minutes")}
+    about["waited"] = sum(r.get("waited") or 0.0 for r in rows) / max(sum(r.get("elapsed", 0.0) for r in rows), TINY)
+    return Chart(
+        about,
+        tuple(point for point in points if point is not None),
+        tuple({"frame": frame, **each.plain()} for frame, each in found.items()),
+        tuple(_without_kind(each) for each in journal.rows("term")),
+        tuple(_without_kind(each) for each in journal.rows("failed")),
+    )
+
+
+def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point | None:
+    """One budget of one method; None while a frame of it is missing."""
+    judged = {row["frame"]: row for row in rows if "energies" in row}
+    if set(judged) != set(references):
+        return None
+    times = [[row["ms"] for row in rows if row["frame"] == frame] for frame in judged]
+    first, values = rows[0], list(judged.values())
+    energies = {name: statistics.fmean(v["energies"].get(name, 0.0) for v in values) for name in values[0]["energies"]}
+    least, start = (sum(getattr(each, name) for each in references.values()) for name in ("least", "start"))
+    energy = sum(energies.values())
+    apart = [each for v in values if (each := v.get("apart_mm")) is not None]
+    return Point(
+        method=first["method"],
+        integrator=first.get("integrator", ""),
+        nested=first.get("nested"),
+        steps=first["steps"],
+        made=statistics.fmean(v["made"] for v in values),
+        tolerance=first.get("tolerance", 0.0),
+        ms=statistics.fmean(typical(each) for each in times),
+        ms_median=statistics.fmean(statistics.median(each) for each in times),
+        ms_least=statistics.fmean(min(each) for each in times),
+        gap=(len(values) * energy - least) / max(start - least, TINY),
+        energy=energy,
+        energies=energies,
+        strain=max(v["strain"] for v in values),
+        inside=sum(v["inside"] for v in values),
+        percent=statistics.fmean(v["percent"] for v in values),
+        deepest_mm=max(v["deepest_mm"] for v in values),
+        crossings=sum(v["crossings"] for v in values),
+        tangles=sum(v["tangles"] for v in values),
+        frames=len(values),
+        repeats=min(len(each) for each in times),
+        note=first.get("note", ""),
+        apart_mm=statistics.fmean(apart) if len(apart) == len(values) else None,
+    )
+
+
+def _flat(point: Point, terms: Sequence[str]) -> dict[str, Any]:
+    """One line of the CSV."""
+    values = asdict(point)
+    energies = values.pop("energies")
+    return values | {f"{name}_joules": energies.get(name, "") for name in terms}
+
+
+def _without_kind(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name != "row"}

@@ -1,0 +1,92 @@
+"""Trousers, a shirt over them and a belt over both, on hips and legs that walk in place."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...solver.fabric import PRESETS, Fabric
+from ...usd.write.plain import Look, PlainMesh, PlainStage
+from .grid import ease
+from .walker import Cage, Cells, body, trousers, tube, walk
+
+FRAMES, RATE = 30, 24.0
+
+GAPS = (0.005, 0.010, 0.0152)
+"""Distance of trousers, shirt and belt from the body, where all three lie over one another [m]."""
+
+WAIST = 1.02
+"""Height of the belt's middle [m]."""
+
+LONGER, WIDER = 1.08, 1.04
+"""Size of the trousers and the shirt at rest over the size in which they are worn: they are pushed together."""
+
+
+def build() -> PlainStage:
+    """Build the shot.
+
+    Returns:
+        Three garments in three layers and a body collider, 30 samples.
+    """
+    times = np.arange(FRAMES) / RATE
+    solid = body()
+    form = PlainMesh(
+        name="Form",
+        counts=solid.counts,
+        indices=solid.indices,
+        points=solid.points,
+        look=Look("Canvas", (0.60, 0.56, 0.50)),
+        role="collider",
+        samples=np.stack([walk(solid.points, time) for time in times]),
+    )
+    doc = "Trousers, shirt and belt in three layers on a body that walks in place"
+    return PlainStage("LayersShot", doc, (_trousers(times), _shirt(times), _belt(times), form), 1.0 + np.arange(FRAMES))
+
+
+def _trousers(times: np.ndarray) -> PlainMesh:
+    """Trousers that widen towards the ankles, where they lag behind the legs."""
+    cells = Cells(40, 10, np.linspace(1.05, 0.835, 10), np.linspace(0.745, 0.115, 27))
+    cage = trousers(cells, lambda height: GAPS[0] + 0.015 * ease((0.62 - height) / 0.35))
+    late = 0.006 * ease((0.5 - cage.points[:, 1]) / 0.4)
+    samples = np.stack([walk(cage.points, time - late) for time in times])
+    return _garment("Trousers", cage, samples, Look("Denim", (0.12, 0.17, 0.30)), fabric=PRESETS["denim"], layer=0)
+
+
+def _shirt(times: np.ndarray) -> PlainMesh:
+    """A shirt without sleeves from the chest to below the hips; its hem swings."""
+    cage = tube(np.linspace(1.27, 0.845, 21), 46, lambda height: GAPS[1] + 0.010 * ease((0.98 - height) / 0.12))
+    free = ease((0.97 - cage.points[:, 1]) / 0.12)
+    samples = []
+    for time in times:
+        phase = 2 * np.pi * (time - 0.06) / 0.625
+        swing = 0.004 * ease(time / 0.35) * np.array([np.sin(0.5 * phase), 0.0, np.sin(phase)])
+        samples.append(walk(cage.points, time) + free[:, None] * swing)
+    return _garment("Shirt", cage, np.stack(samples), Look("Cotton", (0.72, 0.70, 0.64)), layer=1)
+
+
+def _belt(times: np.ndarray) -> PlainMesh:
+    """A belt of leather, as long as it is worn."""
+    cage = tube(WAIST + np.linspace(0.0225, -0.0225, 4), 44, lambda height: np.full_like(height, GAPS[2]))
+    samples = np.stack([walk(cage.points, time) for time in times])
+    look = Look("Leather", (0.16, 0.09, 0.05), 0.5)
+    return _garment("Belt", cage, samples, look, fabric=PRESETS["leather"], layer=2)
+
+
+def _garment(
+    name: str, cage: Cage, samples: np.ndarray, look: Look, *, layer: int, fabric: Fabric = PRESETS["cotton"]
+) -> PlainMesh:
+    """A garment; all but the belt are larger at rest and held by their top row."""
+    points, top = cage.points, cage.points[:, 1] > cage.points[:, 1].max() - 1e-6
+    loose = layer < 2
+    rest = (points - (0.0, WAIST, 0.0)) * (WIDER, LONGER, WIDER) + (0.0, WAIST, 0.0)
+    return PlainMesh(
+        name=name,
+        counts=np.full(len(cage.quads), 4),
+        indices=cage.quads.ravel(),
+        points=rest if loose else points,
+        look=look,
+        samples=samples,
+        uv=cage.uv,
+        pin=top.astype(float) if loose else None,
+        fabric=fabric,
+        layer=layer,
+    )

@@ -1,0 +1,332 @@
+"""The training loop: unroll steps on patches, follow the energy down, keep a record."""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...errors import UsageError
+from ...shot.plain_json import to_json
+from ...solver.integrate.base import Integrator
+from ...solver.integrate.learned import integrator_of
+from ...solver.integrate.network import Physgraph, PhysgraphConfig
+from ...solver.integrate.paper_network import PaperConfig, PaperNetwork
+from ...solver.integrate.quasi_newton import QuasiNewton
+from ...solver.integrate.weights import make_network
+from .bundle import Bundle, deal
+from .patches import Patch, PatchConfig, make_patches
+from .unroll import Twin, detached, unrolled
+
+HARMLESS = 0.02
+"""Part of the energy at the start below which the logarithm of the gap stops to reward."""
+TWINS = 1 / 3
+"""Part of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
+SCHEDULES = ((5, 5, 5), (10, 10, 5))
+"""Steps a level at which held-out patches are measured."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that a training run depends on.
+
+    Attributes:
+        kind: "physgraph" or "physgraph-paper".
+        network: Size of the network.
+        patches: What it is trained on.
+        seed: Of patches, weights and order.
+        minutes: How long to train, patches not counted.
+        iterations: Most iterations, or None.
+        batch: Most patches an iteration; they are dealt into batches once, and a batch is stepped as one.
+        unroll: Steps that gradients flow through.
+        segments: Most unrolls one after another on a patch; later ones start where the last one ended.
+        through_forces: Gradients flow through forces too, by differences; else through displacements only (A19).
+        loss: "ratio" or "log" of the gap, averaged over the steps (A18).
+        late: Weight of step k in that average, as the power of k: 0 counts all alike, more counts where an unroll ends.
+        steady: Weight of how much an unroll magnifies the difference of two descents whose starts differ by noise, as a
+            logarithm. Without, rounding decides where cloth folds.
+        raw: Part of the starts that are the upsampled cage.
+        middle: Part of the starts where an earlier unroll ended; the others come from a solved level below.
+        own: Part of those that the network itself has solved; quasi-Newton the others.
+        turn: Turn each start at random (A8); only where neither gravity nor guide has a direction.
+        rate: Adam's first rate; it falls to a hundredth along a cosine.
+        clip: Largest norm of the gradient.
+        average: Decay of the weights' running mean, which is what is kept.
+        held_out: Patches to measure on, of another seed.
+    """
+
+    kind: str = "physgraph"
+    network: PhysgraphConfig | PaperConfig = field(default_factory=PhysgraphConfig)
+    patches: PatchConfig = field(default_factory=PatchConfig)
+    seed: int = 1
+    minutes: float = 5.0
+    iterations: int | None = None
+    batch: int = 4
+    unroll: int = 10
+    segments: int = 3
+    through_forces: bool = False
+    loss: str = "log"
+    late: float = 0.0
+    steady: float = 0.0
+    raw: float = 0.4
+    middle: float = 0.15
+    own: float = 0.5
+    turn: bool = False
+    rate: float = 3e-3
+    clip: float = 1.0
+    average: float = 0.99
+    held_out: int = 8
+
+
+class Trainer:
+    """A network in training.
+
+    Attributes:
+        config: The run.
+        network: The network.
+        iteration: Iterations made.
+        seconds: Time they took.
+        curve: What was measured on the way.
+    """
+
+    def __init__(self, config: TrainConfig, *, device: str = "cpu", like: Trainer | None = None) -> None:
+        """Make patches and an untrained network.
+
+        Args:
+            config: The run.
+            device: "cpu" or a CUDA device.
+            like: A finished run on the same patches, which are taken over, or None.
+        """
+        self.config, self.device = config, device
+        torch.manual_seed(config.seed)
+        self.network = make_network(config.network).to(device)
+        self._mean = torch.optim.swa_utils.AveragedModel(
+            self.network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
+        )
+        self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
+        shared = like is not None and (like.config.patches, like.config.seed) == (config.patches, config.seed)
+        self.patches = like.patches if like and shared else _made(config.patches, config.seed)
+        self._held_out = like._held_out if like and shared else None
+        self._bundles = [
+            Bundle(batch, device=device, through_forces=config.through_forces)
+            for batch in deal(self.patches, config.batch)
+        ]
+        self._rng = np.random.default_rng(config.seed + 1)
+        self.iteration, self.seconds = 0, 0.0
+        self.curve: list[dict[str, Any]] = []
+
+    def train(self, *, every: float = 60.0, say: Any = None, keep: Path | None = None) -> None:
+        """Train until the time or the iterations are spent.
+
+        Args:
+            every: Seconds between measurements on held-out patches.
+            say: Called with a line at each measurement.
+            keep: File for checkpoints, or None.
+        """
+        config = self.config
+        measured, losses = self.seconds, []
+        while self.progress < 1.0:
+            began = time.perf_counter()
+            losses.append(self.iterate())
+            self.seconds += time.perf_counter() - began
+            if self.seconds - measured >= every or self.progress >= 1.0:
+                measured = self.seconds
+                row = {"iteration": self.iteration, "minutes": self.seconds / 60, "loss": float(np.mean(losses))}
+                row |= {"held_out": self.held_out_ratios()} if config.held_out else {}
+                losses = []
+                self.curve.append(row)
+                if say:
+                    say(to_json(row, indent=None))
+                if keep:
+                    self.save(keep)
+
+    @property
+    def progress(self) -> float:
+        """Part of the run that is done."""
+        config = self.config
+        parts = [self.seconds / (60.0 * config.minutes)]
+        if config.iterations is not None:
+            parts.append(self.iteration / config.iterations)
+        return max(parts)
+
+    def iterate(self) -> float:
+        """One iteration; returns the mean loss."""
+        config, done = self.config, self.progress
+        for group in self._optimiser.param_groups:
+            group["lr"] = config.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0))))
+        steps = max(2, round(config.unroll * min(1.0, 0.3 + 2.8 * done)))
+        self._optimiser.zero_grad()
+        self.network.train()
+        loss = self._descend(steps)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+        if all(bool(p.grad.isfinite().all()) for p in self.network.parameters() if p.grad is not None):
+            self._optimiser.step()
+            self._mean.update_parameters(self.network)
+        self.iteration += 1
+        return loss
+
+    def _descend(self, steps: int) -> float:
+        """Unroll a batch, segment after segment; gradients add up. Returns the mean loss."""
+        config = self.config
+        bundle = self._bundles[int(self._rng.integers(len(self._bundles)))]
+        index = int(self._rng.integers(bundle.levels))
+        system = bundle.systems[index]
+        system.energies.clear()
+        x = bundle.begin(index, lambda: self._dice(len(bundle.patches)), shares=config)
+        integrator = integrator_of(self.network)
+        segments = int(self._rng.integers(1, config.segments + 1))
+        x = self._turned(x) if config.turn else x
+        twin = Twin(integrator, system, x) if config.steady and self._rng.random() < TWINS else None
+        carry, total = integrator.start(system, x), 0.0
+        before = system.energies[-1].detach()
+        for _ in range(segments):
+            before = system.energies[-1].detach()
+            if twin is not None:
+                twin.unroll(steps, beside=carry.x)
+            system.energies.clear()
+            carry = unrolled(integrator, system, detached(carry), steps)
+            reached = torch.stack(system.energies)  # K P
+            bundle.learn(index, reached.detach())
+            loss = loss_of(reached, before, bundle.least[index], kind=config.loss, late=config.late)
+            if twin is not None:
+                loss = loss + config.steady / TWINS * twin.growth(carry.x).log().mean()
+            if not bool(loss.isfinite()):
+                break
+            (loss / segments).backward()
+            total += float(loss.detach()) / segments
+        bundle.keep(index, carry.x.detach(), system.energies[-1].detach() <= before)
+        return total
+
+    def _turned(self, x: Tensor) -> Tensor:
+        """The positions after a random rotation."""
+        turn = np.linalg.qr(self._rng.normal(size=(3, 3)))[0]
+        return x @ torch.as_tensor(turn * np.linalg.det(turn), dtype=x.dtype, device=x.device)
+
+    def _dice(self, count: int) -> Tensor:
+        return torch.as_tensor(self._rng.random(count), device=self.device)
+
+    def averaged(self) -> Physgraph | PaperNetwork:
+        """The running mean of the weights, ready for use."""
+        network = make_network(self.config.network).to(self.device)
+        network.load_state_dict(self._mean.module.state_dict())
+        return network.requires_grad_(False).eval()
+
+    def held_out_ratios(self) -> dict[str, float]:
+        """Gap over that of quasi-Newton at the same steps, geometric mean over held-out patches."""
+        if self._held_out is None:
+            config = replace(self.config.patches, count=self.config.held_out)
+            self._held_out = _made(config, 10_000 + self.config.seed)
+        ours = integrator_of(self.averaged().to("cpu"))
+        table = {}
+        for schedule in SCHEDULES:
+            ratios = []
+            for patch in self._held_out:
+                mine, theirs = (nested_gap(patch, integrator, schedule) for integrator in (ours, QuasiNewton()))
+                ratios.append(math.log(max(mine, 1e-3) / max(theirs, 1e-3)))
+            table[str(schedule)] = round(math.exp(float(np.mean(ratios))), 4)
+        return table
+
+    def save(self, file: Path) -> None:
+        """Write a checkpoint from which the run can go on."""
+        state = {
+            "network": self.network.state_dict(),
+            "mean": self._mean.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "rng": self._rng.bit_generator.state,
+            "torch": torch.get_rng_state(),
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "curve": self.curve,
+            "bundles": [bundle.state() for bundle in self._bundles],
+        }
+        part = file.with_suffix(".part")
+        torch.save(state, part)
+        part.replace(file)
+
+    def resume(self, file: Path) -> None:
+        """Go on from a checkpoint of the same configuration.
+
+        Raises:
+            UsageError: The file is damaged, or holds anything but tensors and plain values.
+        """
+        try:
+            with warnings.catch_warnings(action="ignore"):  # of what is refused anyway
+                # Anything else in a pickle could run a command.
+                state = torch.load(file, map_location=self.device, weights_only=True)
+        except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+            raise UsageError(f"{file} is no checkpoint of ours or is damaged: {str(error).splitlines()[0]}") from error
+        try:
+            self._take(state)
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise UsageError(f"{file} does not fit this configuration: {error}") from error
+
+    def _take(self, state: dict[str, Any]) -> None:
+        """Take over what `save` wrote."""
+        self.network.load_state_dict(state["network"])
+        self._mean.load_state_dict(state["mean"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._rng.bit_generator.state = state["rng"]
+        torch.set_rng_state(state["torch"].cpu())
+        self.iteration, self.seconds, self.curve = state["iteration"], state["seconds"], state["curve"]
+        for bundle, kept in zip(self._bundles, state["bundles"], strict=True):
+            bundle.restore(kept)
+
+
+def _made(config: PatchConfig, seed: int) -> list[Patch]:
+    return make_patches(config, seed=seed, workers=min(os.cpu_count() or 1, config.count // 8))
+
+
+def loss_of(
+    energies: Float[Tensor, "steps patches"],
+    before: Float[Tensor, " patches"],
+    least: Float[Tensor, " patches"],
+    *,
+    kind: str,
+    late: float = 0.0,
+) -> Float[Tensor, ""]:
+    """Mean over patches, weighted over steps, of the gap or of its logarithm, relative to the start.
+
+    Args:
+        energies: Energies of the steps [J].
+        before: Energies at the start [J].
+        least: Least energies known [J].
+        kind: "ratio" or "log".
+        late: Power of k that weighs step k.
+    """
+    scale = torch.maximum(before - least, 1e-6 * before.abs()).clamp_min(1e-30)
+    gap = (energies - least) / scale
+    # Beyond the start's own gap only the logarithm counts: one patch that blows up must not outweigh the rest.
+    if kind == "ratio":
+        told = torch.where(gap < 1.0, gap, 1.0 + gap.clamp_min(1.0).log())
+    else:
+        told = (gap.clamp_min(0.0) + HARMLESS).log()
+    weight = torch.arange(1, len(gap) + 1, dtype=gap.dtype, device=gap.device) ** late  # K
+    return (weight / weight.sum()) @ told.mean(dim=1)
+
+
+def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> float:
+    """Gap at the finest level after so many steps a level, the last entries for the finest levels."""
+    x = patch.begin(0)
+    energy = math.inf
+    counts = steps[-len(patch.systems) :] if len(patch.systems) <= len(steps) else (steps[0], *steps)
+    with torch.no_grad():
+        for index, count in enumerate(counts):
+            level, system = patch.group.levels[index], patch.systems[index]
+            x = x if level.from_below is None else level.from_below.apply(x)
+            carry = integrator.start(system, x)
+            for _ in range(count):
+                carry = integrator.step(system, carry)
+            x, energy = carry.x, carry.energy
+    gap = (energy - patch.least[-1]) / (patch.start[-1] - patch.least[-1])
+    return gap if math.isfinite(gap) else 1e6
