@@ -6,7 +6,7 @@ One cold frame of each shot at each level, contact included, measured as `physgr
 the processor time of one core, on CUDA the wall's; energies judged in float64. Rivals are quasi-Newton and `physgraph`,
 each through the levels and at the finest alone, and L-BFGS there, with growing steps. A ratio is the default's time
 over the least of all to the same gap; up to 1.1 counts as level. A time is the least of so many turns, of every method
-alike. Phi* is the least that anybody found, the short search of `physgraph_usd.lab.chart.reference` among them; below the
+alike. Phi* is the least that anybody found, the short search of `lab/chart/reference.py` among them; below the
 table stand who found it and how far the next best ended above it. What was measured lies in
 build/front.DEVICE.CODE.jsonl: a run that was stopped goes on there while the code is the same.
 """

@@ -10,7 +10,7 @@
     |-- WeightsError        a network's weights are missing, damaged or of another version
     `-- LayerError          the output layer cannot be written or is invalid
 
-A message gives the value, the place and the choices, in one line each.
+A message gives the value, the place and the choices, in one line each; `counted` puts numbers of things into words.
 """
 
 from __future__ import annotations
@@ -83,3 +83,18 @@ class WeightsError(PhysGraphError):
 
 class LayerError(PhysGraphError):
     """The output layer cannot be written, or failed validation."""
+
+
+NOTICE = 25
+"""Level of what a run says without being asked and is nothing wrong, between logging's INFO and WARNING."""
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """A number of things: "1 frame", "1,024 frames".
+
+    Args:
+        number: How many.
+        noun: One of them.
+        plural: Several; the noun with an "s" where it is left out.
+    """
+    return f"{number:,} {noun if number == 1 else plural or noun + 's'}"

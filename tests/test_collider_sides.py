@@ -21,8 +21,7 @@ from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.colliders.sign import _sides, signed_distances
 from physgraph_usd.solver.contact.track import Track
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.schema import COLLIDER
-from physgraph_usd.usd.sides import SIDES
+from physgraph_usd.usd.schema import COLLIDER, SIDES
 
 MESH, REST = sheet(6, 6, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "physgraph_usd"
+PACKAGE = Path(__file__).resolve().parents[1] / "physgraph_usd" / "solver"
 FOLDERS = ("contact", "collide", "frame")
 OWN = {"self", "cls"}
 MAKERS = {"__init__", "__post_init__", "__new__"}

@@ -66,7 +66,7 @@ def test_wheel_carries_schemas_weights_and_licence(tmp_path: Path) -> None:
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
     assert wheel.name.startswith(f"physgraph_usd-{physgraph_usd.__version__}-py3-none-any")
-    data = ("schemas/plugInfo.json", "schemas/generatedSchema.usda", "weights/README.md", "report.schema.json")
+    data = ("schemas/plugInfo.json", "schemas/generatedSchema.usda", "weights/README.md", "shot/report.schema.json")
     for name in (*data, "cli/refine.py"):
         assert f"physgraph_usd/{name}" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)

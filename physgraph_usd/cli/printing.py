@@ -13,8 +13,7 @@ from typing import Any, TextIO
 
 import click
 
-from ..errors import PhysGraphError
-from ..words import NOTICE, counted
+from ..errors import NOTICE, PhysGraphError, counted
 
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""

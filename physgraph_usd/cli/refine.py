@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ..errors import LayerError, PhysGraphError, UsageError
-from ..words import counted
+from ..errors import LayerError, PhysGraphError, UsageError, counted
 from .options import (
     farm_options,
     file_options,

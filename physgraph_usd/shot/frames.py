@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LayerError, UsageError
+from ..errors import LayerError, UsageError, counted
 from ..usd.write.atomic import make_file, temporary_path, write_text
-from ..words import counted
 from .lock import LOCK, FolderLock
 
 RUN = "run.json"

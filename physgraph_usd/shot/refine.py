@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from ..errors import LayerError, PhysGraphError, SolveError, StageError, UsageError
+from ..errors import NOTICE, LayerError, PhysGraphError, SolveError, StageError, UsageError, counted
 from ..interrupts import SIGNALLED, exit_code_of, signals_raise
 from ..solver.contact.passed import told
 from ..solver.frame.history import told_broken, told_jumped
@@ -30,7 +30,6 @@ from ..usd.view import Layer, Stage
 from ..usd.write.atomic import check_place
 from ..usd.write.chunk import Chunk, chunk_of
 from ..usd.write.writer import LayerWriter
-from ..words import NOTICE, counted
 from .chunks import RUN_UP, solve_in_chunks
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
 from .farm import connected, shots_at_once

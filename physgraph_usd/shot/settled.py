@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, fields
 from itertools import groupby
 from typing import Any
 
+from ..errors import counted
 from ..solver.integrate.solve import FAR
-from ..words import counted
 
 ROUNDING = 1e-3
 """Part of an energy that counts for nothing: sums are in single precision."""

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..solver.fabric import PRESETS
-from .sides import SIDES
 
 GARMENT_API = "PhysGraphGarmentAPI"
 COLLIDER_API = "PhysGraphColliderAPI"
@@ -28,6 +27,14 @@ SI = " SI, whatever the stage's metersPerUnit."
 """End of the doc of every property that has a unit."""
 REFINEMENT, FABRIC, CONTACT, PAINTED, COLLISION = "Refinement", "Fabric", "Contact", "Painted Maps", "Collider"
 """Display groups."""
+SIDES = ("auto", "winding", "start", "front", "back")
+"""How to tell on which side of a mesh cloth belongs.
+
+"auto": outside of pieces that are closed, and of the others the side on which the coarse cloth around a vertex is.
+"winding": outside of every piece, closed or not, by the generalised winding number.
+"start": the side on which the coarse cloth is, of every piece, closed or not.
+"front", "back": that side of the authored faces of open pieces; outside of closed ones.
+"""
 _JERSEY = PRESETS["jersey"]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...words import counted
+from ...errors import counted
 from ..colliders.orient import pieces_of
 from ..colliders.pose import Collider, MeshPose, ShapePose
 from ..colliders.sweep import Sweep, through_shape

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ...errors import GarmentError
+from ...errors import GarmentError, counted
 from ...solver.mesh.topology import PolygonMesh
-from ...words import counted
 from ..stage import Notice
 
 _CONTROLS = {

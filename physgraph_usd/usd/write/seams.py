@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...words import counted
+from ...errors import counted
 
 Points = Mapping[str, np.ndarray]
 """Local points by the path of the fine mesh, each of shape (V, 3), float32."""

@@ -13,8 +13,7 @@ from ..files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from ..lookup import check_limits
 from ..provenance import asset_path, export_layer
 from ..read.find import find_colliders, find_garments
-from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, Property
-from ..sides import SIDES
+from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, SIDES, Property
 from ..stage import open_stage
 from ..view import root_over
 from .atomic import ASSET_PATHS, prepare_target
