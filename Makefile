@@ -4,8 +4,10 @@
 # make site       the documentation as a site, in build/site
 # make format     let ruff rewrite what it can
 # PYTHON=python3.12 picks the interpreter of the environment; JOBS=8 the number of test processes.
+# TORCH=auto takes torch's build for this machine's card, TORCH=cu128 the one for that CUDA; else its CPU build.
 
 PYTHON ?= python3
+TORCH ?= cpu
 JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
@@ -51,11 +53,17 @@ $(VENV)/.python:
 	$(PYTHON) -m venv --clear $(VENV)
 	@touch $@
 
-$(VENV)/.demo: pyproject.toml $(VENV)/.python
+# pip takes torch's CUDA build on Linux, 5.5 GB; uv knows where the others are.
+$(VENV)/.torch: $(VENV)/.python
+	@$(PIP) uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend $(TORCH) -r pyproject.toml || \
+		echo 'uv could not install the $(TORCH) build of torch; pip installs the one that it finds'
+	@touch $@
+
+$(VENV)/.demo: pyproject.toml $(VENV)/.torch
 	$(PIP) -e '.[usd,preview]'
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml $(VENV)/.python
+$(VENV)/.dev: pyproject.toml $(VENV)/.torch
 	$(PIP) -e '.[dev]'
 	$(PIP) --upgrade --no-deps --target $(VENV)/pyblish 'pyblish-base>=1.8,<2'
 	@touch $@ $(VENV)/.demo
