@@ -9,7 +9,7 @@ from pxr import Gf, Sdf, Vt
 
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
-from physgraph_usd.usd.write.carry import FineMap, to_numpy, to_vt
+from physgraph_usd.usd.write.primvars import FineMap, to_numpy, to_vt
 
 POINTS, COUNTS, INDICES = grid(3, 2)
 

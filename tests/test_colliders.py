@@ -12,7 +12,7 @@ from physgraph_usd.solver.colliders.orient import pieces_of
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose, moved_rigidly
 from physgraph_usd.solver.colliders.primitives import ShapeSurface
 from physgraph_usd.solver.colliders.sign import signed_distances
-from physgraph_usd.usd.read.shapes import tessellated
+from physgraph_usd.usd.read.bodies import tessellated
 
 FAR = np.array([0.25, 0.0, 0.0])
 BODIES = {

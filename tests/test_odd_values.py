@@ -17,7 +17,7 @@ from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.stage import LONGEST_REASON, in_brief, pxr_errors, read_units
-from physgraph_usd.usd.write.carry import to_numpy
+from physgraph_usd.usd.write.primvars import to_numpy
 
 CLOTH = "/World/cloth"
 

@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom, Vt
 from stages import add_sheet, new_stage, save, value_type
 
 from physgraph_usd.errors import SchemaError
-from physgraph_usd.usd.read.painted import read_painted
+from physgraph_usd.usd.read.garment import read_painted
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import GARMENT, PROPERTIES, Property
 

@@ -10,7 +10,7 @@ from pxr import UsdGeom
 from stages import add_sheet, new_stage, save, sheet_points, sheet_shot, vec3
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.usd.read.points import repair
+from physgraph_usd.usd.read.cage import repair
 from physgraph_usd.usd.read.reader import open_shot
 
 LINE = np.array([[0, 1], [1, 2], [2, 3]])

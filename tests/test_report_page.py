@@ -23,7 +23,7 @@ from physgraph_usd.shot.page.plot import plot
 from physgraph_usd.shot.page.report import page
 from physgraph_usd.shot.page.series import add_jerk, read_series, third_difference
 from physgraph_usd.shot.report import RefineReport
-from physgraph_usd.usd.check.readback import RefinedLayer
+from physgraph_usd.usd.read.meshes import RefinedLayer
 from physgraph_usd.usd.read.reader import open_shot
 
 

@@ -13,8 +13,7 @@ import pytest
 from layers import COAT, dress_up, make_shot, write_layer
 from pxr import Sdf, Usd, Vt
 
-from physgraph_usd.usd.check import layer_rules
-from physgraph_usd.usd.check.rules import RULES
+from physgraph_usd.usd.check.rules import LAYER_RULES, RULES
 from physgraph_usd.usd.check.validators import PLUGIN
 
 FOLDER = Path(__file__).parents[1] / "plugins" / "usdvalidation"
@@ -71,7 +70,7 @@ def test_the_plugin_lists_each_rule_with_its_doc() -> None:
     (plugin,) = json.loads((FOLDER / "plugInfo.json").read_text(encoding="utf-8"))["Plugins"]
     listed = dict(plugin["Info"]["Validators"])
     assert (plugin["Name"], plugin["Type"], listed.pop("keywords")) == (PLUGIN, "python", ["PhysGraph"])
-    rules = (*layer_rules.RULES, *RULES)
+    rules = (*LAYER_RULES, *RULES)
     assert {name: row["doc"] for name, row in listed.items()} == {
         rule.__name__: (rule.__doc__ or "").split("\n")[0] for rule in rules
     }

@@ -11,7 +11,7 @@ from trimesh.exchange.gltf import export_glb
 
 from ..solver.colliders.pose import MeshPose, Pose
 from ..solver.scene import Frame
-from ..usd.read.shapes import tessellated
+from ..usd.read.bodies import tessellated
 from .session import Shown, TuneSession
 from .values import painted_on
 

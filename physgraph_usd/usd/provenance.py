@@ -16,6 +16,7 @@ import numpy as np
 from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError, StageError
+from .lookup import bound_materials, with_ancestors
 from .stage import TRAVERSAL, USD_ERRORS, reason_of
 from .view import root_over
 from .write.atomic import prepare_target, publish, temporary_path
@@ -179,6 +180,24 @@ def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
                 f"<{path}> is refined already in {name}, which holds other things as well and so cannot be left out; "
                 f"{instead}"
             )
+
+
+def selections(prims: Iterable[Usd.Prim]) -> tuple[str, ...]:
+    """Variant selections in force on prims, above them and on their materials.
+
+    Args:
+        prims: Garments, colliders, skeletons: whatever the result depends on.
+
+    Returns:
+        Paths such as ``/World/coat{fit=loose}``, sorted; a set with nothing selected has an empty selection.
+    """
+    found = set()
+    for prim in prims:
+        for each in (other for start in (prim, *bound_materials(prim)) for other in with_ancestors(start)):
+            sets = each.GetVariantSets()
+            path = each.GetPath()
+            found |= {path.AppendVariantSelection(name, sets.GetVariantSelection(name)) for name in sets.GetNames()}
+    return tuple(sorted(str(path) for path in found))
 
 
 def unsaved_layers(stage: Usd.Stage) -> tuple[str, ...]:

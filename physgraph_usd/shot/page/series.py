@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import LayerError, StageError
 from ...solver.frame.pipeline import Refiner
-from ...usd.check.readback import RefinedLayer
+from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
 from ..report import RefineReport
 

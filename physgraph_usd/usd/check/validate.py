@@ -12,11 +12,9 @@ from pxr import Sdf, Usd, UsdUtils
 
 from ...errors import LayerError
 from ..provenance import read_record, recorded_shot
-from ..read.variants import same_variants
 from ..stage import USD_ERRORS, bad_rate, check_there, is_there, pxr_errors, quiet, reason_of
 from ..view import StageView
-from . import layer_rules
-from .rules import RULES, Fine, Problem, subsets
+from .rules import LAYER_RULES, RULES, Fine, Problem, against_shot, is_mesh, same_metadata, same_variants, subsets
 from .validators import PLUGIN
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
@@ -73,7 +71,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
     Returns:
         Problems in the order of the rules.
     """
-    problems = [replace(problem, rule=rule.__name__) for rule in layer_rules.RULES for problem in rule(layer)]
+    problems = [replace(problem, rule=rule.__name__) for rule in LAYER_RULES for problem in rule(layer)]
     if shot is None:
         return problems
     paths = _garments(layer)
@@ -82,16 +80,16 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
     with quiet():
         problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
         composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
-    problems += _named("same_metadata", layer_rules.same_metadata(layer, alone))
+    problems += _named("same_metadata", same_metadata(layer, alone))
     for path in paths:
-        fault = layer_rules.is_mesh(path, composed)
+        fault = is_mesh(path, composed)
         if fault:
             problems.append(Problem("error", path, None, fault, "composition"))
             continue
         coarse = alone.GetPrimAtPath(_coarse_path(layer, path))
         problems += _check_garment(composed.GetPrimAtPath(path), layer, samples, coarse=coarse)
         if coarse:
-            problems += _named("against_shot", layer_rules.against_shot(layer, coarse, Sdf.Path(path)))
+            problems += _named("against_shot", against_shot(layer, coarse, Sdf.Path(path)))
     return problems
 
 

@@ -14,8 +14,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ..provenance import read_record
-from . import layer_rules
-from .rules import RULES, Fine, Problem, extent
+from .rules import LAYER_RULES, RULES, Fine, Problem, extent
 
 PLUGIN = "physgraph_validators"
 """Name of the plug-in, by which its plugInfo.json and the names of the rules begin."""
@@ -35,7 +34,7 @@ def register() -> bool:
     registry = UsdValidation.ValidationRegistry()
     if not hasattr(registry, "RegisterPluginPrimValidator"):
         return False
-    for rule in layer_rules.RULES:
+    for rule in LAYER_RULES:
         registry.RegisterPluginLayerValidator(f"{PLUGIN}:{rule.__name__}", _layer_task(UsdValidation, rule))
     for rule in RULES:
         name, task = f"{PLUGIN}:{rule.__name__}", _prim_task(UsdValidation, rule)

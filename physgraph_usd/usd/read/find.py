@@ -10,12 +10,13 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import AbsentError, GarmentError, StageError
 from ..lookup import COLLIDER_ENABLED, is_on
 from ..schema import COLLIDER_API, GARMENT_API
-from ..stage import TRAVERSAL, list_meshes
+from ..stage import TRAVERSAL, Notice, list_meshes
 from .materials import is_collision_prim
 
 _COLLECTION = ".collection:"
 _COLLIDERS_RELATIONSHIP = "physgraph:colliders"
 _SHOWN = 20
+EXCLUDE = "physgraph:contact:exclude"
 
 
 def has_schema(prim: Usd.Prim, name: str) -> bool:
@@ -209,3 +210,45 @@ def _meshes_said(stage: Usd.Stage) -> str:
     meshes = list_meshes(stage)
     more = f" and {len(meshes) - _SHOWN} more" if len(meshes) > _SHOWN else ""
     return f"meshes: {', '.join(meshes[:_SHOWN]) or 'none'}{more}"
+
+
+def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dict[Sdf.Path, str]], list[Notice]]:
+    """Read what garments are kept apart from.
+
+    Two garments are apart when either says so. A garment is never apart from itself: that is selfCollision's.
+
+    Args:
+        stage: The stage.
+        garments: The garments.
+
+    Returns:
+        For each garment, the gprims that it does not touch, each with what says so; and a notice for each target that
+        is not there.
+    """
+    found, notices = [], []
+    for prim in garments:
+        own, odd = _named(stage, prim)
+        found.append(own)
+        notices += odd
+    numbers = {prim.GetPath(): index for index, prim in enumerate(garments)}
+    for (place, _), own in zip(numbers.items(), found, strict=True):
+        own.pop(place, None)
+        for path in [path for path in own if path in numbers]:
+            found[numbers[path]].setdefault(place, own[path])
+    return found, notices
+
+
+def _named(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str], list[Notice]]:
+    """Gprims at and below the targets of one garment, and by which target."""
+    found: dict[Sdf.Path, str] = {}
+    notices = []
+    said = f"<{prim.GetPath()}>.{EXCLUDE}"
+    for target in targets_of(prim, EXCLUDE):
+        try:
+            paths = find_paths(stage, str(target), UsdGeom.Gprim)
+        except StageError as error:
+            notices.append(Notice(str(prim.GetPath()), None, f"{EXCLUDE} excludes nothing by <{target}>: {error}"))
+            continue
+        for path in paths:
+            found.setdefault(path, said if path == target else f"{said} = <{target}>")
+    return found, notices

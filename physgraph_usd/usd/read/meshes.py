@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
-from ...errors import StageError
-from ..provenance import recorded_shot
+from ...errors import LayerError, StageError
+from ..provenance import read_record, recorded_shot
 from ..stage import bad_rate, check_there, list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
 from ..times import garment_times, merge
 from ..view import root_over
 from .find import has_schema, traverse
+from .placement import place
+from .reader import Shot
 
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh that says nothing of its own."""
@@ -182,10 +184,10 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
     )
     if not points or not counts or not indices:
         return None
-    place = np.asarray(points, dtype=np.float64)
+    positions = np.asarray(points, dtype=np.float64)
     counts, indices = np.asarray(counts), np.asarray(indices)
-    usable = counts.sum() == len(indices) and indices.min() >= 0 and indices.max() < len(place)
-    if not usable or not np.isfinite(place).all():
+    usable = counts.sum() == len(indices) and indices.min() >= 0 and indices.max() < len(positions)
+    if not usable or not np.isfinite(positions).all():
         return None
     face, triangles, edges = _fan(counts, indices)
     left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
@@ -193,7 +195,7 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
     if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
         triangles, edges = triangles[:, ::-1], edges[:, ::-1]
     colors = _colors(mesh, code, len(counts))[face]
-    return DrawnMesh(str(mesh.GetPath()), place, triangles, edges, colors, len(counts))
+    return DrawnMesh(str(mesh.GetPath()), positions, triangles, edges, colors, len(counts))
 
 
 def _fan(counts: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -238,3 +240,46 @@ def _material_color(prim: Usd.Prim) -> np.ndarray | None:
         return None
     value = diffuse.Get()
     return None if value is None else np.array(value, dtype=float)
+
+
+class RefinedLayer:
+    """A refined layer, for looking at what was written.
+
+    Attributes:
+        targets: Path of each garment's fine mesh, in the scene's order.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the layer.
+
+        Raises:
+            LayerError: It is no refined layer.
+        """
+        layer = Sdf.Layer.FindOrOpen(str(path))
+        record = None if layer is None else read_record(layer)
+        if layer is None or record is None:
+            raise LayerError(f"{path} is no refined layer")
+        self._layer = layer
+        self.targets = tuple(str(each) for each in record.get("garments", ()))
+
+    def points(self, shot: Shot, index: int, time: float | None) -> np.ndarray | None:
+        """World positions [m] of a garment's fine mesh, shape (V, 3), or None where it has no sample.
+
+        Args:
+            shot: The shot that was refined.
+            index: Which garment.
+            time: Time code, or None for the default.
+        """
+        coarse = str(shot.sources[index].path)
+        target = next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
+        if target is None:  # a chunk without a sample of it
+            return None
+        path = Sdf.Path(target).AppendProperty("points")
+        if time is None:
+            attribute = self._layer.GetAttributeAtPath(path)
+            local = None if attribute is None else attribute.default
+        else:
+            local = self._layer.QueryTimeSample(path, time)
+        if local is None or isinstance(local, Sdf.ValueBlock):
+            return None
+        return place(np.asarray(local, dtype=np.float64), shot.to_metres(index, time))

@@ -22,7 +22,7 @@ from pxr import Sdf, Usd
 from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
 from ..lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
-from ..provenance import mute_refined, refuse_refined, unsaved_layers
+from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
 from ..schema import GARMENT
 from ..stage import (
     GarmentSource,
@@ -38,17 +38,14 @@ from ..stage import (
 )
 from ..times import merge, snap, within
 from ..view import StageView
-from .apart import read_apart
+from .authored import beyond_limits_of_all, unread
 from .bodies import ColliderReader, read_collider
-from .find import felt_by, find_colliders, find_garments, instance_roots
+from .find import felt_by, find_colliders, find_garments, instance_roots, read_apart
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
-from .limits import beyond_limits_of_all
 from .materials import find_values
 from .placement import to_metres
 from .rest import AUTO
 from .skinning import Bake
-from .unread import unread
-from .variants import selections
 
 
 class Shot:

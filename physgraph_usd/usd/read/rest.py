@@ -18,7 +18,7 @@ from ...errors import GarmentError
 from ...solver.scene import out_of_bounds
 from ..lookup import nearest, source_name
 from ..stage import Notice
-from .points import as_points, repair
+from .cage import as_points, repair
 
 AUTO = "auto"
 """In place of a time code: a rest shape fitted to the animation."""

@@ -11,10 +11,9 @@ from ...solver.colliders.orient import pieces_of
 from ..schema import GARMENT_API
 from ..stage import Notice, list_meshes, metres_per_unit, open_stage, pxr_errors, quiet, read_units, shot_name
 from ..times import garment_times
-from .cage import read_cage
+from .cage import PointReader, read_cage
 from .find import has_schema, instance_roots
 from .placement import check_placement
-from .points import PointReader
 from .skinning import skel_root
 
 

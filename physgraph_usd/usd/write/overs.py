@@ -8,9 +8,10 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from ...errors import LayerError
+from ...solver.scene import Garment, GarmentFrame
 from ..schema import GARMENT_API
 from ..stage import GarmentSource, Notice
-from .carry import FineMap
+from .primvars import FineMap
 from .stream import LayerStream
 
 _TYPES = Sdf.ValueTypeNames
@@ -204,3 +205,39 @@ def _copy_collection_binding(stream: LayerStream, target: Sdf.Path, prim: Usd.Pr
         edit_schemas(stream, target, added=["MaterialBindingAPI"])
         binding = Sdf.RelationshipSpec(stream.prim(target), name, False)
         binding.targetPathList.explicitItems = [material.GetPath()]
+
+
+def author_used_values(stream: LayerStream, source: GarmentSource, garment: Garment, values: GarmentFrame) -> None:
+    """Author the fabric, guide and level that were used, except where they are animated.
+
+    Args:
+        stream: The layer.
+        source: Where the garment is; values whose source is animated are left alone.
+        garment: Its constant data.
+        values: Its data at the first time code.
+    """
+    edit_schemas(stream, source.path, added=[GARMENT_API])
+    level = source.path.AppendProperty("physgraph:refine:level")
+    stream.attribute(level, Sdf.ValueTypeNames.Int, uniform=True)
+    stream.set(level, garment.level)
+    for short, value in _used(values).items():
+        if value is None or short in source.animated:
+            continue
+        prefix = "physgraph:" if ":" in short else "physgraph:material:"
+        path = source.path.AppendProperty(prefix + short)
+        stream.attribute(path, Sdf.ValueTypeNames.Float)
+        stream.set(path, float(value))
+
+
+def _used(values: GarmentFrame) -> dict[str, float | None]:
+    """Values by short name, as in `GarmentSource.sources`."""
+    fabric = values.fabric
+    return {
+        "stretchStiffness": fabric.stretch,
+        "shearStiffness": fabric.shear,
+        "bendStiffness": fabric.bend,
+        "density": fabric.density,
+        "thickness": fabric.thickness,
+        "guide:stiffness": values.guide,
+        "refine:detail": values.detail,
+    }

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
+from scipy import sparse
 
+from ...solver.mesh.attributes import (
+    corner_values,
+    edge_subset,
+    face_subset,
+    uniform_values,
+    vertex_subset,
+    vertex_values,
+)
+from ...solver.mesh.subdivide import Refinement, compose
+from ...solver.mesh.topology import PolygonMesh
 from ..stage import Notice
-from .carry import FineMap, to_numpy, to_vt
 from .stream import LayerStream
 
 STALE = ("primvars:normals", "primvars:skel:jointIndices", "primvars:skel:jointWeights")
@@ -143,3 +155,197 @@ def carry_subsets(
             stream.set(path, Vt.IntArray())
             notices.append(Notice(str(subset.GetPrim().GetPath()), None, f"{error}; emptied"))
     return notices
+
+
+class FineMap:
+    """From a garment's authored arrays to its fine mesh."""
+
+    def __init__(
+        self, cage: PolygonMesh, refinements: Sequence[Refinement], counts: np.ndarray, kept: np.ndarray
+    ) -> None:
+        """Prepare the map.
+
+        Args:
+            cage: The coarse mesh that was refined.
+            refinements: Coarse to fine; none means that the fine mesh is the cage.
+            counts: Authored corners per face, shape (F,), dropped faces included.
+            kept: Authored faces that the cage has, shape (F_cage,).
+        """
+        self.cage = cage
+        self.fine = refinements[-1].mesh if refinements else cage
+        self._refinements = tuple(refinements)
+        self._kept = np.asarray(kept, np.int64)
+        self._face_count = len(counts)
+        self._starts = np.concatenate([[0], np.cumsum(np.asarray(counts, np.int64))])
+
+    @cached_property
+    def stencil(self) -> sparse.csr_matrix | None:
+        """From coarse to fine vertices; None at level 0."""
+        return compose(self._refinements) if self._refinements else None
+
+    @cached_property
+    def nearest_vertex(self) -> np.ndarray:
+        """Coarse vertex of each fine vertex, shape (V_fine,)."""
+        return vertex_values(self._refinements, np.arange(self.cage.vertex_count))
+
+    @cached_property
+    def parent_face(self) -> np.ndarray:
+        """Authored face of each fine face, shape (F_fine,)."""
+        return self._kept[uniform_values(self._refinements, np.arange(self.cage.face_count))]
+
+    @cached_property
+    def kept_corners(self) -> np.ndarray:
+        """Authored corner of each corner of the cage, shape (C,)."""
+        counts = np.asarray(self.cage.counts, np.int64)
+        first = np.repeat(self._starts[self._kept] - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
+        return first + np.arange(len(first))
+
+    @cached_property
+    def nearest_corner(self) -> np.ndarray:
+        """Authored corner of each fine corner, shape (C_fine,)."""
+        corners = np.arange(len(self.kept_corners))
+        indices, values = corner_values(self._refinements, self.cage.counts, corners, corners)
+        return self.kept_corners[values[indices]]
+
+    def count(self, interpolation: str) -> int:
+        """Number of authored elements of an interpolation.
+
+        Raises:
+            ValueError: The interpolation depends on no topology.
+        """
+        vertices = self.cage.vertex_count
+        counts = {
+            "vertex": vertices,
+            "varying": vertices,
+            "uniform": self._face_count,
+            "faceVarying": int(self._starts[-1]),
+        }
+        if interpolation not in counts:
+            raise ValueError(f"has interpolation {interpolation!r}; known: constant, {', '.join(counts)}")
+        return counts[interpolation]
+
+    def primvar(
+        self, interpolation: str, values: np.ndarray, *, indices: np.ndarray | None = None, smooth: bool = True
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Refine the values of one primvar.
+
+        Args:
+            interpolation: ``vertex``, ``varying``, ``uniform`` or ``faceVarying``.
+            values: Shape (N, ...).
+            indices: Value of each element where the primvar is indexed, shape (elements,).
+            smooth: Whether values between two are meaningful; otherwise the nearest parent's is taken.
+
+        Returns:
+            Fine values, or None where the authored ones stay as they are, and fine indices where it is indexed then.
+
+        Raises:
+            ValueError: The number of elements is not the mesh's, or an index is out of range.
+        """
+        elements = len(values) if indices is None else len(indices)
+        if elements != self.count(interpolation):
+            raise ValueError(f"has {elements} elements; {interpolation} needs {self.count(interpolation)}")
+        if indices is not None and len(indices) and not 0 <= indices.min() <= indices.max() < len(values):
+            raise ValueError(f"has indices from {indices.min()} to {indices.max()} into {len(values)} values")
+        if not smooth or interpolation == "uniform":
+            return self._picked(interpolation, values, indices)
+        if interpolation == "faceVarying":
+            return self._corners(values, indices)
+        flat = values if indices is None else values[indices]
+        return self.interpolate(flat), None
+
+    def interpolate(self, values: np.ndarray) -> np.ndarray:
+        """Refine floating values on vertices linearly, shape (V, ...) to (V_fine, ...), type kept."""
+        if self.stencil is None:
+            return values
+        flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+        return (self.stencil @ flat.astype(np.float64)).reshape(-1, *values.shape[1:]).astype(values.dtype)
+
+    def _picked(
+        self, interpolation: str, values: np.ndarray, indices: np.ndarray | None
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Take each fine element's value from one coarse element; words and paths by index alone."""
+        picks = {"uniform": "parent_face", "faceVarying": "nearest_corner"}.get(interpolation, "nearest_vertex")
+        chosen: np.ndarray = getattr(self, picks)
+        if indices is None and values.dtype != object:
+            return values[chosen], None
+        return None, (chosen if indices is None else indices[chosen]).astype(np.int32)
+
+    def _corners(self, values: np.ndarray, indices: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Refine values on corners along their own topology, so that seams stay seams."""
+        own = self.kept_corners if indices is None else np.asarray(indices)[self.kept_corners]
+        fine, refined = corner_values(self._refinements, self.cage.counts, own.astype(np.int32), values)
+        return (refined[fine], None) if indices is None else (refined, fine.astype(np.int32))
+
+    def subset(self, element: str, indices: np.ndarray, *, exclusive: bool = False) -> np.ndarray:
+        """Refine the indices of a subset.
+
+        Args:
+            element: ``face``, ``point`` or ``edge``.
+            indices: Authored indices; pairs of vertices for edges.
+            exclusive: Whether a vertex must not fall into two subsets of the family, and none may be lost.
+
+        Returns:
+            Fine indices, ascending, int32.
+
+        Raises:
+            ValueError: The element type is unknown or an index is out of range.
+        """
+        indices = np.asarray(indices)
+        if indices.dtype.kind not in "iu" and indices.size:
+            raise ValueError(f"has indices that are no whole numbers but {indices.dtype}")
+        indices = indices.astype(np.int64).reshape(-1)
+        if element == "edge" and len(indices) % 2:
+            raise ValueError(f"has {len(indices)} indices for edges, which need pairs")
+        limit = self._face_count if element == "face" else self.cage.vertex_count
+        if len(indices) and not 0 <= indices.min() <= indices.max() < limit:
+            raise ValueError(f"has {element} indices from {indices.min()} to {indices.max()}; the mesh has {limit}")
+        if element == "face":
+            return face_subset(self._refinements, np.flatnonzero(np.isin(self._kept, indices)))
+        if element == "point" and exclusive:
+            return np.flatnonzero(np.isin(self.nearest_vertex, indices)).astype(np.int32)
+        if element == "point":
+            return vertex_subset(self._refinements, indices)
+        if element == "edge":
+            return edge_subset(self._refinements, indices.reshape(-1, 2)).reshape(-1)
+        raise ValueError(f"has elements of type {element!r}; known: edge, face, point")
+
+
+def to_numpy(value: Any) -> tuple[np.ndarray, bool]:
+    """Bring a ``Vt`` array to numpy.
+
+    Returns:
+        The array, shape (N, ...), and whether values between two are meaningful. Quaternions are not interpolated:
+        q and -q are the same rotation.
+
+    Raises:
+        ValueError: The value is no array.
+    """
+    if not hasattr(type(value), "__len__") or not type(value).__name__.endswith("Array"):
+        raise ValueError(f"is a {type(value).__name__}, no array")
+    if not hasattr(type(value), "FromNumpy"):
+        return _objects(value), False
+    array = np.asarray(value)
+    return array, array.dtype.kind == "f" and "Quat" not in type(value).__name__
+
+
+def _objects(value: Any) -> np.ndarray:
+    """Strings, tokens and asset paths as an array of objects, shape (N,)."""
+    array = np.empty(len(value), object)
+    array[:] = list(value)
+    return array
+
+
+def to_vt(array: np.ndarray, like: Any) -> Any:
+    """Bring an array back to the ``Vt`` type that it came from.
+
+    Args:
+        array: Shape (N, ...).
+        like: A value of the wanted type.
+
+    Returns:
+        The ``Vt`` array.
+    """
+    kind = type(like)
+    if array.dtype == object:
+        return kind(array.tolist())
+    return kind.FromNumpy(np.ascontiguousarray(array))

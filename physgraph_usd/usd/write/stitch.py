@@ -39,10 +39,10 @@ from ..times import within
 from ..view import StageView
 from .atomic import prepare_target, publish, temporary_path
 from .chunk import CHUNK, Chunk, read_chunk
-from .hints import ATTRIBUTE as HINT
 from .normals import VertexNormals
 from .seams import Look, Points, Seam, between
 from .stream import LayerStream
+from .track import ATTRIBUTE as HINT
 from .track import extent_of
 
 SEAM_BOUND = 0.05

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-from pxr import Sdf, UsdGeom, Vt
+from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ...errors import LayerError
 from .normals import VertexNormals
 from .stream import LayerStream
+
+PREFIX = "primvars:physgraph:"
+HEAT = ("penetration", "crossing")
+"""Depth in the deepest body [mm], 0 outside; and 1 at the corners of edges and faces that cross, 0 elsewhere."""
+ATTRIBUTE = "extentsHint"
+_FIRST = Usd.TimeCode.EarliestTime()
+_PURPOSES = ("default", "render", "proxy", "guide")
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,3 +217,133 @@ def extent_of(points: np.ndarray) -> np.ndarray:
         return np.zeros((2, 3), np.float32)
     columns = np.ascontiguousarray(points.T)
     return np.stack([columns.min(axis=1), columns.max(axis=1)])
+
+
+class HeatTrack:
+    """Writes one garment's heat maps as they come; an attribute is authored when its first values do.
+
+    A run of equal samples is written by its first and last only.
+    """
+
+    def __init__(self, stream: LayerStream, target: Sdf.Path, count: int, *, still: bool) -> None:
+        """Author nothing yet.
+
+        Args:
+            stream: The layer.
+            target: Prim to author on.
+            count: Number of fine vertices.
+            still: Whether the garment's input has no samples: a default is written in place of the first one.
+        """
+        self._stream, self._target, self._count, self._still = stream, target, count, still
+        self._runs: dict[str, tuple[np.ndarray, float | None]] = {}
+
+    def check(self, heat: Mapping[str, np.ndarray], time: float | None) -> None:
+        """Refuse values that are not one finite number a vertex.
+
+        Raises:
+            LayerError: Naming the primvar and the time.
+        """
+        for name, values in heat.items():
+            place = f"<{self._path(name)}>" + ("" if time is None else f" at time code {time:g}")
+            if name not in HEAT:
+                raise LayerError(f"{place}: no such heat map; known: {', '.join(HEAT)}")
+            if values.shape != (self._count,) or not np.isfinite(values).all():
+                raise LayerError(f"{place}: needs {self._count} finite values, got shape {values.shape}")
+
+    def write(self, time: float | None, heat: Mapping[str, np.ndarray]) -> None:
+        """Take one time code.
+
+        Args:
+            time: Time code, or None for the default of a shot without samples.
+            heat: Values by name, each of shape (V,); a map that is left out has no sample here.
+        """
+        for name, given in heat.items():
+            values = np.ascontiguousarray(given, np.float32)
+            if name not in self._runs:
+                path = self._path(name)
+                self._stream.attribute(path, Sdf.ValueTypeNames.FloatArray, interpolation=UsdGeom.Tokens.vertex)
+                self._set(name, None if self._still else time, values)
+                self._runs[name] = values, time if self._still else None
+                continue
+            last, held = self._runs[name]
+            if np.array_equal(values, last):
+                self._runs[name] = last, time
+                continue
+            if held is not None:
+                self._set(name, held, last)
+            self._set(name, time, values)
+            self._runs[name] = values, None
+
+    def finish(self, *, hold: bool = False) -> None:
+        """Author the ends of runs of equal samples where further samples are to follow them (``hold``)."""
+        for name, (last, held) in self._runs.items() if hold else ():
+            if held is not None and not self._still:
+                self._set(name, held, last)
+
+    def _path(self, name: str) -> Sdf.Path:
+        return self._target.AppendProperty(PREFIX + name)
+
+    def _set(self, name: str, time: float | None, values: np.ndarray) -> None:
+        self._stream.set(self._path(name), Vt.FloatArray.FromNumpy(values), time=time)
+
+
+class ModelHints:
+    """Grows the authored hints of one garment's ancestors so that they hold the fine cloth."""
+
+    def __init__(self, stream: LayerStream, stage: Usd.Stage, path: Sdf.Path, *, purpose: str) -> None:
+        """Find the ancestors with a hint.
+
+        Args:
+            stream: The layer.
+            stage: The shot.
+            path: The coarse garment.
+            purpose: Purpose of the fine mesh, which chooses the box to grow.
+        """
+        self._stream, self._stage = stream, stage
+        self._prim = stage.GetPrimAtPath(path)
+        self._row = 2 * _PURPOSES.index(purpose if purpose in _PURPOSES else "default")
+        self._models = []
+        prim = self._prim
+        while prim and not prim.IsPseudoRoot():
+            attribute = prim.GetAttribute(ATTRIBUTE)
+            if attribute and attribute.HasAuthoredValue() and isinstance(attribute.Get(_FIRST), Vt.Vec3fArray):
+                self._models.append(prim)
+            prim = prim.GetParent()
+
+    def write(self, time: float | None, box: np.ndarray) -> None:
+        """Grow the hints by one box.
+
+        Args:
+            time: Time code, or None.
+            box: Local extent of the fine mesh, shape (2, 3).
+        """
+        if not self._models:
+            return
+        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        cache = UsdGeom.XformCache(code)
+        corners = np.array([[box[i][0], box[j][1], box[k][2], 1.0] for i, j, k in product((0, 1), repeat=3)])
+        local = np.array(cache.GetLocalToWorldTransform(self._prim))
+        for model in self._models:
+            inverse = np.linalg.pinv(np.array(cache.GetLocalToWorldTransform(model)))
+            grown = (corners @ local @ inverse)[:, :3]
+            if np.isfinite(grown).all():
+                self._grow(model, time, grown)
+
+    def _grow(self, model: Usd.Prim, time: float | None, corners: np.ndarray) -> None:
+        """Author the union of a hint and eight corners, at a time where the hint is animated, else as default."""
+        attribute = model.GetAttribute(ATTRIBUTE)
+        time = time if attribute.GetNumTimeSamples() > 0 else None
+        path = model.GetPath().AppendProperty(ATTRIBUTE)
+        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        spec = self._stream.attribute(path, Sdf.ValueTypeNames.Float3Array)
+        ours = self._stream.layer.QueryTimeSample(path, time) if time is not None else spec.default
+        value = attribute.Get(code) if ours is None else ours
+        rows = np.array(value if value is not None else [], np.float32).reshape(-1, 3)
+        empty = np.tile(np.array([[np.finfo(np.float32).max], [-np.finfo(np.float32).max]], np.float32), (1, 3))
+        while len(rows) < self._row + 2:
+            rows = np.concatenate([rows, empty])
+        low, high = rows[self._row], rows[self._row + 1]
+        grown = rows.copy()
+        grown[self._row] = np.minimum(low, corners.min(axis=0))
+        grown[self._row + 1] = np.maximum(high, corners.max(axis=0))
+        self._stream.set(path, Vt.Vec3fArray.FromNumpy(grown), time=time)

@@ -24,15 +24,12 @@ from ..files import check_targets, files_of
 from ..read.reader import Shot
 from ..stage import Notice, pxr_errors
 from . import overs
-from .carry import FineMap
 from .chunk import CHUNK, Chunk
-from .heat import HeatTrack
-from .hints import ModelHints
-from .material_opinions import author_used_values
 from .normals import VertexNormals
-from .primvars import carry_primvars, carry_subsets
+from .overs import author_used_values
+from .primvars import FineMap, carry_primvars, carry_subsets
 from .stream import LayerStream
-from .track import PointTrack, extent_of, to_local
+from .track import HeatTrack, ModelHints, PointTrack, extent_of, to_local
 
 MODES = ("over", "sibling")
 
