@@ -177,7 +177,7 @@ UNREGISTERED = """
 from pxr import Usd, UsdGeom
 stage = Usd.Stage.CreateInMemory()
 UsdGeom.Mesh.Define(stage, "/a").GetPrim().GetAttribute("points").HasFallbackValue()
-from physgraph_usd.usd.reader import open_shot
+from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import register
 register()
 shot = open_shot({path!r})
