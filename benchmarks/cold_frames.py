@@ -36,7 +36,7 @@ from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.level import hinge_geometry
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
-from .contact_shots import LANES, REAL, SAMPLES, groups_of
+from .contact_shots import REAL, SAMPLES, THREADS, groups_of
 
 MORE_SAMPLES = ("sleeve", "flag", "swatch")
 FREE = {"07_flag_quads_nocollider.usda": (["/shot/flag"], [])}
@@ -119,7 +119,7 @@ def main(
             shot, short = _opened(name, Path(place), folder), Path(name).parts[0].split(".")[0]
             times = shot.scene.times
             picks = np.unique(np.linspace(0, len(times) - 1, min(count, len(times))).round().astype(int))
-            refiner = Refiner(shot.scene, settings, levels=[level] * len(shot.scene.garments), lanes=LANES)
+            refiner = Refiner(shot.scene, settings, levels=[level] * len(shot.scene.garments), threads=THREADS)
             row = Row()
             for pick in picks:
                 own = Row() if whole else row

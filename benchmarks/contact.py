@@ -37,7 +37,7 @@ WARM = 13
 TRAVEL = 0.05
 """Angle by which its folds travel round the ball between frames."""
 SHEET = SheetOverBall(side=79, edge=0.02, radius=0.4)
-LANES = 2
+THREADS = 2
 
 
 def main() -> None:
@@ -79,7 +79,7 @@ def cold_frames(device: str) -> None:
             measure[name].append(state.telemetry[0]["milliseconds"]["measure"])  # type: ignore[index]
             said[name] = state.telemetry[0].get("contact")
             count = len(state.points[0]) if state.points[0] is not None else 0
-    say(f"sheet of {count} fine vertices over a ball of {len(ball.triangles)} triangles, {LANES} threads, cold frames")
+    say(f"sheet of {count} vertices over a ball of {len(ball.triangles)} triangles, {THREADS} threads, cold frames")
     say("\n| case | frame ms | steps alone ms | measuring ms | frame / switched off | of processor time |")
     say("|---|---|---|---|---|---|")
     bases = [statistics.median(values["switched off"][1:]) for values in (times, work)]
@@ -122,7 +122,7 @@ def _turned(ball: MeshPose, index: int) -> MeshPose:
 def _refiner(scene: Scene, form: str, cloth: str, *, device: str, temporal: str = "off") -> Refiner:
     contact = ContactSettings(form, cloth=cloth)
     settings = SolveSettings(method_named("quasi-newton"), temporal=temporal, contact=contact)
-    return Refiner(replace(scene), settings, device=device, lanes=LANES)
+    return Refiner(replace(scene), settings, device=device, threads=THREADS)
 
 
 def say(line: str) -> None:

@@ -157,7 +157,7 @@ def measured(shot: Path, time: float, refined: Sequence[Sequence[DrawnMesh]]) ->
     opened.close()
     chains = refine_garments(scene.garments, [LEVEL] * len(scene.garments))
     levels = build_levels([recentred(g) for g in scene.garments], chains, dtype=torch.float32, device="cpu")
-    bodies = Bodies(scene.colliders, device="cpu", lanes=1)
+    bodies = Bodies(scene.colliders, device="cpu", threads=1)
     bodies.pose(frame.colliders)
     every = range(len(scene.colliders))
     parts = list(zip(scene.garments, frame.garments, strict=True))

@@ -47,7 +47,7 @@ REAL = {
     "10_style3d_skirt_twist.usdc": (["/shot/skirt"], ["/shot/avatar"], 20),
 }
 """Real shots: garments, bodies and the number of the first frame here."""
-LANES = 2
+THREADS = 2
 JUMP = 0.02
 """Second difference of a vertex's detail from frame to frame beyond which it jumps [m]."""
 
@@ -173,7 +173,7 @@ def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSett
     from physgraph_usd.shot.options import RefineOptions  # noqa: PLC0415
 
     solve = replace(RefineOptions().solve_settings(), contact=settings)
-    refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), device=device, lanes=LANES)
+    refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), device=device, threads=THREADS)
     sums, spent, details = Sums(), list[float](), list[np.ndarray]()
     for time_code in shot.scene.times[first : first + count]:
         frame = shot.frame(time_code)

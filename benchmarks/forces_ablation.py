@@ -109,7 +109,7 @@ def solved(shot: Shot, forces: Forces) -> tuple[np.ndarray, ...]:
         form=COLD.contact.form if forces.body else "off",
         cloth=COLD.contact.cloth if forces.cloth else "off",
     )
-    problem = Problem(scene, [garment.level for garment in scene.garments], device="cpu", lanes=CORES)
+    problem = Problem(scene, [garment.level for garment in scene.garments], device="cpu", threads=CORES)
     return problem.solve(frame, replace(COLD, contact=contact)).points
 
 

@@ -150,8 +150,8 @@ class Bench:
         """
         levels = [about["level"]] * len(shot.scene.garments)
         self._about, self._frame, self._journal = about, frame, journal
-        self._timed = Problem(shot.scene, levels, device=device, lanes=1, clock="cpu" if device == "cpu" else "wall")
-        self._judge = Problem(shot.scene, levels, device="cpu", lanes=1, dtype=torch.float64)
+        self._timed = Problem(shot.scene, levels, device=device, threads=1, clock="cpu" if device == "cpu" else "wall")
+        self._judge = Problem(shot.scene, levels, device="cpu", threads=1, dtype=torch.float64)
         self._rows: list[dict[str, Any]] = []
 
     def run(self, known: set[tuple[str, int]]) -> list[dict[str, Any]]:

@@ -108,7 +108,7 @@ def run(
         Fine positions [m], shape (V, 3), and telemetry of each frame; where it failed those of the frame before.
     """
     scene, ball = SHEET.scene(subdivisions=4)
-    refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[level], lanes=2)
+    refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[level], threads=2)
     told: list[tuple[np.ndarray, dict[str, Any]]] = []
     for index in range(first, at + 1 + after):
         points = SHEET.draped(0.002, travel * index) + index * DRIFT

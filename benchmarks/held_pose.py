@@ -23,7 +23,7 @@ from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.scene import Frame
 
-from .contact_shots import LANES, REAL, SAMPLES, open_one
+from .contact_shots import REAL, SAMPLES, THREADS, open_one
 
 DRIFT = np.array([1e-6, 0.0, 0.0])
 """Of the cage, a frame [m]."""
@@ -81,7 +81,7 @@ def held(name: str, place: Path, folder: Path | None = None, *, level: int, fram
     shot, at = open_one(name, place, folder)
     times = shot.scene.times[max(at - lead, 0) : at + 1]
     settings = RefineOptions().solve_settings()
-    refiner = Refiner(shot.scene, settings, levels=[level] * len(shot.scene.garments), device="cpu", lanes=LANES)
+    refiner = Refiner(shot.scene, settings, levels=[level] * len(shot.scene.garments), device="cpu", threads=THREADS)
     given = [shot.frame(time) for time in times]
     given += [_held(given[-1], count) for count in range(1, frames + 1)]
     solved = [refiner.solve(frame).points for frame in given][-LAST - 1 :]

@@ -36,7 +36,7 @@ def opened(name: str, level: int | None = None, garments: Sequence[str] = ()) ->
 def problem_of(shot: Shot, dtype: torch.dtype = torch.float32) -> Problem:
     """The shot's frames, to be solved in any way."""
     levels = [garment.level for garment in shot.scene.garments]
-    return Problem(shot.scene, levels, device="cpu", lanes=CORES, dtype=dtype)
+    return Problem(shot.scene, levels, device="cpu", threads=CORES, dtype=dtype)
 
 
 def frames_of(shot: Shot, times: Sequence[float]) -> list[Frame]:

@@ -67,7 +67,7 @@ def main() -> None:
             settings,
             dtype=torch.float32,
             device="cpu",
-            lanes=CORES,
+            threads=CORES,
         )
         finest = single.levels[-1]
         say(f"sleeve, last frame: {finest.vertex_count} fine vertices, {len(finest.edges)} edges")

@@ -65,7 +65,7 @@ def rows(short: bool) -> Found:
 def frozen() -> tuple[int, int]:
     """Frames of a still shot that are the first one's bytes, and all of its frames."""
     shot = opened("frozen", 1)
-    refiner = Refiner(shot.scene, RefineOptions().solve_settings(), lanes=CORES)
+    refiner = Refiner(shot.scene, RefineOptions().solve_settings(), threads=CORES)
     states = [np.asarray(refiner.solve(shot.frame(time)).points[0]).tobytes() for time in shot.scene.times]
     return sum(state == states[0] for state in states), len(states)
 
@@ -73,7 +73,7 @@ def frozen() -> tuple[int, int]:
 def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
     """Jerk of the detail [mean fine edges] and mean energy [J] of a shot's first frames."""
     settings = replace(RefineOptions(temporal=temporal).solve_settings(), tether=stiffness)
-    refiner = Refiner(shot.scene, settings, lanes=CORES)
+    refiner = Refiner(shot.scene, settings, threads=CORES)
     details, energies = [], []
     for time in shot.scene.times[:FRAMES]:
         frame = shot.frame(time)

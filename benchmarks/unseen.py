@@ -44,7 +44,7 @@ SHOTS: dict[str, tuple[str, float | None]] = {
 """Samples and, where the folder of real assets is there, shots: garment and time code (None: the last)."""
 FABRICS = ("jersey", "denim", "silk")
 LEVEL = 2
-LANES = os.cpu_count() or 1
+THREADS = os.cpu_count() or 1
 
 
 @dataclass(eq=False)
@@ -111,7 +111,7 @@ def reference_of(
 ) -> Reference:
     """The least energy known of a garment that touches nothing, in one frame."""
     scene = Scene((garment,), gravity, ())
-    problem = Problem(scene, [level], device=device, lanes=LANES, dtype=torch.float64)
+    problem = Problem(scene, [level], device=device, threads=THREADS, dtype=torch.float64)
     return find_reference(problem, Frame(None, (frame,)), settings=ALONE, short=short)
 
 
@@ -193,4 +193,4 @@ def plain_group(garment: Garment, gravity: np.ndarray, dtype: torch.dtype, *, le
     """One garment's levels, without contact."""
     settings = SolveSettings(method_named("quasi-newton"))
     chains = refine_garments([garment], [level])
-    return Group([garment], chains, gravity, settings, dtype=dtype, device=device, lanes=LANES)
+    return Group([garment], chains, gravity, settings, dtype=dtype, device=device, threads=THREADS)

@@ -61,7 +61,7 @@ def split(soup: Soup) -> Soup:
 
 def surfaces(soup: Soup) -> tuple[MeshSurface, ...]:
     """The closed and the open part, posed."""
-    return MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))
+    return MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
 
 
 def distances(soup: Soup, x: np.ndarray) -> np.ndarray:

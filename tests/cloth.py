@@ -69,12 +69,12 @@ def refiner_of(
     times: Sequence[float] = (),
     gravity: np.ndarray = DOWN,
     dtype: torch.dtype = torch.float64,
-    lanes: int = 1,
+    threads: int = 1,
     **options: Any,
 ) -> Solver:
     """A refiner of garments, all at one level."""
     scene = Scene(tuple(garments), gravity, tuple(times))
-    return Solver(Refiner(scene, settings_of(**options), levels=[level] * len(garments), dtype=dtype, lanes=lanes))
+    return Solver(Refiner(scene, settings_of(**options), levels=[level] * len(garments), dtype=dtype, threads=threads))
 
 
 def frame_of(points: np.ndarray, time: float | None = None, *, fabric: Fabric = FABRIC, guide: float = GUIDE) -> Frame:

@@ -18,7 +18,7 @@ TOP = float(REST[:, 1].max())
 
 def near(gap: float, *, margin: float, offset: float, kind: str = "cube") -> bool:
     """Whether a body that lies a gap above the sheet's bounds counts."""
-    bodies = Bodies([Collider("/World/Body", kind, offset)], device="cpu", lanes=1)
+    bodies = Bodies([Collider("/World/Body", kind, offset)], device="cpu", threads=1)
     centre = np.array([0.1, TOP + gap + 0.5, 0.0])
     if kind == "mesh":
         corners = np.array([[0.0, TOP + gap, 0.0], [0.1, TOP + gap, 0.0], [0.0, TOP + gap + 0.1, 0.1]])
@@ -49,6 +49,6 @@ def test_a_body_counts_within_the_margin_and_its_own_offset(
 
 
 def test_one_without_a_pose_does_not():
-    bodies = Bodies([Collider("/World/Body", "cube")], device="cpu", lanes=1)
+    bodies = Bodies([Collider("/World/Body", "cube")], device="cpu", threads=1)
     bodies.pose([None])
     assert bodies.near(replace(garment_of(MESH, REST), colliders=(0,)), bounds_of(REST), 1e9) == ()

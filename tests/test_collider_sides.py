@@ -29,7 +29,7 @@ FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array(
 
 
 def surfaces(soup: Soup, side: str) -> tuple[MeshSurface, ...]:
-    return MeshBody(side=side, device="cpu", lanes=1).pose(MeshPose(*soup))
+    return MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*soup))
 
 
 def signed(surface: MeshSurface, x: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:

@@ -132,7 +132,7 @@ class TestMeshes:
 
     def test_a_pose_moves_the_surface(self):
         points, triangles = ball()
-        body = MeshBody(device="cpu", lanes=1)
+        body = MeshBody(device="cpu", threads=1)
         body.pose(MeshPose(points, triangles))
         (surface,) = body.pose(MeshPose(2.0 * points + 5.0, triangles))
         x = np.array([[5.0, 5.0, 5.5]])
@@ -140,7 +140,7 @@ class TestMeshes:
 
     def test_what_stands_still_is_not_posed_again(self, monkeypatch):
         points, triangles = ball()
-        body = MeshBody(device="cpu", lanes=1)
+        body = MeshBody(device="cpu", threads=1)
         body.pose(MeshPose(points, triangles))
         posed: list[MeshPose] = []
         monkeypatch.setattr(MeshSurface, "repose", lambda _, pose: posed.append(pose))
@@ -159,7 +159,7 @@ class TestMeshes:
         turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
         move = 0.0 if rigid else 0.02 * second
         later = MeshPose((points + move * np.array([-1.0, 0.0, 0.0])) @ turn.T + 0.3, triangles)
-        body, every = MeshBody(device="cpu", lanes=1), torch.arange(len(triangles), dtype=torch.int32)
+        body, every = MeshBody(device="cpu", threads=1), torch.arange(len(triangles), dtype=torch.int32)
         (surface,) = body.pose(MeshPose(points, triangles))
         surface._is_mute(every)
         asked, lifted = list[int](), MeshSurface._lifted_inside
@@ -176,7 +176,7 @@ class TestMeshes:
         assert torch.equal(surface.closest(x, endless(len(x))).side, fresh.closest(x, endless(len(x))).side)
 
     def test_the_topology_may_change(self):
-        body = MeshBody(device="cpu", lanes=1)
+        body = MeshBody(device="cpu", threads=1)
         body.pose(MeshPose(*ball()))
         (surface,) = body.pose(MeshPose(*box()))
         assert signed_by(surface, np.zeros((1, 3)))[0] == pytest.approx(-0.1, abs=1e-6)
@@ -255,7 +255,7 @@ class TestBuried:
 
     def test_through_a_hole_one_sees_the_sky_from_inside(self):
         """Of a tube with a ball in it: the ball's corners look out at the ends, and all are buried."""
-        body = MeshBody(side="winding", device="cpu", lanes=1)
+        body = MeshBody(side="winding", device="cpu", threads=1)
         (surface,) = body.pose(MeshPose(*together(tube(0.1, 0.4), ball(0.05))))
         radius = np.linalg.norm(surface.mesh.points.numpy() + surface.origin, axis=1)
         inner = torch.as_tensor(np.flatnonzero(radius < 0.051))

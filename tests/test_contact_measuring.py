@@ -63,7 +63,7 @@ class TestBodies:
     def begun(self) -> tuple[FrameBodies, Level, torch.Tensor]:
         """A sheet over a ball and just clear of it, with what is known of it."""
         levels = levels_of(named((MESH, HANGING)))
-        surface = MeshBody(device="cpu", lanes=1).pose(MeshPose(BALL[0] - 0.13 * NORMAL, BALL[1]))[0]
+        surface = MeshBody(device="cpu", threads=1).pose(MeshPose(BALL[0] - 0.13 * NORMAL, BALL[1]))[0]
         cage = torch.as_tensor(HANGING, dtype=torch.float32)
         body = Touching("/Ball", surface, (0.002,))
         return (

@@ -144,7 +144,7 @@ def test_what_a_bodys_normals_tell_is_the_same_asked_together(monkeypatch: pytes
     x, told = np.random.default_rng(1).uniform([-0.3, -0.3, -0.3], [0.5, 0.3, 0.3], (2000, 3)), []
     for device, most in (("cpu", 0), ("cuda", 0), ("cuda", 10_000)):
         monkeypatch.setattr("physgraph_usd.solver.colliders.mesh.TOGETHER", most)
-        (surface,) = MeshBody(device=device, lanes=1).pose(MeshPose(points, faces.astype(np.int32)))
+        (surface,) = MeshBody(device=device, threads=1).pose(MeshPose(points, faces.astype(np.int32)))
         asked = torch.as_tensor(x - surface.origin, device=device)
         told.append(surface.closest(asked, torch.full_like(asked[:, 0], torch.inf)).side.cpu())
     assert torch.equal(told[1], told[2])

@@ -51,7 +51,7 @@ class TestPenetration:
     def test_in_a_mesh_it_is_libigls_distance(self):
         soup = ball(level=4)
         x = np.random.default_rng(1).uniform(-0.25, 0.25, (400, 3))
-        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))
+        (surface,) = MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
         inside = np.linalg.norm(x, axis=1) < 0.199
         clear = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 2e-3
         found = penetration_map([surface], x, NO_EDGES)
@@ -59,7 +59,7 @@ class TestPenetration:
 
     @pytest.mark.parametrize(("side", "depth"), [("auto", 0.0), ("back", 0.0), ("front", 20.0)])
     def test_an_open_body_has_a_behind_only_where_its_side_is_fixed(self, side: str, depth: float):
-        (surface,) = MeshBody(side=side, device="cpu", lanes=1).pose(MeshPose(*tube(around=256)))
+        (surface,) = MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*tube(around=256)))
         found = penetration_map([surface], np.array([[0.08, 0.0, 0.0]]), NO_EDGES)
         assert found[0] == pytest.approx(depth, abs=0.1)
 
@@ -69,7 +69,7 @@ class TestCrossings:
         """A level sheet through a ball: its edges between inside and outside, and nothing away from the surface."""
         x, faces = level_sheet()
         soup = ball(0.2, level=3)
-        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))
+        (surface,) = MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
         edges = edges_of(faces, len(x)).vertices
         found = body_crossings([surface], x, edges, triangles=faces)
         radius = np.linalg.norm(x, axis=1)[edges]
@@ -87,7 +87,7 @@ class TestCrossings:
         base = np.array([[1e-3, 1e-3, 1e-3], [-1e-3, 1e-3, -1e-3], [1e-3, -1e-3, -1e-3]])
         spike = np.concatenate([[0.3 * normal], base - 0.3 * normal]) + at
         sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [3, 2, 1]])
-        (surface,) = MeshBody(device="cpu", lanes=1).pose(MeshPose(spike, sides))
+        (surface,) = MeshBody(device="cpu", threads=1).pose(MeshPose(spike, sides))
         found = body_crossings([surface], x, edges_of(faces, len(x)).vertices, triangles=faces)
         assert np.flatnonzero(found).tolist() == sorted(faces[7].tolist())
 

@@ -28,7 +28,7 @@ OVER, UNDER = (ball(0.15, at=(0.0, side * 0.13, 0.0), level=4) for side in (1.0,
 
 def bodies_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> FrameBodies:
     """A frame's bodies, meshes all."""
-    posed = [MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))[0] for soup in soups]
+    posed = [MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))[0] for soup in soups]
     touching = [Touching(f"/Body{index}", each, (0.002,)) for index, each in enumerate(posed)]
     return FrameBodies.begin(levels, touching, cage, origin=np.zeros(3), settings=SETTINGS)
 

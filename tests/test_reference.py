@@ -23,7 +23,7 @@ from physgraph_usd.solver.scene import Frame, Scene
 def squeezed() -> tuple[Problem, Frame]:
     """A sheet of 6 by 4 cells that is squeezed by a fifth and buckles."""
     mesh, rest = sheet(6, 4)
-    problem = Problem(Scene((garment_of(mesh, rest),), DOWN, ()), [2], device="cpu", lanes=1, dtype=torch.float64)
+    problem = Problem(Scene((garment_of(mesh, rest),), DOWN, ()), [2], device="cpu", threads=1, dtype=torch.float64)
     return problem, frame_of(wave(rest, squeeze=0.2))
 
 

@@ -31,7 +31,7 @@ class TestRepairedCage:
         levels = levels_of(garment)
         for points in (cloth[1], crumpled(cloth[1])):
             cage = torch.as_tensor(points, dtype=torch.float32)
-            surface = MeshBody(device="cpu", lanes=1).pose(MeshPose(*ball(0.1)))[0]
+            surface = MeshBody(device="cpu", threads=1).pose(MeshPose(*ball(0.1)))[0]
             body, settings = Touching("/Ball", surface, (0.002,)), ContactSettings(stiffness=1.0)
             bodies = FrameBodies.begin(levels, [body], cage, origin=np.zeros(3), settings=settings)
             view = bodies.at(levels[0], levels[-1])

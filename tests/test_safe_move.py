@@ -182,9 +182,9 @@ class TestWhatIsFreeToGoGoes:
 class TestTheSame:
     def test_each_time_and_in_any_number_of_threads(self):
         results = []
-        for lanes in (1, 1, 2):
+        for threads in (1, 1, 2):
             scenes = Scenes(40, gap=1e-2, far=0.0, dtype=torch.float32)
-            scenes.parts.level = replace(scenes.level, lanes=lanes)
+            scenes.parts.level = replace(scenes.level, threads=threads)
             results.append(scenes.go(wanted_of(scenes, np.random.default_rng(5))).x)
         assert torch.equal(results[0], results[1])
         assert torch.equal(results[0], results[2])

@@ -105,7 +105,7 @@ def trough() -> Soup:
 def view_of(soup: Soup) -> tuple[Level, LevelBodies]:
     """The finest level of a small sheet, and what it sees of a body."""
     levels = levels_of(named(square(6)))
-    surface = MeshBody(device="cpu", lanes=1).pose(MeshPose(*soup))[0]
+    surface = MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))[0]
     cage = levels[0].rest
     touching = [Touching("/Trough", surface, (OFFSET,))]
     bodies = FrameBodies.begin(levels, touching, cage, origin=np.zeros(3), settings=ContactSettings(stiffness=1.0))

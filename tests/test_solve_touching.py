@@ -124,7 +124,7 @@ class TestPlanes:
     def test_those_of_vertices_that_stay_are_not_looked_for_again(self, monkeypatch):
         garment = named(square(6))
         levels = levels_of(garment)
-        surface = MeshBody(device="cpu", lanes=1).pose(MeshPose(*ball(0.2, at=(0.0, -0.201, 0.0))))[0]
+        surface = MeshBody(device="cpu", threads=1).pose(MeshPose(*ball(0.2, at=(0.0, -0.201, 0.0))))[0]
         cage = torch.as_tensor(garment.rest, dtype=torch.float32)
         body = Touching("/Ball", surface, (0.002,))
         settings = ContactSettings(stiffness=1.0)

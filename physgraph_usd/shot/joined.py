@@ -23,7 +23,7 @@ import numpy as np
 
 from ..errors import LayerError
 from ..solver.frame.pipeline import Refiner
-from ..solver.mesh.lanes import start_warp
+from ..solver.mesh.threads import start_warp
 from ..solver.scene import Frame
 from ..usd.read.reader import Shot
 from ..usd.stage import is_there
@@ -164,8 +164,8 @@ class Looking:
         """Move cloth safely from the nearer solution to joined positions, and compare what crosses then with both."""
         if self._refiner is None:
             start_warp()
-            lanes = os.cpu_count() or 1
-            given = {"levels": self._levels, "device": self._options.device, "lanes": lanes}
+            threads = os.cpu_count() or 1
+            given = {"levels": self._levels, "device": self._options.device, "threads": threads}
             self._refiner = Refiner(self._opened.scene, self._options.solve_settings(), **given)
         found = self._refiner.moved_safely(frame, near, made)
         told = [[each for _, each in self._refiner.moved_safely(frame, side, side)] for side in (near, far)]

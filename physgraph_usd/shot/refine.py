@@ -20,7 +20,7 @@ from ..solver.frame.history import told_broken, told_jumped
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.pipeline import Refiner
 from ..solver.integrate.metric import FACTOR
-from ..solver.mesh.lanes import kernels_are_kept, start_warp
+from ..solver.mesh.threads import kernels_are_kept, start_warp
 from ..solver.resolution import too_coarse
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED, is_result_of, write_root
@@ -47,7 +47,7 @@ try:
     import resource
 except ImportError:  # Windows has none.
     resource = None
-MOST_LANES = 4
+MOST_THREADS = 4
 """Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
 SLOWER = "cholespy is not installed: matrices are factorised by scipy, which is slower"
 TIMED_FRAMES, LONG_RUN = 3, 60.0
@@ -276,7 +276,7 @@ def _timed(opened: Shot, found: dict[str, Any], options: RefineOptions) -> dict[
     """Wall time of a frame from nothing, of the one after it, and of the whole shot by these [s]."""
     prepare_device(options.device)
     levels = [garment["level"] for garment in found["garments"]]
-    own = {"device": options.device, "lanes": min(MOST_LANES, max(1, os.cpu_count() or 1))}
+    own = {"device": options.device, "threads": min(MOST_THREADS, max(1, os.cpu_count() or 1))}
     refiner = Refiner(opened.scene, options.solve_settings(), levels=levels, **own)
     times, spent = list(opened.scene.times) or [None], []
     middle = (len(times) - 1) // 2
@@ -312,7 +312,7 @@ class _ShotSolver:
     def __init__(self, shot: str, levels: list[int], options: RefineOptions) -> None:
         self.levels = levels
         self._shot, self._options = shot, dataclasses.replace(options, progress=None)
-        self._lanes = min(MOST_LANES, max(1, (os.cpu_count() or 1) // options.workers))
+        self._threads = min(MOST_THREADS, max(1, (os.cpu_count() or 1) // options.workers))
         self._opened: Shot | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -331,7 +331,7 @@ class _ShotSolver:
         prepare_device(device)
         shot = self._opened = self._opened or _open(self._shot, self._options)
         settings = self._options.solve_settings()
-        options = {"device": device, "lanes": self._lanes, "heat_map": self._options.heat_map}
+        options = {"device": device, "threads": self._threads, "heat_map": self._options.heat_map}
         refiner = Refiner(shot.scene, settings, levels=self.levels, **options)
         self._lead_in(shot, refiner, times)
         for time in times:
@@ -349,7 +349,7 @@ class _ShotSolver:
     def _lead_in(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
         """Begin in the middle of a shot, where its cage crosses, with the cage walked there from an earlier frame."""
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
-        own = {"times": earlier, "device": self._options.device, "lanes": self._lanes}
+        own = {"times": earlier, "device": self._options.device, "threads": self._threads}
         found = cages_walked(shot.scene, self._options.solve_settings(), shot.frame, **own)
         if found is not None:
             refiner.begin_at(found[0], since=found[1])

@@ -17,7 +17,7 @@ from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import MeshPose
 from ..solver.contact.broad_phase import bounds_of
 from ..solver.contact.nearby import NEAR, share_at, smallest_body
-from ..solver.mesh.lanes import start_warp
+from ..solver.mesh.threads import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Frame
 from ..usd.read.reader import Shot, open_shot
@@ -67,7 +67,7 @@ def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
     least, found = smallest_body(shot.scene.garments), []
     for path, poses in meshes_beside(shot, [frame.time for frame in looked], boxes, least=least):
         start_warp()
-        body = MeshBody(device="cpu", lanes=1)
+        body = MeshBody(device="cpu", threads=1)
         for index, pose in poses:
             cages = zip(shot.scene.garments, looked[index].garments, strict=True)
             shares = {g.path: share_at(body, pose, g, own.points) for g, own in cages if isinstance(pose, MeshPose)}

@@ -78,7 +78,7 @@ class Level:
         from_below: Linear map from the level below, None at the first level.
         smooth_from_below: Smooth map from there, None at the first level.
         flat_from_below: Map onto the triangles of the level below, None at the first level.
-        lanes: Most threads that a kernel over the level uses on the CPU.
+        threads: Most threads that a kernel over the level uses on the CPU.
     """
 
     index: int
@@ -111,7 +111,7 @@ class Level:
     from_below: Stencil | None
     smooth_from_below: Stencil | None
     flat_from_below: Stencil | None
-    lanes: int = 1
+    threads: int = 1
 
     @property
     def dtype(self) -> torch.dtype:
@@ -136,7 +136,7 @@ class Level:
     @cached_property
     def lengths(self) -> EdgeLengths:
         """Gives the edges' lengths at positions [m]."""
-        return EdgeLengths(self.edges, self.rest, lanes=self.lanes)
+        return EdgeLengths(self.edges, self.rest, threads=self.threads)
 
     def normals(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
         """The triangles' normals at x [m], twice their areas long [m^2]."""
@@ -144,17 +144,17 @@ class Level:
 
     @cached_property
     def _normals(self) -> TriangleNormals:
-        return TriangleNormals(self.triangles, self.rest, lanes=self.lanes)
+        return TriangleNormals(self.triangles, self.rest, threads=self.threads)
 
     @cached_property
     def base(self) -> Stencil:
         """Linear map from cage positions to this level."""
-        return Stencil(self.from_coarse, dtype=self.dtype, device=self.device, lanes=self.lanes)
+        return Stencil(self.from_coarse, dtype=self.dtype, device=self.device, threads=self.threads)
 
     @cached_property
     def smooth_base(self) -> Stencil:
         """Smooth map from cage positions to this level."""
-        return Stencil(self.smooth_from_coarse, dtype=self.dtype, device=self.device, lanes=self.lanes)
+        return Stencil(self.smooth_from_coarse, dtype=self.dtype, device=self.device, threads=self.threads)
 
 
 def refine_garments(garments: Sequence[Garment], levels: Sequence[int]) -> list[tuple[Refinement, ...]]:
@@ -176,7 +176,7 @@ def build_levels(
     *,
     dtype: torch.dtype = torch.float32,
     device: str = "cpu",
-    lanes: int = 1,
+    threads: int = 1,
 ) -> tuple[Level, ...]:
     """Build every level of garments that are solved together, the cage itself first.
 
@@ -187,7 +187,7 @@ def build_levels(
         refinements: Their refinements, as `refine_garments` gives them.
         dtype: Scalar type of the tensors.
         device: Their device.
-        lanes: Most threads that a kernel uses on the CPU.
+        threads: Most threads that a kernel uses on the CPU.
 
     Returns:
         Levels, coarsest first.
@@ -200,9 +200,9 @@ def build_levels(
         if index:
             maps = zip(*((part.linear_step, part.smooth_step, part.flat_step) for part in parts), strict=True)
             whole = [sp.csr_matrix(sp.block_diag(each)) for each in maps] or [sp.csr_matrix((0, 0))] * 3
-            below = [Stencil(each, dtype=dtype, device=device, lanes=lanes) for each in whole]
+            below = [Stencil(each, dtype=dtype, device=device, threads=threads) for each in whole]
             below[2] = below[2] if abs(whole[2] - whole[0]).sum() > 0 else below[0]
-        levels.append(_join(index, parts, below, dtype=dtype, device=device, lanes=lanes))
+        levels.append(_join(index, parts, below, dtype=dtype, device=device, threads=threads))
     return tuple(levels)
 
 
@@ -281,7 +281,7 @@ def _join(
     *,
     dtype: torch.dtype,
     device: str,
-    lanes: int,
+    threads: int,
 ) -> Level:
     """Concatenate garments into one level and measure its rest shape."""
     counts = [part.vertex_count for part in parts]
@@ -304,7 +304,7 @@ def _join(
         from_below=below[0],
         smooth_from_below=below[1],
         flat_from_below=below[2],
-        lanes=lanes,
+        threads=threads,
     )
 
 

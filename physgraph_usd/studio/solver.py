@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 from ..shot.options import RefineOptions
-from ..shot.refine import MOST_LANES, sampled_at
+from ..shot.refine import MOST_THREADS, sampled_at
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.pipeline import Refiner
 from ..solver.frame.settings import SolveSettings
@@ -45,8 +45,8 @@ class FrameSolver:
         """
         self._times = shot.scene.times
         self._settings = _settings(contact=contact)
-        self._lanes = min(MOST_LANES, os.cpu_count() or 1)
-        self._exact = Refiner(shot.scene, self._settings, levels=levels, lanes=self._lanes)
+        self._threads = min(MOST_THREADS, os.cpu_count() or 1)
+        self._exact = Refiner(shot.scene, self._settings, levels=levels, threads=self._threads)
         self._quick: tuple[Refiner, float | None] | None = None  # And the time code where it is.
         self.refinements = self._exact.refinements
         self.run: tuple[float | None, ...] = ()
@@ -108,7 +108,7 @@ class FrameSolver:
     def _lead_in(self, shot: Shot, time: float | None) -> None:
         """Begin in the middle of a shot, where its cage crosses, with the cage walked there, as a run does."""
         earlier = [] if time is None else shot.times_until(time)
-        found = cages_walked(shot.scene, self._settings, shot.frame, times=earlier, lanes=self._lanes)
+        found = cages_walked(shot.scene, self._settings, shot.frame, times=earlier, threads=self._threads)
         if found is not None:
             self._exact.begin_at(found[0], since=found[1])
 

@@ -248,7 +248,9 @@ def s34_repeats(method: str) -> Result:
     """Different results among five runs and 1 to 4 threads."""
     mesh, rest = sheet(40, 40)
     options = {"level": 1, "dtype": torch.float32, "steps": 3, "integrator": method}
-    runs = {solved(mesh, rest, wave(rest), lanes=lanes, **options).points[0].tobytes() for lanes in (1, 1, 1, 2, 4)}
+    runs = {
+        solved(mesh, rest, wave(rest), threads=threads, **options).points[0].tobytes() for threads in (1, 1, 1, 2, 4)
+    }
     return Result(len(runs) == 1, f"{len(runs)} result" + "s" * (len(runs) > 1))
 
 

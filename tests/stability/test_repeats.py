@@ -30,8 +30,8 @@ def test_s34_any_number_of_threads_gives_the_same_bytes():
     """Enough elements that each of four threads has its slice."""
     mesh, rest = sheet(60, 60)
     runs = [
-        solved(mesh, rest, wave(rest), level=1, dtype=torch.float32, lanes=lanes, steps=4).points[0].tobytes()
-        for lanes in (1, 2, 4, 4)
+        solved(mesh, rest, wave(rest), level=1, dtype=torch.float32, threads=threads, steps=4).points[0].tobytes()
+        for threads in (1, 2, 4, 4)
     ]
     assert len(set(runs)) == 1
 

@@ -63,7 +63,7 @@ class Problem:
         levels: Sequence[int],
         *,
         device: str,
-        lanes: int,
+        threads: int,
         dtype: torch.dtype = torch.float32,
         clock: str = "wall",
     ) -> None:
@@ -73,7 +73,7 @@ class Problem:
             scene: The scene; its gain of detail is left out, for it is no part of the potential.
             levels: Subdivisions of each garment.
             device: "cpu" or a CUDA device.
-            lanes: Most threads of a kernel.
+            threads: Most threads of a kernel.
             dtype: Scalar type of the solve.
             clock: "wall", or "cpu" to count the processor's time alone.
         """
@@ -81,7 +81,7 @@ class Problem:
         garments = tuple(replace(each, detail_scale=np.ones_like(each.detail_scale)) for each in scene.garments)
         scene = replace(scene, garments=garments)
         self.scene = scene
-        self.refiner = Refiner(scene, DEFAULT, levels=levels, dtype=dtype, device=device, lanes=lanes)
+        self.refiner = Refiner(scene, DEFAULT, levels=levels, dtype=dtype, device=device, threads=threads)
         self.has_bodies = any(garment.colliders for garment in garments)
 
     @property

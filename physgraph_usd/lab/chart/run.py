@@ -16,7 +16,7 @@ import torch
 
 from ...errors import UsageError
 from ...shot.options import RefineOptions
-from ...shot.refine import MOST_LANES, prepare_device
+from ...shot.refine import MOST_THREADS, prepare_device
 from ...shot.untagged import open_with_colliders
 from ...solver.resolution import choose_levels, sample_frames
 from ...solver.scene import Frame, Scene
@@ -107,8 +107,8 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
     levels = tuple(choice.level for choice in choose_levels(opened.scene, sample_frames(opened.scene, opened.frame)))
 
     def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:
-        lanes = min(MOST_LANES, os.cpu_count() or 1) if options.clock == "wall" else 1
-        return Problem(scene, levels, device=options.device, lanes=lanes, dtype=dtype, clock=options.clock)
+        threads = min(MOST_THREADS, os.cpu_count() or 1) if options.clock == "wall" else 1
+        return Problem(scene, levels, device=options.device, threads=threads, dtype=dtype, clock=options.clock)
 
     problems = build(opened.scene, levels), build(opened.scene, levels, torch.float64)
     about = _about(opened, levels, options) | {"vertices": problems[0].vertex_count}

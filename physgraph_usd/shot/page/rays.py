@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ...solver.mesh.lanes import LEAST_QUERIES, Launch, start_warp
+from ...solver.mesh.threads import LEAST_QUERIES, Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,8 +69,8 @@ class Rays:
 
     def _cast(self, kernel: wp.Kernel, origins: np.ndarray, directions: np.ndarray, *made: wp.array) -> None:
         inputs = [self._mesh.id, _vectors(origins), _vectors(directions), *made]
-        lanes = os.cpu_count() or 1
-        Launch(kernel, len(origins), inputs, device="cpu", lanes=lanes, least=LEAST_QUERIES)({})
+        threads = os.cpu_count() or 1
+        Launch(kernel, len(origins), inputs, device="cpu", threads=threads, least=LEAST_QUERIES)({})
 
 
 def _vectors(values: np.ndarray) -> wp.array:

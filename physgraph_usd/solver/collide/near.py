@@ -11,7 +11,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.lanes import Launch
+from ..mesh.threads import Launch
 from .distance import weights_of
 from .parts import Parts
 from .sweep import Listed, Reach, Swept
@@ -50,7 +50,7 @@ def _closest(
 
 
 def weights(
-    x: Float[Tensor, "vertices 3"], corners: Int[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], *, lanes: int = 1
+    x: Float[Tensor, "vertices 3"], corners: Int[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], *, threads: int = 1
 ) -> Float[Tensor, "pairs 4"]:
     """Weights of corners in the shortest way from each pair's second part to its first, as in `NearPairs`.
 
@@ -58,12 +58,12 @@ def weights(
         x: Positions [m], float64.
         corners: A vertex and the corners of a face, or the ends of two edges, int32.
         face: Whether it is a vertex and a face.
-        lanes: Most threads on the CPU.
+        threads: Most threads on the CPU.
     """
     out = torch.zeros((len(face), 4), dtype=torch.float64, device=x.device)
     inputs = [wp.from_torch(x.contiguous(), dtype=wp.vec3d), wp.from_torch(corners, dtype=wp.vec4i)]
     inputs += [wp.from_torch(face), wp.from_torch(out, dtype=wp.vec4d)]
-    Launch(_closest, len(out), inputs, device=str(x.device), lanes=lanes)({})
+    Launch(_closest, len(out), inputs, device=str(x.device), threads=threads)({})
     return out
 
 
@@ -81,7 +81,7 @@ def near_pairs(parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, lis
         pairs = listed.pairs
     else:
         pairs = Swept(parts, at, torch.zeros_like(at), near=near).near()
-    weight, corners = weights(at, pairs.corners, pairs.face, lanes=parts.level.lanes), pairs.corners.long()
+    weight, corners = weights(at, pairs.corners, pairs.face, threads=parts.level.threads), pairs.corners.long()
     way = (weight.unsqueeze(2) * at[corners]).sum(dim=1)
     radius = near.radius[corners]
     of_face = radius[:, 0] + radius[:, 1:].amax(dim=1)

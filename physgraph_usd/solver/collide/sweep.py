@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.lanes import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, Launch
 from .impact import distance_of, impact_of
 from .parts import Parts, Topology
 
@@ -490,7 +490,7 @@ class Swept:
 
     def _launch(self, kernel: wp.Kernel, *inputs: object) -> None:
         """Run over the clusters."""
-        given = {"device": self._device, "lanes": self._parts.level.lanes, "least": LEAST_QUERIES}
+        given = {"device": self._device, "threads": self._parts.level.threads, "least": LEAST_QUERIES}
         Launch(kernel, self._parts.count, [self._parts.topology, *inputs], **given)({})
 
 
@@ -540,7 +540,7 @@ class Listed:
         motion.share, motion.floor = share, floor
         inputs = [self._parts.topology, motion, wp.from_torch(self.pairs.corners, dtype=wp.vec4i)]
         inputs += [wp.from_torch(self.pairs.face), wp.from_torch(value)]
-        Launch(values_of, len(value), inputs, device=str(start.device), lanes=self._parts.level.lanes)({})
+        Launch(values_of, len(value), inputs, device=str(start.device), threads=self._parts.level.threads)({})
         met = value < 1.0
         return Pairs(self.pairs.corners[met], value[met], self.pairs.face[met])
 

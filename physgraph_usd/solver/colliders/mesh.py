@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..mesh.lanes import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, Launch
 from .base import Nearest
 from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
@@ -105,7 +105,7 @@ class MeshSurface:
         *,
         side: str = "auto",
         device: str,
-        lanes: int,
+        threads: int,
     ) -> None:
         """Build the hierarchy on one pose.
 
@@ -115,7 +115,7 @@ class MeshSurface:
             rim: Rim edges and rim corners of open pieces, or None for closed ones.
             side: One of `sides.SIDES`.
             device: "cpu" or a CUDA device.
-            lanes: Most threads that a query uses on the CPU.
+            threads: Most threads that a query uses on the CPU.
         """
         self.closed = rim is None
         self.fixed_side = None if self.closed else FIXED.get(side)
@@ -123,7 +123,7 @@ class MeshSurface:
         self.triangles = triangles
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         self.edges, shared = np.unique(sides, axis=0, return_counts=True)
-        self._device, self._lanes = device, lanes
+        self._device, self._threads = device, threads
         self._used = np.unique(triangles)
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
         self._corners = torch.as_tensor(triangles, device=device).long()
@@ -270,7 +270,7 @@ class MeshSurface:
         needed = torch.zeros(len(self._corners), dtype=torch.bool, device=face.device)
         needed[face.long()] = True
         new = torch.nonzero(needed & (self._overlaps < 0)).squeeze(1)
-        self._overlaps[new] = (overlapping(self.mesh, new, lanes=self._lanes) | self._ragged[new]).to(torch.int8)
+        self._overlaps[new] = (overlapping(self.mesh, new, threads=self._threads) | self._ragged[new]).to(torch.int8)
         return self._overlaps[face.long()] > 0
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
@@ -318,7 +318,7 @@ class MeshSurface:
 
     def _run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
         """Launch over points in slices on several threads."""
-        given = {"device": self._device, "lanes": self._lanes, "least": LEAST_QUERIES}
+        given = {"device": self._device, "threads": self._threads, "least": LEAST_QUERIES}
         Launch(kernel, count, [mesh.id, *inputs], **given)({})
 
     def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
@@ -334,9 +334,9 @@ class MeshSurface:
 class MeshBody:
     """One mesh collider over the shot: its surfaces, kept while the topology stays the same."""
 
-    def __init__(self, *, side: str = "auto", device: str, lanes: int) -> None:
+    def __init__(self, *, side: str = "auto", device: str, threads: int) -> None:
         """Remember where and how to build; ``side`` is one of `sides.SIDES`."""
-        self._side, self._device, self._lanes = side, device, lanes
+        self._side, self._device, self._threads = side, device, threads
         self._triangles: np.ndarray | None = None
         self._points = np.zeros((0, 3))
         self._surfaces: tuple[MeshSurface, ...] = ()
@@ -361,7 +361,7 @@ class MeshBody:
     def _build(self, pose: MeshPose, pieces: Pieces) -> list[MeshSurface]:
         rims = (None, (pieces.rim, pieces.rim_vertex))
         return [
-            MeshSurface(pose, triangles, rim, side=self._side, device=self._device, lanes=self._lanes)
+            MeshSurface(pose, triangles, rim, side=self._side, device=self._device, threads=self._threads)
             for triangles, rim in zip((pieces.closed, pieces.open), rims, strict=True)
             if len(triangles)
         ]

@@ -13,8 +13,8 @@ import warp as wp
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ..mesh.lanes import LEAST_QUERIES, Launch
 from ..mesh.piercing import passes_through
+from ..mesh.threads import LEAST_QUERIES, Launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,17 +55,17 @@ def _overlap(
     out[i] = found
 
 
-def overlapping(mesh: wp.Mesh, faces: Int[Tensor, " faces"], *, lanes: int = 1) -> Bool[Tensor, " faces"]:
+def overlapping(mesh: wp.Mesh, faces: Int[Tensor, " faces"], *, threads: int = 1) -> Bool[Tensor, " faces"]:
     """Whether faces of a mesh pass through others of it.
 
     Args:
         mesh: The mesh.
         faces: Numbers of the faces asked about.
-        lanes: Most threads on the CPU.
+        threads: Most threads on the CPU.
     """
     out = torch.zeros(len(faces), dtype=torch.int32, device=faces.device)
     if len(faces):
         ask = faces.to(torch.int32).contiguous()
         inputs = [mesh.id, wp.from_torch(ask), mesh.points, mesh.indices, wp.from_torch(out)]
-        Launch(_overlap, len(faces), inputs, device=str(faces.device), lanes=lanes, least=LEAST_QUERIES)({})
+        Launch(_overlap, len(faces), inputs, device=str(faces.device), threads=threads, least=LEAST_QUERIES)({})
     return out > 0

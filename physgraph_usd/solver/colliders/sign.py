@@ -15,8 +15,8 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.lanes import Launch, start_warp
 from ..mesh.stencil import vectors
+from ..mesh.threads import Launch, start_warp
 from ..mesh.topology import joined_by
 from .base import Nearest, Surface
 

@@ -15,7 +15,7 @@ import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int
 
-from ..mesh.lanes import Launch
+from ..mesh.threads import Launch
 from .pose import ShapePose
 from .primitives import ShapeSurface
 
@@ -99,15 +99,15 @@ def _count(
 class Sweep:
     """Counts passages of points through one mesh in motion; its hierarchy is built once and refitted."""
 
-    def __init__(self, triangles: Int[np.ndarray, "triangles 3"], *, device: str = "cpu", lanes: int = 1) -> None:
+    def __init__(self, triangles: Int[np.ndarray, "triangles 3"], *, device: str = "cpu", threads: int = 1) -> None:
         """Take a topology.
 
         Args:
             triangles: Corners.
             device: "cpu" or a CUDA device.
-            lanes: Most threads that it uses on the CPU.
+            threads: Most threads that it uses on the CPU.
         """
-        self._triangles, self._device, self._lanes = triangles, device, lanes
+        self._triangles, self._device, self._threads = triangles, device, threads
         self._boxes: tuple[wp.array, ...] = ()
 
     def passages(
@@ -142,7 +142,7 @@ class Sweep:
         arrays = [wp.array(each, dtype=wp.vec3f, device=self._device) for each in poses]
         total = wp.zeros(len(start), dtype=wp.vec3f, device=self._device)
         inputs = [self._tree.id, self._faces, *arrays, count, total]
-        Launch(_count, len(start), inputs, device=self._device, lanes=self._lanes)({})
+        Launch(_count, len(start), inputs, device=self._device, threads=self._threads)({})
         # Of two unit normals the sum's square is 2 + 2 cos.
         found, length = count.numpy(), np.square(total.numpy()).sum(axis=1)
         return found, length < (1.0 - OPPOSED) * found

@@ -78,7 +78,7 @@ def _lay_back(mesh: ClothMesh, found: Crossings, x: Tensor, *, gap: float) -> Te
             continue
         never = np.zeros(faces.shape, bool)
         pose = MeshPose(out.double().cpu().numpy(), faces)
-        surface = MeshSurface(pose, faces, (never, never), device=str(x.device), lanes=mesh.level.lanes)
+        surface = MeshSurface(pose, faces, (never, never), device=str(x.device), threads=mesh.level.threads)
         asked = out[which] - torch.as_tensor(surface.origin).to(x)
         near = surface.closest(asked, torch.full_like(asked[:, 0], float("inf")))
         back = near.point - asked

@@ -150,7 +150,7 @@ def kept(level: Level, track: Track, x: Tensor, normal: Tensor, signed: Tensor, 
         wanted: Distances wanted [m], shape (N,).
     """
     foot = x - signed.unsqueeze(1) * normal + track.shift
-    room = room_above(track.surface, foot, normal, reach=2.0 * wanted.clamp_min(0.0), lanes=level.lanes)
+    room = room_above(track.surface, foot, normal, reach=2.0 * wanted.clamp_min(0.0), threads=level.threads)
     return torch.minimum(wanted, 0.5 * room)
 
 

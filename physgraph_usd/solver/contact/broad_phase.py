@@ -107,10 +107,10 @@ class Bodies:
         colliders: Their identities.
     """
 
-    def __init__(self, colliders: Sequence[Collider], *, device: str, lanes: int) -> None:
+    def __init__(self, colliders: Sequence[Collider], *, device: str, threads: int) -> None:
         """Prepare one body for each collider; nothing is built before something is near it."""
         self.colliders = tuple(colliders)
-        self._device, self._lanes = device, lanes
+        self._device, self._threads = device, threads
         self.forget()
         self._poses: Sequence[Pose | None] = ()
         self._surfaces: dict[int, tuple[Surface, ...]] = {}
@@ -118,7 +118,7 @@ class Bodies:
 
     def forget(self) -> None:
         """Build every body anew: hierarchies that are refitted answer ties by the poses that they were built on."""
-        self._meshes = [MeshBody(side=c.side, device=self._device, lanes=self._lanes) for c in self.colliders]
+        self._meshes = [MeshBody(side=c.side, device=self._device, threads=self._threads) for c in self.colliders]
 
     def pose(self, poses: Sequence[Pose | None]) -> None:
         """Take the poses of one frame, one entry a collider."""

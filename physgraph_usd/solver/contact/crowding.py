@@ -12,7 +12,7 @@ from ..collide.crossings import crossings
 from ..collide.parts import Parts
 from ..colliders.sign import signed_distances
 from ..level import build_levels
-from ..mesh.lanes import start_warp
+from ..mesh.threads import start_warp
 from ..scene import Frame, Garment, GarmentFrame, Scene
 from .broad_phase import Bodies, bounds_of, reach_of, touch_one_another
 
@@ -47,7 +47,7 @@ class CrowdingMeter:
         self._level = build_levels(list(scene.garments), [()] * len(scene.garments))[0]
         feel = [[a is b or touch_one_another(a, b) for b in scene.garments] for a in scene.garments]
         self._parts = Parts(self._level, np.array(feel, dtype=bool))
-        self._bodies = Bodies(scene.colliders, device="cpu", lanes=1)
+        self._bodies = Bodies(scene.colliders, device="cpu", threads=1)
 
     def measure(self, frame: Frame) -> Crowding:
         """How crowded a frame is."""

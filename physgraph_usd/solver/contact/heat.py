@@ -13,7 +13,7 @@ import warp as wp
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
 from ..colliders.sign import signed_distances
-from ..mesh.lanes import Launch
+from ..mesh.threads import Launch
 from .measure import depths
 
 wp.set_module_options({"enable_backward": False})

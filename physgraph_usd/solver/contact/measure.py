@@ -17,7 +17,7 @@ from torch import Tensor
 from ..colliders.base import Nearest, Surface
 from ..colliders.mesh import MeshSurface
 from ..level import Level
-from ..mesh.lanes import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, Launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -231,7 +231,7 @@ def pierced(
         none = level.edges.long()[:0, 0]
         return Pierced(none, none)
     points = x.to(torch.float32).contiguous()
-    faces = _faces_met(surface.mesh, level.edges, points, clear=distance, longest=length, lanes=level.lanes)
+    faces = _faces_met(surface.mesh, level.edges, points, clear=distance, longest=length, threads=level.threads)
     return Pierced(torch.nonzero(faces >= 0).squeeze(1), _through_cloth(surface, level, points, distance.isfinite()))
 
 
@@ -245,7 +245,7 @@ def _through_cloth(
     body = wp.to_torch(surface.mesh.points)
     # How far the body is from the cloth nobody knows: none of its edges is left out.
     clear, longest = (body.new_zeros(len(each)) for each in (body, edges))
-    faces = _faces_met(cloth.mesh, edges, body, clear=clear, longest=longest, lanes=level.lanes)
+    faces = _faces_met(cloth.mesh, edges, body, clear=clear, longest=longest, threads=level.threads)
     return cloth.triangles[faces[faces >= 0].long()]
 
 
@@ -285,7 +285,7 @@ class _Cloth:
 
 
 def _faces_met(
-    mesh: wp.Mesh, edges: Tensor, points: Tensor, *, clear: Tensor, longest: Tensor, lanes: int
+    mesh: wp.Mesh, edges: Tensor, points: Tensor, *, clear: Tensor, longest: Tensor, threads: int
 ) -> Int[Tensor, " edges"]:
     """The first face of a mesh that each edge meets, -1 where it meets none or is too short to.
 
@@ -295,12 +295,12 @@ def _faces_met(
         points: Positions [m], float32, shape (V, 3).
         clear: How far each vertex is from the mesh at least [m], shape (V,).
         longest: What both ends are away together beyond which an edge cannot meet the mesh [m], shape (E,).
-        lanes: Most threads on the CPU.
+        threads: Most threads on the CPU.
     """
     face = torch.full((len(edges),), -1, dtype=torch.int32, device=points.device)
     if len(edges):
         reach = [wp.from_torch(each.to(torch.float32).contiguous()) for each in (clear, longest)]
         ends = wp.from_torch(edges.contiguous(), dtype=wp.vec2i)
         inputs = [mesh.id, ends, wp.from_torch(points, dtype=wp.vec3f), *reach, wp.from_torch(face)]
-        Launch(_pierce, len(edges), inputs, device=str(points.device), lanes=lanes, least=LEAST_QUERIES)({})
+        Launch(_pierce, len(edges), inputs, device=str(points.device), threads=threads, least=LEAST_QUERIES)({})
     return face

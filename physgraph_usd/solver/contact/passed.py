@@ -22,11 +22,11 @@ class Passed:
     """Remembers the last frame of a shot. Meshes whose topology changes are not looked at."""
 
     def __init__(
-        self, garments: Sequence[Garment], colliders: Sequence[Collider], *, device: str = "cpu", lanes: int = 1
+        self, garments: Sequence[Garment], colliders: Sequence[Collider], *, device: str = "cpu", threads: int = 1
     ) -> None:
         """Take the scene; nothing is looked at before the second frame."""
         self._garments, self._colliders = tuple(garments), tuple(colliders)
-        self._place = {"device": device, "lanes": lanes}
+        self._place = {"device": device, "threads": threads}
         self._last: Frame | None = None
         self._parts: dict[int, tuple[np.ndarray, Sweep, Sweep]] = {}
 

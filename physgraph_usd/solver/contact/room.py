@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
-from ..mesh.lanes import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, Launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,7 +40,7 @@ def room_above(
     normal: Float[Tensor, "points 3"],
     *,
     reach: Float[Tensor, " points"],
-    lanes: int = 1,
+    threads: int = 1,
 ) -> Float[Tensor, " points"]:
     """Distance from points of a surface to the next wall of the same surface above them [m], infinite beyond reach.
 
@@ -49,7 +49,7 @@ def room_above(
         point: Points of it, in its coordinates [m].
         normal: Unit normals there, away from it.
         reach: How far to look [m].
-        lanes: Most threads on the CPU.
+        threads: Most threads on the CPU.
     """
     room = torch.full_like(reach, float("inf"))
     if not isinstance(surface, MeshSurface) or not len(point):
@@ -59,7 +59,7 @@ def room_above(
     limit = reach.to(torch.float32).contiguous()
     inputs = [wp.from_torch(each, dtype=wp.vec3f) for each in (start, along)]
     inputs += [wp.from_torch(each) for each in (limit, found)]
-    Launch(_ahead, len(point), [surface.mesh.id, *inputs], device=str(point.device), lanes=lanes, least=LEAST_QUERIES)(
-        {}
-    )
+    Launch(
+        _ahead, len(point), [surface.mesh.id, *inputs], device=str(point.device), threads=threads, least=LEAST_QUERIES
+    )({})
     return found.to(room)

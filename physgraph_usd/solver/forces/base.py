@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.incidence import incidence
-from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, vectors
+from ..mesh.threads import Launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -192,7 +192,7 @@ class Elements:
             level: The level.
         """
         self.count, width = corners.shape
-        dtype, device, lanes = level.dtype, level.device, level.lanes
+        dtype, device, threads = level.dtype, level.device, level.threads
         starts, slots = incidence(corners, level.vertex_count)
         # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
         packed = wp.from_torch(
@@ -204,9 +204,9 @@ class Elements:
         own = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
         buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
         self._kept = (corners, starts, slots, parameters)
-        self._elements = Launch(kernels[dtype], self.count, [x, packed, *own, *buffers], device=device, lanes=lanes)
+        self._elements = Launch(kernels[dtype], self.count, [x, packed, *own, *buffers], device=device, threads=threads)
         inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
-        self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, device=device, lanes=lanes)
+        self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, device=device, threads=threads)
 
     def evaluate(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Run the element kernel and gather: adds to ``force`` and returns the energy.

@@ -28,8 +28,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.lanes import Launch, start_warp
 from ..mesh.stencil import SCALAR, VECTOR, vectors
+from ..mesh.threads import Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -121,7 +121,7 @@ class Contact:
         x = vectors(torch.zeros_like(level.rest))
         own = [wp.from_torch(planes.vertex), vectors(planes.normal), wp.from_torch(planes.height)]
         inputs = [x, *own, wp.from_torch(weight), wp.from_torch(energy), x]
-        return Launch(_PUSH[level.dtype], len(planes.vertex), inputs, device=level.device, lanes=level.lanes)
+        return Launch(_PUSH[level.dtype], len(planes.vertex), inputs, device=level.device, threads=level.threads)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

@@ -44,7 +44,7 @@ class GuideMap:
         matrix = sp.csr_matrix(rows @ shares)
         self.spread_matrix = sp.csr_matrix(matrix.T)
         self.average, self.spread = (
-            Stencil(stencil, dtype=level.dtype, device=level.device, lanes=level.lanes)
+            Stencil(stencil, dtype=level.dtype, device=level.device, threads=level.threads)
             for stencil in (matrix, self.spread_matrix)
         )
         self.squares = sp.csr_matrix(matrix.multiply(matrix).T)

@@ -54,7 +54,7 @@ class Group:
         *,
         dtype: torch.dtype,
         device: str,
-        lanes: int = 1,
+        threads: int = 1,
     ) -> None:
         """Build the levels.
 
@@ -65,12 +65,12 @@ class Group:
             settings: How to solve.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
-            lanes: Most threads that a kernel uses on the CPU.
+            threads: Most threads that a kernel uses on the CPU.
         """
         self.garments = tuple(garments)
         self._gravity, self._settings = gravity, settings
         self.levels = build_levels(
-            [recentred(g) for g in garments], refinements, dtype=dtype, device=device, lanes=lanes
+            [recentred(g) for g in garments], refinements, dtype=dtype, device=device, threads=threads
         )
         self._guide_maps = [GuideMap(level) for level in self.levels]
         cage, finest = self.levels[0], self.levels[-1]

@@ -22,7 +22,7 @@ def cages_walked(
     *,
     times: Sequence[float],
     device: str = "cpu",
-    lanes: int = 1,
+    threads: int = 1,
 ) -> tuple[Refiner, float] | None:
     """Walk a scene's cages to the first frame of a run, where cloth walks and feels cloth.
 
@@ -32,7 +32,7 @@ def cages_walked(
         frame_at: Reads a time code.
         times: The shot's time codes up to the run's first, in order.
         device: Where the run is solved.
-        lanes: Most threads that a kernel uses on the CPU.
+        threads: Most threads that a kernel uses on the CPU.
 
     Returns:
         As `lead_in`.
@@ -40,7 +40,7 @@ def cages_walked(
     if len(times) < 2 or settings.temporal == "off" or settings.contact.cloth != "pairs":
         return None
     alone = [0] * len(scene.garments)
-    return lead_in(Refiner(scene, settings, levels=alone, device=device, lanes=lanes), frame_at, times)
+    return lead_in(Refiner(scene, settings, levels=alone, device=device, threads=threads), frame_at, times)
 
 
 def lead_in(

@@ -52,7 +52,7 @@ class Refiner:
         levels: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
-        lanes: int = 1,
+        threads: int = 1,
         heat_map: bool = False,
     ) -> None:
         """Subdivide the garments.
@@ -63,7 +63,7 @@ class Refiner:
             levels: Subdivisions of each garment; the garments' own when None.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
-            lanes: Most threads that a kernel uses on the CPU; the result does not depend on it.
+            threads: Most threads that a kernel uses on the CPU; the result does not depend on it.
             heat_map: Whether states hold a heat map.
 
         Raises:
@@ -75,11 +75,11 @@ class Refiner:
         self.refinements = self.subdivide(scene, chosen)
         self._settings = settings
         self._spacing = median(np.diff(scene.times).tolist()) if len(scene.times) > 1 else 0.0
-        self._place = {"dtype": dtype, "device": device, "lanes": lanes}
+        self._place = {"dtype": dtype, "device": device, "threads": threads}
         self._groups: dict[tuple[int, ...], Group] = {}
         self._scene, self._device, self._heat_map = scene, device, heat_map
-        self._bodies = Bodies(scene.colliders, device=device, lanes=lanes)
-        self._passed = Passed(scene.garments, scene.colliders, device=device, lanes=lanes)
+        self._bodies = Bodies(scene.colliders, device=device, threads=threads)
+        self._passed = Passed(scene.garments, scene.colliders, device=device, threads=threads)
         self._parts = Parts(scene.garments, together=settings.contact.cloth != "off")
         self._last: list[Known | None] = [None] * len(scene.garments)
         self._before: list[Known | None] = [None] * len(scene.garments)

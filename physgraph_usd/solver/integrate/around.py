@@ -25,8 +25,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..mesh.incidence import incidence
-from ..mesh.lanes import Launch
 from ..mesh.stencil import SCALAR, VECTOR, Stencil, vectors
+from ..mesh.threads import Launch
 from .base import Surface
 
 wp.set_module_options({"enable_backward": False})
@@ -117,7 +117,7 @@ class _Tables:
         def ints(values: np.ndarray, kind: Any = wp.int32) -> wp.array:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=device)
 
-        given = {"device": device, "lanes": level.lanes}
+        given = {"device": device, "threads": level.threads}
         lengths = level.rest_length.double().cpu().numpy()[end // 2]
         rest = wp.array(lengths, dtype=SCALAR[dtype], device=device)
         self.mesh = (ints(corner_starts), ints(turned, wp.vec2i), ints(end_starts), ints(far))

@@ -94,7 +94,7 @@ class Surface(Protocol):
         ...
 
     @property
-    def lanes(self) -> int:
+    def threads(self) -> int:
         """Most threads that a kernel uses on the CPU."""
         ...
 

@@ -18,8 +18,8 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mesh.lanes import Launch
 from ..mesh.stencil import vectors
+from ..mesh.threads import Launch
 from .around import Around
 from .features import NORMAL, STRAIN, Parts, seeing
 from .network import (
@@ -51,7 +51,9 @@ class FusedPhysgraph:
         bases: Names of the vectors that are handed over; the others are parts that the kernels take of them.
     """
 
-    def __init__(self, network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, lanes: int) -> None:
+    def __init__(
+        self, network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, threads: int
+    ) -> None:
         """Lay out the weights.
 
         Args:
@@ -59,7 +61,7 @@ class FusedPhysgraph:
             starts: First vertex of each garment, and the number of vertices.
             longest: Longest displacement in local edge lengths.
             device: "cpu" or a CUDA device.
-            lanes: Most threads that a kernel uses on the CPU.
+            threads: Most threads that a kernel uses on the CPU.
         """
         self._config = config = network.config
         self.vertices = vertices = starts[-1]
@@ -86,7 +88,7 @@ class FusedPhysgraph:
         strain, x, others = (wp.zeros(1, dtype=t, device=device) for t in (wp.mat33f, wp.vec3f, wp.vec2i))
         number = wp.zeros(1, dtype=wp.int32, device=device)
         shared = [vertices, flat, spacing, normal, strain]
-        given = {"device": device, "lanes": lanes}
+        given = {"device": device, "threads": threads}
         seen = [wp.from_torch(self._features), vectors(self._scaled.reshape(-1, 3))]
         between = tuple((a, b) for a, b in self._pairs.T.tolist())
         shares = tuple(zip(families_of(config.vectors), counted(config.vectors), strict=True))
@@ -157,10 +159,10 @@ class FusedPhysgraph:
 
 @functools.lru_cache(maxsize=8)
 def fused_physgraph(
-    network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, lanes: int
+    network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, threads: int
 ) -> FusedPhysgraph:
     """The same, kept for the next frame; the network's weights must not change any more."""
-    return FusedPhysgraph(network, starts, longest, device=device, lanes=lanes)
+    return FusedPhysgraph(network, starts, longest, device=device, threads=threads)
 
 
 def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Parts]:

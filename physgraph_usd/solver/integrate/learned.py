@@ -132,9 +132,9 @@ class LearnedMetric:
         """The network as one kernel for a system, where there is one."""
         if not self._fuse or system.spacing.dtype != torch.float32:
             return None
-        lanes = 1 if system.level is None else system.level.lanes
+        threads = 1 if system.level is None else system.level.threads
         starts = (*(span.start for span in graph.spans), len(system.spacing))
-        return fused_physgraph(self._network, starts, LONGEST, device=str(system.spacing.device), lanes=lanes)
+        return fused_physgraph(self._network, starts, LONGEST, device=str(system.spacing.device), threads=threads)
 
     def _combined(
         self,

@@ -36,8 +36,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...errors import SolveError
-from ..mesh.lanes import current_stream
 from ..mesh.stencil import SCALAR, VECTOR, vectors
+from ..mesh.threads import current_stream
 from .dissection import dissect
 from .fronts import Tree, joined
 
@@ -171,17 +171,17 @@ def _product(
     values: wp.array(dtype=Any),
     z: wp.array(dtype=Any),
 ):
-    i, lane = wp.tid()
+    i, thread = wp.tid()
     row = first + i
     total = z[0] * values.dtype(0.0)
     begin = starts[row]
     listed = lists[row] - begin
-    k = begin + lane
+    k = begin + thread
     while k < starts[row + 1]:
         total += values[k] * z[columns[listed + k]]
         k += wp.block_dim()
     whole = wp.tile_sum(wp.tile(total, preserve_type=True))
-    if lane == 0:
+    if thread == 0:
         result = whole[0]
         if target == 0:
             result = z[row] - result

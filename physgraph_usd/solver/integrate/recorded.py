@@ -27,7 +27,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mesh.lanes import Launch
+from ..mesh.threads import Launch
 from .base import Carry, System
 
 wp.set_module_options({"enable_backward": False})

@@ -12,8 +12,8 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .lanes import Launch, start_warp
 from .stencil import SCALAR, VECTOR, vectors
+from .threads import Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,15 +53,15 @@ _LENGTHS, _NORMALS = _overloads(_lengths, wp.vec2i, SCALAR), _overloads(_normals
 class EdgeLengths:
     """The lengths of some edges, wherever their vertices are."""
 
-    def __init__(self, edges: Int[Tensor, "edges 2"], like: Float[Tensor, "vertices 3"], *, lanes: int = 1) -> None:
+    def __init__(self, edges: Int[Tensor, "edges 2"], like: Float[Tensor, "vertices 3"], *, threads: int = 1) -> None:
         """Prepare the launch.
 
         Args:
             edges: End vertices, int32.
             like: Any positions, for their type and device.
-            lanes: Most threads on the CPU.
+            threads: Most threads on the CPU.
         """
-        self._launch = _Measure(_LENGTHS, edges, like, corners=wp.vec2i, lanes=lanes)
+        self._launch = _Measure(_LENGTHS, edges, like, corners=wp.vec2i, threads=threads)
 
     def __call__(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:
         """The lengths at x [m]."""
@@ -72,10 +72,10 @@ class TriangleNormals:
     """The normals of some triangles, twice their areas long, wherever their vertices are."""
 
     def __init__(
-        self, triangles: Int[Tensor, "triangles 3"], like: Float[Tensor, "vertices 3"], *, lanes: int = 1
+        self, triangles: Int[Tensor, "triangles 3"], like: Float[Tensor, "vertices 3"], *, threads: int = 1
     ) -> None:
         """Prepare the launch; arguments are those of `EdgeLengths`, with corners for ends."""
-        self._launch = _Measure(_NORMALS, triangles, like, corners=wp.vec3i, lanes=lanes)
+        self._launch = _Measure(_NORMALS, triangles, like, corners=wp.vec3i, threads=threads)
 
     def __call__(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
         """The normals at x [m^2]."""
@@ -86,14 +86,14 @@ class _Measure:
     """One kernel over elements, launched anew for other positions and another result."""
 
     def __init__(
-        self, kernels: Mapping[torch.dtype, wp.Kernel], elements: Tensor, like: Tensor, *, corners: type, lanes: int
+        self, kernels: Mapping[torch.dtype, wp.Kernel], elements: Tensor, like: Tensor, *, corners: type, threads: int
     ) -> None:
         start_warp()  # Views of tensors do not start Warp by themselves.
         self.count, self._elements, self._launch = len(elements), elements.contiguous(), None
         if len(elements):  # Empty tensors keep strides that Warp refuses.
             out = like.new_empty(len(elements), *([3] if kernels is _NORMALS else []))
             inputs = [wp.from_torch(self._elements, dtype=corners), vectors(like), _packed(out)]
-            self._launch = Launch(kernels[like.dtype], len(elements), inputs, device=str(like.device), lanes=lanes)
+            self._launch = Launch(kernels[like.dtype], len(elements), inputs, device=str(like.device), threads=threads)
 
     def __call__(self, x: Tensor, out: Tensor) -> Tensor:
         if self._launch is not None:

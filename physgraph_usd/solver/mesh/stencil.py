@@ -16,7 +16,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .lanes import Launch
+from .threads import Launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -82,14 +82,14 @@ class Stencil:
         shape: (rows, columns).
     """
 
-    def __init__(self, matrix: sp.csr_matrix, *, dtype: torch.dtype, device: str, lanes: int = 1) -> None:
+    def __init__(self, matrix: sp.csr_matrix, *, dtype: torch.dtype, device: str, threads: int = 1) -> None:
         """Copy a scipy matrix to the device.
 
         Args:
             matrix: Any scipy sparse matrix, shape (rows, columns).
             dtype: torch.float32 or torch.float64.
             device: "cpu" or a CUDA device.
-            lanes: Most threads to use on the CPU.
+            threads: Most threads to use on the CPU.
         """
         csr = sp.csr_matrix(matrix)
         csr.sort_indices()
@@ -100,7 +100,7 @@ class Stencil:
         values = wp.array(csr.data, dtype=SCALAR[dtype], device=device)
         x, out = (wp.zeros(count, dtype=VECTOR[dtype], device=device) for count in reversed(self.shape))
         inputs = [starts, columns, values, x, out]
-        self._launch = Launch(_GATHER[dtype], self.shape[0], inputs, device=device, lanes=lanes)
+        self._launch = Launch(_GATHER[dtype], self.shape[0], inputs, device=device, threads=threads)
 
     def apply(self, x: Float[Tensor, "columns 3"]) -> Float[Tensor, "rows 3"]:
         """The matrix times x."""

@@ -1,4 +1,4 @@
-"""Prepared launches: the number of lanes changes no bit, and no kernel is compiled for what nobody asks."""
+"""Prepared launches: the number of threads changes no bit, and no kernel is compiled for what nobody asks."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportArgumentType=false
@@ -15,16 +15,16 @@ import torch
 import warp as wp
 
 import physgraph_usd
-from physgraph_usd.solver.mesh.lanes import LEAST_PER_LANE, LEAST_QUERIES, Launch, _tapered
 from physgraph_usd.solver.mesh.stencil import Stencil
+from physgraph_usd.solver.mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch, _tapered
 
 
-@pytest.mark.parametrize("rows", [3, LEAST_PER_LANE, 3 * LEAST_PER_LANE + 7])
-def test_lanes_give_the_same_bits(rows: int) -> None:
+@pytest.mark.parametrize("rows", [3, LEAST_PER_THREAD, 3 * LEAST_PER_THREAD + 7])
+def test_threads_give_the_same_bits(rows: int) -> None:
     rng = np.random.default_rng(3)
     matrix = sp.csr_matrix(sp.random(rows, 50, density=0.1, random_state=rng))
     x = torch.as_tensor(rng.normal(size=(50, 3)), dtype=torch.float32)
-    alone, shared = (Stencil(matrix, dtype=torch.float32, device="cpu", lanes=lanes).apply(x) for lanes in (1, 3))
+    alone, shared = (Stencil(matrix, dtype=torch.float32, device="cpu", threads=threads).apply(x) for threads in (1, 3))
     assert torch.equal(alone, shared)
     assert np.allclose(alone.numpy(), matrix @ x.numpy(), atol=1e-5)
 
@@ -44,15 +44,15 @@ class TestSlices:
         assert sizes[-1] < 0.01 * 10_000 < 0.11 * 10_000 < sizes[0] < 0.13 * 10_000
 
     def test_slices_of_queries_give_the_same_bits(self):
-        one, many = (self.counted(5003, least=LEAST_QUERIES, lanes=lanes) for lanes in (1, 3))
+        one, many = (self.counted(5003, least=LEAST_QUERIES, threads=threads) for threads in (1, 3))
         assert torch.equal(one, many)
 
     @staticmethod
-    def counted(size: int, *, least: int, lanes: int = 2) -> torch.Tensor:
+    def counted(size: int, *, least: int, threads: int = 2) -> torch.Tensor:
         """How often each item is met."""
         wp.init()
         out = torch.zeros(size, dtype=torch.int32)
-        Launch(_meet, size, [wp.from_torch(out)], device="cpu", lanes=lanes, least=least)({})
+        Launch(_meet, size, [wp.from_torch(out)], device="cpu", threads=threads, least=least)({})
         return out
 
 

@@ -1,7 +1,7 @@
 """Kernel launches prepared once: on the CPU in slices on several threads, on CUDA whole.
 
 Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile, so slices run side by side. Each
-item writes its own places only, so the number of lanes changes no bit of the result.
+item writes its own places only, so the number of threads changes no bit of the result.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import warp as wp
 from ...interrupts import undisturbed
 
 _STDERR = 2
-LEAST_PER_LANE = 4000
-"""Items below which another lane costs more than it saves."""
+LEAST_PER_THREAD = 4000
+"""Items below which another thread costs more than it saves."""
 LEAST_QUERIES = 250
 """The same where each item asks a hierarchy or stands for many elements."""
 SLICES, LEAST_SLICE = 8, 32
-"""Slices of a lane there, and what they have at least on average: some items cost a hundred times as much as others, so
+"""Slices a thread there, and what they have at least on average: some items cost a hundred times as much as others, so
 whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
 
 
@@ -79,8 +79,8 @@ class Launch:
         inputs: Sequence[wp.array],
         *,
         device: str,
-        lanes: int = 1,
-        least: int = LEAST_PER_LANE,
+        threads: int = 1,
+        least: int = LEAST_PER_THREAD,
     ) -> None:
         """Prepare the launch.
 
@@ -89,13 +89,13 @@ class Launch:
             size: Number of items.
             inputs: The kernel's arrays; those that change are given again at each call.
             device: "cpu" or a CUDA device.
-            lanes: Most threads to use on the CPU.
+            threads: Most threads to use on the CPU.
             least: Items below which another of them costs more than it saves.
         """
-        self._lanes = lanes = max(1, min(lanes, size // least)) if device == "cpu" else 1
+        self._threads = threads = max(1, min(threads, size // least)) if device == "cpu" else 1
         self._device = None if device == "cpu" else device
-        slices = min(SLICES * lanes, size // LEAST_SLICE) if lanes > 1 and least < LEAST_PER_LANE else lanes
-        bounds = _tapered(size, slices) if slices > lanes else [size * i // slices for i in range(slices + 1)]
+        slices = min(SLICES * threads, size // LEAST_SLICE) if threads > 1 and least < LEAST_PER_THREAD else threads
+        bounds = _tapered(size, slices) if slices > threads else [size * i // slices for i in range(slices + 1)]
         whole = wp.launch(kernel, dim=size, inputs=[0, *inputs], device=device, record_cmd=True)
         self._commands: list[wp.Launch] = []
         if whole is not None and size:
@@ -115,15 +115,15 @@ class Launch:
             for command in self._commands:
                 command.launch(stream=stream)
             return
-        if self._lanes == 1:
+        if self._threads == 1:
             _run(iter(self._commands))
             return
         left = iter(self._commands)  # A list's iterator hands each command to one thread only.
         others: list[Future[None]] = []
         with undisturbed:  # The caller's arrays may go only when nobody works on them any more.
             try:
-                for _ in range(self._lanes - 1):
-                    others.append(_pool(self._lanes).submit(_run, left))
+                for _ in range(self._threads - 1):
+                    others.append(_pool(self._threads).submit(_run, left))
                 _run(left)
             finally:
                 wait(others)
@@ -165,6 +165,6 @@ def _stream(device: str, handle: int) -> wp.Stream:
 
 
 @functools.cache
-def _pool(lanes: int) -> ThreadPoolExecutor:
+def _pool(threads: int) -> ThreadPoolExecutor:
     """Threads that wait for slices, shared by all launches of one width."""
-    return ThreadPoolExecutor(lanes - 1, thread_name_prefix="lane")
+    return ThreadPoolExecutor(threads - 1, thread_name_prefix="thread")
