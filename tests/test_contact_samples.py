@@ -20,7 +20,7 @@ from shots import faults, refine, sample_times
 
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.lab.samples.panel import sew
-from physgraph_usd.lab.samples.solids import box, join, lathe, off_box, off_torus, torus
+from physgraph_usd.lab.samples.shapes import box, join, lathe, off_box, off_torus, torus
 from physgraph_usd.lab.samples.tshirt import SHIRT, dress
 from physgraph_usd.usd.write.plain import Look, PlainMesh, PlainStage
 

@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import connected_components
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.samples import SAMPLES, write_sample
-from physgraph_usd.lab.samples.grid import ease, quad_grid, springs
 from physgraph_usd.lab.samples.panel import Cut, sew
+from physgraph_usd.lab.samples.shapes import ease, quad_grid, springs
 from physgraph_usd.shot.page.rays import Rays
 from physgraph_usd.usd.write.plain import PlainMesh, PlainStage
 

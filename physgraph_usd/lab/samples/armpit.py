@@ -11,10 +11,9 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from ...solver.fabric import PRESETS
-from ...usd.write.plain import Look, PlainMesh, PlainStage
-from .grid import ease
+from ...usd.write.plain import Look, PlainStage
 from .panel import sew
-from .solids import Solid, ellipsoid, join, lathe
+from .shapes import Solid, ease, ellipsoid, join, lathe, mesh, rings
 from .tshirt import SHIRT, dress, trim
 
 ARMPIT = (0.202, 0.403)
@@ -53,23 +52,18 @@ FRAMES = 30
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        A shirt with two materials, pinned at the collar, and a body of closed parts that overlap; 30 samples.
-    """
+    """A shirt with two materials, pinned at the collar, and a body of closed parts that overlap."""
     shirt = sew(SHIRT)
     level = dress(shirt)
     rest = _lower(level, WORN, WORN) * (1.02, 1.04, 1.02)
     down = [float(ease(2.0 * t) - ease(2.0 * t - 1.0)) for t in np.linspace(0.0, 1.0, FRAMES)]
     angles = [(RAISED + (HANGING - RAISED) * d, RAISED + 20.0 * d) for d in down]
     pressed = [(left + PRESSED * d, right) for (left, right), d in zip(angles, down, strict=True)]
-    garment = PlainMesh(
-        name="Shirt",
-        counts=np.full(len(shirt.quads), 4),
-        indices=shirt.quads.ravel(),
-        points=rest,
-        look=Look("Body", (0.36, 0.22, 0.40)),
+    garment = mesh(
+        "Shirt",
+        shirt.quads,
+        rest,
+        Look("Body", (0.36, 0.22, 0.40)),
         samples=np.stack([_lower(level, *each) for each in angles]),
         uv=shirt.uv,
         subsets=((Look("Trim", (0.74, 0.70, 0.62)), trim(shirt)),),
@@ -80,15 +74,8 @@ def build() -> PlainStage:
     neck = ellipsoid(np.array([0.050, 0.130, 0.048]), np.array([0.0, 0.60, -0.005]), (24, 14))
     places = [_lower(moving.points, *each, below=(-95.0, 2.5)) for each in pressed]
     solids = [join(Solid(place, moving.counts, moving.indices), neck) for place in places]
-    body = PlainMesh(
-        name="Form",
-        counts=solids[0].counts,
-        indices=solids[0].indices,
-        points=solids[0].points,
-        look=Look("Canvas", (0.60, 0.56, 0.50)),
-        role="collider",
-        samples=np.stack([solid.points for solid in solids]),
-    )
+    samples = np.stack([solid.points for solid in solids])
+    body = solids[0].collider("Form", Look("Canvas", (0.60, 0.56, 0.50)), samples=samples)
     doc = "A T-shirt pinched between a hanging arm and the side"
     return PlainStage("ArmpitShot", doc, (garment, body), 1.0 + np.arange(FRAMES))
 
@@ -116,10 +103,11 @@ def _torso() -> Solid:
     """The torso as rings that are closer together at the shoulders."""
     around, rows = 56, 30
     height = TORSO[0, 0] - (TORSO[0, 0] - TORSO[-1, 0]) * np.linspace(0.0, 1.0, rows) ** 1.3
-    across, deep = (np.interp(-height, -TORSO[:, 0], TORSO[:, i])[:, None] for i in (1, 2))
-    a = 2 * np.pi * np.arange(around) / around
-    rings = np.stack(np.broadcast_arrays(across * np.cos(a), height[:, None], deep * np.sin(a)), axis=-1)
-    return lathe(rings, np.array([[0.0, TORSO[0, 0] + 0.005, 0.0], [0.0, TORSO[-1, 0] - 0.015, 0.0]]))
+    across, deep = (np.interp(-height, -TORSO[:, 0], TORSO[:, i]) for i in (1, 2))
+    return lathe(
+        rings(across, height, deep, around),
+        np.array([[0.0, TORSO[0, 0] + 0.005, 0.0], [0.0, TORSO[-1, 0] - 0.015, 0.0]]),
+    )
 
 
 def _arm(side: float) -> Solid:
@@ -134,6 +122,8 @@ def _arm(side: float) -> Solid:
     a = 2 * np.pi * np.arange(28) / 28
     height = 0.5 * (SHIRT.armpit + SHIRT.shoulder) - 0.005
     ring = [along[:, None], height + radius[:, None] * np.cos(a), 0.94 * radius[:, None] * np.sin(a)]
-    rings = np.stack(np.broadcast_arrays(*ring), axis=-1)
-    solid = lathe(rings, np.array([[first - 0.51 * thick, height, 0.0], [last + 1.01 * thin, height, 0.0]]))
+    solid = lathe(
+        np.stack(np.broadcast_arrays(*ring), axis=-1),
+        np.array([[first - 0.51 * thick, height, 0.0], [last + 1.01 * thin, height, 0.0]]),
+    )
     return Solid(solid.points * (side, 1.0, side), solid.counts, solid.indices)

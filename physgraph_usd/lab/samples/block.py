@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ...solver.fabric import PRESETS
-from ...usd.write.plain import Look, PlainMesh, PlainStage
+from ...usd.write.plain import Look, PlainStage
 from .drape import Drape, DrapeOptions
-from .grid import grid_uv, quad_grid
-from .solids import box, off_box
+from .shapes import box, mesh, off_box, square
 
 SIDE, CELLS = 0.72, 32
 """Side of the sheet [m] and its quads along a side."""
@@ -26,36 +27,16 @@ FRAMES, STEPS = 24, 2
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        One garment, 24 samples, over a static block of six faces.
-    """
-    side = np.linspace(-0.5 * SIDE, 0.5 * SIDE, CELLS + 1)
-    z, x = np.meshgrid(-side, side, indexing="ij")
+    """One garment over a static block of six faces."""
+    level, quads, uv = square(SIDE, CELLS, 2.0 * HALF[1] + ABOVE)
+    x, y, z = level.T
     c, s = np.cos(TURNED), np.sin(TURNED)
-    level = np.full(x.size, 2.0 * HALF[1] + ABOVE)
-    rest = np.stack([c * x.ravel() + s * z.ravel(), level, c * z.ravel() - s * x.ravel()], axis=1)
-    quads = quad_grid(CELLS + 1, CELLS + 1)
-    sheet = PlainMesh(
-        name="Sheet",
-        counts=np.full(len(quads), 4),
-        indices=quads.ravel(),
-        points=rest,
-        look=Look("Cotton", (0.62, 0.34, 0.22)),
-        samples=_drop(rest, quads),
-        uv=grid_uv(CELLS + 1, CELLS + 1),
-        fabric=PRESETS["cotton"],
-    )
+    rest = np.stack([c * x + s * z, y, c * z - s * x], axis=1)
+    look = Look("Cotton", (0.62, 0.34, 0.22))
+    sheet = mesh("Sheet", quads, rest, look, samples=_drop(rest, quads), uv=uv, fabric=PRESETS["cotton"])
     solid = box(HALF)
-    block = PlainMesh(
-        name="Block",
-        counts=solid.counts,
-        indices=solid.indices,
-        points=solid.points + np.array([0.0, HALF[1], 0.0]),
-        look=Look("Stone", (0.45, 0.45, 0.44)),
-        role="collider",
-    )
+    standing = replace(solid, points=solid.points + np.array([0.0, HALF[1], 0.0]))
+    block = standing.collider("Block", Look("Stone", (0.45, 0.45, 0.44)))
     return PlainStage("BlockShot", "A sheet dropped over a block", (sheet, block), np.arange(1.0, FRAMES + 1))
 
 

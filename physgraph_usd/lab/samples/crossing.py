@@ -6,7 +6,7 @@ import numpy as np
 
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainMesh, PlainStage
-from .grid import grid_uv, quad_grid
+from .shapes import flipped, grid_uv, mesh, quad_grid
 
 CELL = 0.021
 """Side of a quad at rest [m]."""
@@ -18,11 +18,7 @@ FRAMES = 12
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        Two garments, 12 samples; they cross along a line some 5 cm above their lower edges.
-    """
+    """Two garments that cross along a line some 5 cm above their lower edges."""
     times = np.arange(FRAMES) / 24.0
     front = _sheet("Front", (26, 25), 1.0, times=times, look=Look("Silk", (0.55, 0.16, 0.14), 0.5))
     back = _sheet("Back", (25, 21), -1.0, times=times, look=Look("Cotton", (0.16, 0.30, 0.45)))
@@ -38,15 +34,13 @@ def _sheet(name: str, size: tuple[int, int], side: float, *, times: np.ndarray, 
     wide, long = CELL * (columns - 1), CELL * (rows - 1)
     rest = np.stack([wide * u, 1.2 - long * v, np.full_like(u, side * APART)], axis=1)
     quads = quad_grid(rows, columns)[:, ::-1]
-    uv = grid_uv(rows, columns)
-    return PlainMesh(
-        name=name,
-        counts=np.full(len(quads), 4),
-        indices=quads.ravel(),
-        points=rest,
-        look=look,
+    return mesh(
+        name,
+        quads,
+        rest,
+        look,
         samples=np.stack([_hang(u, v, (wide, long), side=side, time=time) for time in times]),
-        uv=type(uv)(uv.values, uv.indices.reshape(-1, 4)[:, ::-1].ravel()),
+        uv=flipped(grid_uv(rows, columns)),
         pin=(v == 0.0).astype(float),
         fabric=PRESETS[look.name.lower()],
     )

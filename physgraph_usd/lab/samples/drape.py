@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-from .grid import springs
+from .shapes import springs
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
 """Gravity of the samples' simulations [m/s^2]; they are made with Y up."""
@@ -73,7 +73,7 @@ class Drape:
     ) -> None:
         """Factorise the constant system."""
         self.options = options or DrapeOptions()
-        self.faces, self.pinned, self._project = faces, pinned, project
+        self.pinned, self._project = pinned, project
         self.points = np.array(rest if start is None else start, dtype=float)
         self.velocity = np.zeros_like(self.points)
         self.time = 0.0
@@ -126,8 +126,8 @@ class Drape:
             edge = self._difference @ points
             length = np.linalg.norm(edge, axis=1)
             wanted = np.clip(length, self.options.give * self._length, self._length)
-            kept = self._contact()[:, None] * points
-            points = self._solver.solve(right + kept + self._gather @ (edge * (wanted / length)[:, None]))
+            held = self._contact()[:, None] * points
+            points = self._solver.solve(right + held + self._gather @ (edge * (wanted / length)[:, None]))
             if self._project is not None:
                 moved = self._project(points, self.time)
                 if iteration < RENEWALS and self.options.contact > 0.0:
@@ -144,10 +144,6 @@ class Drape:
             self._touching = touching
             self._solver = self._factorise()
 
-    def normals(self) -> np.ndarray:
-        """Return unit vertex normals, shape (V, 3)."""
-        return vertex_normals(self.points, self.faces)
-
 
 def _smoothing(rest: np.ndarray, faces: np.ndarray) -> sparse.csr_matrix:
     """Distance of each vertex from its neighbours' mean; along the border only from its two border neighbours.
@@ -159,36 +155,15 @@ def _smoothing(rest: np.ndarray, faces: np.ndarray) -> sparse.csr_matrix:
     edges, uses = np.unique(sides, axis=0, return_counts=True)
     border = np.zeros(count, bool)
     border[edges[uses == 1]] = True
-    kept = np.concatenate([springs(faces), edges[uses == 1]])
-    inner = np.arange(len(kept)) < len(kept) - np.count_nonzero(uses == 1)
-    both = np.concatenate([kept, kept[:, ::-1]])
+    pairs = np.concatenate([springs(faces), edges[uses == 1]])
+    inner = np.arange(len(pairs)) < len(pairs) - np.count_nonzero(uses == 1)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
     both = both[border[both[:, 0]] != np.tile(inner, 2)]
     weights = sparse.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
     smooth = sparse.eye(count) - sparse.diags(1.0 / np.maximum(np.asarray(weights.sum(axis=1)).ravel(), 1.0)) @ weights
     edge = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1).mean()
     flat = np.linalg.norm(smooth @ rest, axis=1) < 0.3 * edge
     return sparse.csr_matrix(sparse.diags(flat.astype(float)) @ smooth)
-
-
-def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted unit vertex normals.
-
-    Args:
-        points: Positions, shape (V, 3).
-        faces: Triangles or quads, shape (F, 3) or (F, 4).
-
-    Returns:
-        Unit normals, shape (V, 3).
-    """
-    corners = points[faces]
-    if faces.shape[1] == 4:
-        normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    else:
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(points)
-    for i in range(faces.shape[1]):
-        np.add.at(total, faces[:, i], normal)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
 def _areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...solver.fabric import Fabric
-from ...usd.write.plain import Look, PlainMesh, PlainStage
-from .grid import grid_uv, quad_grid
+from ...usd.write.plain import Look, PlainStage
+from .shapes import grid_uv, mesh, quad_grid
 
 ROWS, COLUMNS = 28, 42
 WIDTH, HEIGHT = 1.5, 1.0
@@ -19,40 +19,32 @@ SAILCLOTH = Fabric(stretch=60.0, bend=60e-6, density=0.18)
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        One garment, 48 samples; its first column is pinned.
-    """
-    v, u = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
-    rest = np.stack([WIDTH * u.ravel(), HEIGHT * (v.ravel() - 0.5), 0.0 * u.ravel()], axis=1)
+    """One garment whose first column is pinned."""
+    down, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
+    rest = np.stack([WIDTH * across.ravel(), HEIGHT * (down.ravel() - 0.5), 0.0 * across.ravel()], axis=1)
     quads = quad_grid(ROWS, COLUMNS)
     stripe = np.flatnonzero(np.arange(ROWS - 1) // 9 == 1)
     faces = (stripe[:, None] * (COLUMNS - 1) + np.arange(COLUMNS - 1)).ravel()
-    mesh = PlainMesh(
-        name="Flag",
-        counts=np.full(len(quads), 4),
-        indices=quads.ravel(),
-        points=rest,
-        look=Look("Red", (0.55, 0.07, 0.06)),
-        samples=_wave(),
+    u, v = np.linspace(0.0, 1.0, COLUMNS)[None, :], np.linspace(-0.5, 0.5, ROWS)[:, None]
+    flag = mesh(
+        "Flag",
+        quads,
+        rest,
+        Look("Red", (0.55, 0.07, 0.06)),
+        samples=np.stack([_pose(u, v, frame / 24.0) for frame in range(FRAMES)]),
         uv=grid_uv(ROWS, COLUMNS),
         subsets=((Look("White", (0.75, 0.73, 0.68)), faces),),
-        pin=(u.ravel() == 0.0).astype(float),
+        pin=(rest[:, 0] == 0.0).astype(float),
         fabric=SAILCLOTH,
     )
-    return PlainStage("FlagShot", "A flag in a gusty wind", (mesh,), np.arange(1.0, FRAMES + 1))
-
-
-def _wave() -> np.ndarray:
-    """The coarse flag, shape (T, V, 3): travelling waves that keep the length of a row but for some compression."""
-    u = np.linspace(0.0, 1.0, COLUMNS)[None, :]
-    v = np.linspace(-0.5, 0.5, ROWS)[:, None]
-    return np.stack([_pose(u, v, frame / 24.0) for frame in range(FRAMES)])
+    return PlainStage("FlagShot", "A flag in a gusty wind", (flag,), np.arange(1.0, FRAMES + 1))
 
 
 def _pose(u: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
-    """One sample: integrate the direction of each row from the pole outwards."""
+    """One sample, shape (V, 3): travelling waves that keep the length of a row but for some compression.
+
+    The direction of each row is integrated from the pole outwards.
+    """
     phase = 2 * np.pi * (1.45 * u - 1.0 * time + 0.22 * v)
     gust = 1.0 + 0.25 * np.sin(2 * np.pi * 0.5 * time + 1.0)
     lead = u * (2.0 - u)

@@ -7,7 +7,7 @@ import numpy as np
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
-from .grid import grid_uv, quad_grid
+from .shapes import Solid, mesh, quad_grid, rings, square
 
 SIDE, CELLS = 1.1, 36
 """Side of the cloth [m] and its quads along a side."""
@@ -19,32 +19,22 @@ FRAMES, SETTLE = 12, 50
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        One garment whose 12 samples are equal, over a static collider.
-    """
-    side = np.linspace(-0.5 * SIDE, 0.5 * SIDE, CELLS + 1)
-    z, x = np.meshgrid(-side, side, indexing="ij")
-    rest = np.stack([x.ravel(), np.full(x.size, TABLE_HEIGHT + 0.004), z.ravel()], axis=1)
-    quads = quad_grid(CELLS + 1, CELLS + 1)
-    draped = _settle(rest, quads)
+    """One garment whose 12 samples are equal, over a static collider."""
+    rest, quads, uv = square(SIDE, CELLS, TABLE_HEIGHT + 0.004)
     ring = np.minimum(np.arange(CELLS), np.arange(CELLS)[::-1])
     border = np.flatnonzero(np.minimum(ring[:, None], ring[None, :]).ravel() == 2)
-    garment = PlainMesh(
-        name="Cloth",
-        counts=np.full(len(quads), 4),
-        indices=quads.ravel(),
-        points=rest,
-        look=Look("Linen", (0.70, 0.66, 0.56)),
-        samples=np.repeat(draped[None], FRAMES, axis=0),
-        uv=grid_uv(CELLS + 1, CELLS + 1),
+    garment = mesh(
+        "Cloth",
+        quads,
+        rest,
+        Look("Linen", (0.70, 0.66, 0.56)),
+        samples=np.repeat(_settle(rest, quads)[None], FRAMES, axis=0),
+        uv=uv,
         subsets=((Look("Stripe", (0.13, 0.20, 0.38)), border),),
         fabric=PRESETS["cotton"],
     )
-    return PlainStage(
-        "FrozenShot", "A draped cloth that does not move", (garment, _table()), np.arange(1.0, FRAMES + 1)
-    )
+    doc = "A draped cloth that does not move"
+    return PlainStage("FrozenShot", doc, (garment, _table()), np.arange(1.0, FRAMES + 1))
 
 
 def _settle(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
@@ -90,18 +80,10 @@ def _table() -> PlainMesh:
         ]
     )
     around = 48
-    a = 2 * np.pi * np.arange(around) / around
-    points = np.stack(
-        np.broadcast_arrays(outline[:, :1] * np.cos(a), outline[:, 1:], outline[:, :1] * np.sin(a)), axis=-1
-    ).reshape(-1, 3)
+    points = rings(outline[:, 0], outline[:, 1], outline[:, 0], around).reshape(-1, 3)
     quads = quad_grid(len(outline), around, closed=True)[:, ::-1]
     cap = np.array([[0.0, height, 0.0]])
     fan = np.stack([np.full(around, len(points)), (np.arange(around) + 1) % around, np.arange(around)], axis=1)
-    return PlainMesh(
-        name="Table",
-        counts=np.concatenate([np.full(len(quads), 4), np.full(around, 3)]),
-        indices=np.concatenate([quads.ravel(), fan.ravel()]),
-        points=np.concatenate([points, cap]),
-        look=Look("Wood", (0.30, 0.20, 0.12), 0.5),
-        role="collider",
-    )
+    counts = np.concatenate([np.full(len(quads), 4), np.full(around, 3)])
+    table = Solid(np.concatenate([points, cap]), counts, np.concatenate([quads.ravel(), fan.ravel()]))
+    return table.collider("Table", Look("Wood", (0.30, 0.20, 0.12), 0.5))

@@ -8,9 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...solver.fabric import PRESETS
-from ...usd.write.plain import FaceVarying, Look, PlainMesh, PlainStage
-from .grid import ease, grid_uv, quad_grid
-from .solids import ellipsoid, join
+from ...usd.write.plain import FaceVarying, Look, PlainStage
+from .shapes import ease, ellipsoid, grid_uv, join, mesh, quad_grid
 
 UP, DEEP, FOLD = 20, 15, (3, 5)
 """Quads from the neckline up one side to the top, from the face to the seam behind, and to the fold's two bends."""
@@ -29,33 +28,25 @@ FRAMES = 24
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        One garment, 24 samples, pinned along its neckline; a head that moves by its transform and static shoulders.
-    """
+    """One garment, pinned along its neckline; a head that moves by its transform and static shoulders."""
     quads, used, uv = _faces()
     rest, worn = (points.reshape(-1, 3)[used] for points in (_hull(0.0, 0.39, 1.17), _hull(1.0, 0.315, 1.0)))
-    held = rest[:, 1] < 1e-9
     times = np.arange(FRAMES) / 24.0
-    hood = PlainMesh(
-        name="Hood",
-        counts=np.full(len(quads), 4),
-        indices=quads.ravel(),
-        points=rest,
-        look=Look("Jersey", (0.24, 0.36, 0.42)),
-        samples=np.stack([_turn(worn, time, share=0.6) for time in times]),
+    hood = mesh(
+        "Hood",
+        quads,
+        rest,
+        Look("Jersey", (0.24, 0.36, 0.42)),
+        samples=np.stack([_turn(worn, time, fraction=0.6) for time in times]),
         uv=uv,
-        pin=held.astype(float),
+        pin=(rest[:, 1] < 1e-9).astype(float),
         fabric=PRESETS["jersey"],
     )
     skin = Look("Canvas", (0.60, 0.56, 0.50))
-    solid = ellipsoid(HEAD, HEAD_AT, (32, 22))
     poses = np.stack([_pose(time) for time in times])
-    head = PlainMesh("Head", solid.counts, solid.indices, solid.points, skin, role="collider", transforms=poses)
+    head = ellipsoid(HEAD, HEAD_AT, (32, 22)).collider("Head", skin, transforms=poses)
     neck = ellipsoid(np.array([0.052, 0.110, 0.054]), np.array([0.0, 0.03, -0.01]), (24, 14))
-    solid = join(ellipsoid(BUST, BUST_AT, (40, 18)), neck)
-    bust = PlainMesh("Bust", solid.counts, solid.indices, solid.points, skin, role="collider")
+    bust = join(ellipsoid(BUST, BUST_AT, (40, 18)), neck).collider("Bust", skin)
     doc = "A wide hood over a turning head, with a fold that lies on itself"
     return PlainStage("HoodShot", doc, (hood, head, bust), 1.0 + np.arange(FRAMES))
 
@@ -91,22 +82,27 @@ def _hull(folded: float, height: float, larger: float) -> np.ndarray:
     return np.stack([larger * x, y, larger * z], axis=-1)
 
 
-def _even(share: np.ndarray, wide: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Angles on each row's arch after a share of its length, shape (rows, columns)."""
+def _even(fraction: np.ndarray, wide: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Angles on each row's arch after a fraction of its length, shape (rows, columns)."""
     t = 0.5 * np.pi * (1.0 - (1.0 - np.linspace(0.0, 1.0, 401)) ** 2)  # closer together at the top, where it turns
     angles = []
-    for part, w, h in zip(share, wide, high, strict=True):
+    for part, w, h in zip(fraction, wide, high, strict=True):
         curve = np.stack([w * np.cos(t) ** ROUND, h * np.sin(t)], axis=1)
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+        length = _lengths(curve)
         angles.append(np.interp(part * length[-1], length, t))
     return np.stack(angles)
+
+
+def _lengths(curve: np.ndarray) -> np.ndarray:
+    """Length of a curve up to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
 
 
 def _neckline() -> tuple[np.ndarray, np.ndarray]:
     """One side of the neckline from the face to the seam in even steps: (x, z) [m] and unit normals outward."""
     t = np.linspace(0.0, 0.5 * np.pi, 2001)
     curve = np.stack([0.112 * np.cos(t) ** 0.5, 0.085 - 0.235 * np.sin(t) ** 0.9], axis=1)
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    length = _lengths(curve)
     even = np.linspace(0.0, length[-1], DEEP + 1)
     place = np.stack([np.interp(even, length, curve[:, i]) for i in (0, 1)], axis=1)
     along = np.gradient(place, axis=0)
@@ -129,11 +125,11 @@ def _pose(time: float) -> np.ndarray:
     return matrix
 
 
-def _turn(points: np.ndarray, time: float, *, share: float) -> np.ndarray:
-    """The hood at a time [s]: it follows the head by a share, less towards the neck and late by a frame."""
+def _turn(points: np.ndarray, time: float, *, fraction: float) -> np.ndarray:
+    """The hood at a time [s]: it follows the head by a fraction, less towards the neck and late by a frame."""
     turn, lean = _angles(time - 0.03)
     height = ease((points[:, 1] - 0.01) / 0.16)
-    return _rotate(points, share * turn * height, lean * height)
+    return _rotate(points, fraction * turn * height, lean * height)
 
 
 def _rotate(points: np.ndarray, turn: np.ndarray | float, lean: np.ndarray | float) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...solver.fabric import PRESETS, Fabric
 from ...usd.write.plain import Look, PlainMesh, PlainStage
-from .grid import ease
+from .shapes import ease, mesh
 from .walker import Cage, Cells, body, trousers, tube, walk
 
 FRAMES, RATE = 30, 24.0
@@ -22,22 +22,11 @@ LONGER, WIDER = 1.08, 1.04
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        Three garments in three layers and a body collider, 30 samples.
-    """
+    """Three garments in three layers and a body."""
     times = np.arange(FRAMES) / RATE
     solid = body()
-    form = PlainMesh(
-        name="Form",
-        counts=solid.counts,
-        indices=solid.indices,
-        points=solid.points,
-        look=Look("Canvas", (0.60, 0.56, 0.50)),
-        role="collider",
-        samples=np.stack([walk(solid.points, time) for time in times]),
-    )
+    samples = np.stack([walk(solid.points, time) for time in times])
+    form = solid.collider("Form", Look("Canvas", (0.60, 0.56, 0.50)), samples=samples)
     doc = "Trousers, shirt and belt in three layers on a body that walks in place"
     return PlainStage("LayersShot", doc, (_trousers(times), _shirt(times), _belt(times), form), 1.0 + np.arange(FRAMES))
 
@@ -78,12 +67,11 @@ def _garment(
     points, top = cage.points, cage.points[:, 1] > cage.points[:, 1].max() - 1e-6
     loose = layer < 2
     rest = (points - (0.0, WAIST, 0.0)) * (WIDER, LONGER, WIDER) + (0.0, WAIST, 0.0)
-    return PlainMesh(
-        name=name,
-        counts=np.full(len(cage.quads), 4),
-        indices=cage.quads.ravel(),
-        points=rest if loose else points,
-        look=look,
+    return mesh(
+        name,
+        cage.quads,
+        rest if loose else points,
+        look,
         samples=samples,
         uv=cage.uv,
         pin=top.astype(float) if loose else None,

@@ -60,14 +60,7 @@ class Pillow:
 
 
 def sew(cut: Cut) -> Pillow:
-    """Cut, sew and inflate.
-
-    Args:
-        cut: The measures.
-
-    Returns:
-        The pillow.
-    """
+    """A T-shape cut, sewn and inflated."""
     x, y = _lines(cut)
     torso, sleeve, below, _ = cut.cells
     rows, columns = np.meshgrid(np.arange(len(y)), np.arange(len(x)), indexing="ij")
@@ -109,10 +102,10 @@ def _lines(cut: Cut) -> tuple[np.ndarray, np.ndarray]:
     return x, np.concatenate([low, high])
 
 
-def _ends_closer(cells: int, share: float) -> np.ndarray:
-    """Positions from -1 to 1, a blend of even and cosine spacing."""
+def _ends_closer(cells: int, cosine: float) -> np.ndarray:
+    """Positions from -1 to 1 with even spacing and a fraction of cosine spacing."""
     even = np.linspace(-1.0, 1.0, cells + 1)
-    return (1.0 - share) * even + share * np.sin(0.5 * np.pi * even)
+    return (1.0 - cosine) * even + cosine * np.sin(0.5 * np.pi * even)
 
 
 def _seams(cut: Cut, rows: np.ndarray, columns: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ...solver.fabric import PRESETS
-from ...usd.write.plain import Look, PlainMesh, PlainStage
+from ...usd.write.plain import FaceVarying, Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
-from .grid import ease, grid_uv, quad_grid
+from .shapes import Solid, ease, grid_uv, lathe, mesh, quad_grid, rings
 
 ROWS, AROUND, FOLDS = 23, 76, 8
 """Rows from waist to hem, columns around, and folds at the hem."""
@@ -36,29 +36,24 @@ PROFILE = np.array(
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        A triangulated skirt, 48 samples, over a collider that moves by its transform.
-    """
+    """A triangulated skirt over a collider that moves by its transform."""
     rest = _rest()
     quads = quad_grid(ROWS, AROUND, closed=True)[:, ::-1]
-    triangles, corners = _split(quads, grid_uv(ROWS, AROUND, closed=True).indices.reshape(-1, 4)[:, ::-1])
     uv = grid_uv(ROWS, AROUND, closed=True)
+    triangles, corners = (_split(each) for each in (quads, uv.indices.reshape(-1, 4)[:, ::-1]))
     poses = np.stack([_hips(frame / 24.0) for frame in range(FRAMES)])
-    garment = PlainMesh(
-        name="Skirt",
-        counts=np.full(len(triangles), 3),
-        indices=triangles.ravel(),
-        points=rest,
-        look=Look("Wool", (0.42, 0.10, 0.12)),
+    garment = mesh(
+        "Skirt",
+        triangles,
+        rest,
+        Look("Wool", (0.42, 0.10, 0.12)),
         samples=_swing(rest, quads),
-        uv=type(uv)(uv.values, corners.ravel()),
+        uv=FaceVarying(uv.values, corners.ravel()),
         pin=(np.arange(len(rest)) < AROUND).astype(float),
         fabric=PRESETS["wool"],
     )
-    shot = "A flared skirt on turning hips"
-    return PlainStage("SkirtShot", shot, (garment, _hip_mesh(poses)), np.arange(1.0, FRAMES + 1))
+    doc = "A flared skirt on turning hips"
+    return PlainStage("SkirtShot", doc, (garment, _hip_mesh(poses)), np.arange(1.0, FRAMES + 1))
 
 
 def _rest() -> np.ndarray:
@@ -73,14 +68,11 @@ def _rest() -> np.ndarray:
     return np.stack([across * np.cos(a), 0.02 - drop, deep * np.sin(a)], axis=1)
 
 
-def _split(quads: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles with alternating diagonals, and the same split of the UV corners."""
+def _split(quads: np.ndarray) -> np.ndarray:
+    """Quads, or their UV corners, as triangles with alternating diagonals."""
     odd = (np.arange(len(quads)) // AROUND + np.arange(len(quads)) % AROUND) % 2 == 1
-    both = []
-    for four in (quads, corners):
-        turned = np.where(odd[:, None], np.roll(four, 1, axis=1), four)
-        both.append(np.stack([turned[:, [0, 1, 2]], turned[:, [0, 2, 3]]], axis=1).reshape(-1, 3))
-    return both[0], both[1]
+    turned = np.where(odd[:, None], np.roll(quads, 1, axis=1), quads)
+    return np.stack([turned[:, [0, 1, 2]], turned[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
 
 
 def _hips(time: float) -> np.ndarray:
@@ -120,34 +112,25 @@ def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
 def _push_out(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Move points that are inside the hips to 15 mm outside, horizontally."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    across = np.interp(-local[:, 1], -PROFILE[:, 0], PROFILE[:, 1]) + 0.015
-    deep = np.interp(-local[:, 1], -PROFILE[:, 0], PROFILE[:, 2]) + 0.015
+    across, deep = (axis + 0.015 for axis in _half_axes(local[:, 1]))
     reach = np.hypot(local[:, 0] / across, local[:, 2] / deep)
     grow = np.where((reach < 1.0) & (local[:, 1] > PROFILE[-1, 0]), 1.0 / np.maximum(reach, 1e-3), 1.0)
     return (local * np.stack([grow, np.ones_like(grow), grow], axis=1)) @ pose[:3, :3].T + pose[:3, 3]
 
 
+def _half_axes(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Half axes of the hips across and deep at heights [m]."""
+    across, deep = (np.interp(-height, -PROFILE[:, 0], PROFILE[:, i]) for i in (1, 2))
+    return across, deep
+
+
 def _hip_mesh(poses: np.ndarray) -> PlainMesh:
-    """The hips as a closed mesh of quads with triangle fans at both ends."""
+    """The hips as a closed mesh of quads with triangle fans at both ends; its quads face inwards."""
     around, rows = 40, 30
     height = np.concatenate([[0.1225, 0.118, 0.11], np.linspace(0.10, PROFILE[-1, 0], rows - 3)])
-    across = np.interp(-height, -PROFILE[:, 0], PROFILE[:, 1])
-    deep = np.interp(-height, -PROFILE[:, 0], PROFILE[:, 2])
-    a = 2 * np.pi * np.arange(around) / around
-    ring = np.stack(np.broadcast_arrays(across[:, None] * np.cos(a), height[:, None], deep[:, None] * np.sin(a)), -1)
+    across, deep = _half_axes(height)
     ends = np.array([[0.0, PROFILE[0, 0] + 0.001, 0.0], [0.0, PROFILE[-1, 0] - 0.02, 0.0]])
-    points = np.concatenate([ring.reshape(-1, 3), ends])
-    quads = quad_grid(rows, around, closed=True)[:, ::-1]
-    step = (np.arange(around) + 1) % around
-    top = np.stack([np.full(around, len(points) - 2), step, np.arange(around)], axis=1)
-    last = (rows - 1) * around
-    bottom = np.stack([np.full(around, len(points) - 1), last + np.arange(around), last + step], axis=1)
-    return PlainMesh(
-        name="Hips",
-        counts=np.concatenate([np.full(len(quads), 4), np.full(2 * around, 3)]),
-        indices=np.concatenate([quads.ravel(), top.ravel(), bottom.ravel()]),
-        points=points,
-        look=Look("Form", (0.60, 0.56, 0.50)),
-        role="collider",
-        transforms=poses,
-    )
+    solid = lathe(rings(across, height, deep, around), ends)
+    quads, fans = np.split(solid.indices, [4 * (rows - 1) * around])
+    hips = Solid(solid.points, solid.counts, np.concatenate([quads.reshape(-1, 4)[:, ::-1].ravel(), fans]))
+    return hips.collider("Hips", Look("Form", (0.60, 0.56, 0.50)), transforms=poses)

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from ...solver.fabric import PRESETS
-from ...usd.write.plain import FaceVarying, Look, PlainMesh, PlainStage
-from .grid import ease
+from ...usd.write.plain import FaceVarying, Look, PlainStage
+from .shapes import ease, mesh
 
 AROUND, ROWS, EXTRA = 32, 52, 4
 """Vertices around an end, rows of vertices, and vertices added inside: 1,668, so that two splits give 26,304."""
@@ -19,26 +19,22 @@ FRAMES = 24
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        One garment, 24 samples: over the shot its length falls by 20% and its cuff turns by 70 degrees.
-    """
+    """One garment: over the shot its length falls by 20% and its cuff turns by 70 degrees."""
     flat = _scatter()
     triangles, corners = _triangulate(flat)
     samples = np.stack([_pose(flat, float(ease(i / (FRAMES - 1)))) for i in range(FRAMES)])
-    mesh = PlainMesh(
-        name="Sleeve",
-        counts=np.full(len(triangles), 3),
-        indices=triangles.ravel(),
-        points=_pose(flat, 0.0),
-        look=Look("Jersey", (0.24, 0.42, 0.52)),
+    sleeve = mesh(
+        "Sleeve",
+        triangles,
+        _pose(flat, 0.0),
+        Look("Jersey", (0.24, 0.42, 0.52)),
         samples=samples,
-        uv=FaceVarying(*corners),
+        uv=corners,
         pin=((flat[:, 1] < 1e-6) | (flat[:, 1] > 1 - 1e-6)).astype(float),
         fabric=PRESETS["jersey"],
     )
-    return PlainStage("SleeveShot", "A sleeve, compressed by a fifth and twisted", (mesh,), np.arange(1.0, FRAMES + 1))
+    doc = "A sleeve, compressed by a fifth and twisted"
+    return PlainStage("SleeveShot", doc, (sleeve,), np.arange(1.0, FRAMES + 1))
 
 
 def _scatter() -> np.ndarray:
@@ -61,8 +57,8 @@ def _scatter() -> np.ndarray:
 
 def _relax(flat: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """Move free points half way to the mean of their neighbours."""
-    triangles, (values, corners) = _triangulate(flat)
-    ends = values[corners].reshape(-1, 3, 2)
+    triangles, uv = _triangulate(flat)
+    ends = uv.values[uv.indices].reshape(-1, 3, 2)
     total, count = np.zeros_like(flat), np.zeros(len(flat))
     for i in range(3):
         for j in ((i + 1) % 3, (i + 2) % 3):
@@ -73,8 +69,8 @@ def _relax(flat: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     return np.where(fixed[:, None], flat, moved)
 
 
-def _triangulate(flat: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Delaunay triangles on the unrolled tube, and their corners as (values, indices) of the seamed UVs."""
+def _triangulate(flat: np.ndarray) -> tuple[np.ndarray, FaceVarying]:
+    """Delaunay triangles on the unrolled tube, and their UVs, which have a seam."""
     scale = np.array([2 * np.pi * 0.5 * (RADIUS_TOP + RADIUS_CUFF), LENGTH])
     count = len(flat)
     tiled = np.concatenate([flat + np.array([shift, 0.0]) for shift in (-1.0, 0.0, 1.0)])
@@ -86,7 +82,7 @@ def _triangulate(flat: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.nda
     simplices[turned] = simplices[turned][:, ::-1]
     simplices = simplices[np.lexsort(simplices.T[::-1])]
     used, corners = np.unique(simplices, return_inverse=True)
-    return (simplices % count).astype(np.int32), (tiled[used], corners.ravel().astype(np.int32))
+    return (simplices % count).astype(np.int32), FaceVarying(tiled[used], corners.ravel().astype(np.int32))
 
 
 def _pose(flat: np.ndarray, amount: float) -> np.ndarray:

@@ -5,57 +5,45 @@ from __future__ import annotations
 import numpy as np
 
 from ...solver.fabric import PRESETS
-from ...usd.write.plain import Look, PlainMesh, PlainStage
-from .grid import ease, grid_uv, quad_grid
+from ...usd.write.plain import Look, PlainStage
+from .shapes import ease, flipped, grid_uv, mesh, quad_grid
 
-ROWS, COLUMNS = 20, 16
-"""Vertices down and across."""
+ROWS, COLUMNS, FRAMES = 20, 16, 24
+"""Vertices down and across, and samples."""
 
 WIDTH, LENGTH = 0.24, 0.30
 """Size of the swatch [m]."""
-
-FRAMES = 24
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Turns Y up into Z up."""
 
 
 def build(variant: str = "") -> PlainStage:
-    """Build the shot.
+    """One garment whose top edge is gathered by a quarter while it turns a little.
 
     Args:
         variant: Empty, ``cm``, ``zup`` or ``lefthanded``; all show the same cloth in the same place.
-
-    Returns:
-        One garment, 24 samples: its top edge is gathered by a quarter while it turns a little.
     """
     scale = 100.0 if variant == "cm" else 1.0
     axes = TO_Z_UP if variant == "zup" else np.eye(3)
     quads, uv = quad_grid(ROWS, COLUMNS), grid_uv(ROWS, COLUMNS)
     if variant == "lefthanded":
-        quads = quads[:, ::-1]
-        uv = type(uv)(uv.values, uv.indices.reshape(-1, 4)[:, ::-1].ravel())
+        quads, uv = quads[:, ::-1], flipped(uv)
     poses = np.stack([_pose(float(ease(i / (FRAMES - 1)))) for i in range(FRAMES)])
-    mesh = PlainMesh(
-        name="Swatch",
-        counts=np.full(len(quads), 4),
-        indices=quads.ravel(),
-        points=scale * _pose(0.0) @ axes.T,
-        look=Look("Silk", (0.50, 0.34, 0.10), 0.5),
+    swatch = mesh(
+        "Swatch",
+        quads,
+        scale * _pose(0.0) @ axes.T,
+        Look("Silk", (0.50, 0.34, 0.10), 0.5),
         samples=scale * poses @ axes.T,
         uv=uv,
         pin=(np.arange(ROWS * COLUMNS) >= (ROWS - 1) * COLUMNS).astype(float),
         fabric=PRESETS["silk"],
         left_handed=variant == "lefthanded",
     )
-    return PlainStage(
-        "SwatchShot",
-        "A hanging swatch whose top edge is gathered",
-        (mesh,),
-        np.arange(1.0, FRAMES + 1),
-        metres_per_unit=1.0 / scale,
-        up_axis="Z" if variant == "zup" else "Y",
-    )
+    units = {"metres_per_unit": 1.0 / scale, "up_axis": "Z" if variant == "zup" else "Y"}
+    doc = "A hanging swatch whose top edge is gathered"
+    return PlainStage("SwatchShot", doc, (swatch,), np.arange(1.0, FRAMES + 1), **units)
 
 
 def _pose(amount: float) -> np.ndarray:

@@ -5,19 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from ...solver.fabric import PRESETS
-from ...usd.write.plain import Look, PlainMesh, PlainStage
+from ...usd.write.plain import Look, PlainStage
 from .drape import Drape, DrapeOptions
-from .grid import ease, grid_uv, quad_grid
-from .solids import off_torus, torus
+from .shapes import ease, mesh, off_torus, square, torus
 
 SIDE, CELLS = 0.66, 30
 """Side of the sheet [m] and its quads along a side."""
 
-MAJOR, MINOR = 0.135, 0.045
-"""Radius of the torus' circle and of its tube [m]."""
-
-GAP = 0.005
-"""Distance that the coarse sheet keeps from the torus [m]."""
+MAJOR, MINOR, GAP = 0.135, 0.045, 0.005
+"""Radius of the torus' circle and of its tube, and the distance that the coarse sheet keeps from it [m]."""
 
 PULL = 0.24
 """How far the grip goes down [m]."""
@@ -26,36 +22,20 @@ FRAMES, STEPS = 28, 3
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        One garment, 28 samples, over a static torus; the middle of the sheet is pinned.
-    """
-    side = np.linspace(-0.5 * SIDE, 0.5 * SIDE, CELLS + 1)
-    z, x = np.meshgrid(-side, side, indexing="ij")
-    rest = np.stack([x.ravel(), np.full(x.size, MINOR + GAP), z.ravel()], axis=1)
-    quads = quad_grid(CELLS + 1, CELLS + 1)
+    """One garment over a static torus; the middle of the sheet is pinned."""
+    rest, quads, uv = square(SIDE, CELLS, MINOR + GAP)
     grip = np.flatnonzero(np.hypot(rest[:, 0], rest[:, 2]) < 1.5 * SIDE / CELLS)
-    sheet = PlainMesh(
-        name="Sheet",
-        counts=np.full(len(quads), 4),
-        indices=quads.ravel(),
-        points=rest,
-        look=Look("Silk", (0.50, 0.20, 0.34), 0.5),
+    sheet = mesh(
+        "Sheet",
+        quads,
+        rest,
+        Look("Silk", (0.50, 0.20, 0.34), 0.5),
         samples=_pull(rest, quads, grip),
-        uv=grid_uv(CELLS + 1, CELLS + 1),
+        uv=uv,
         pin=np.isin(np.arange(len(rest)), grip).astype(float),
         fabric=PRESETS["silk"],
     )
-    solid = torus(MAJOR, MINOR, (64, 24))
-    ring = PlainMesh(
-        name="Ring",
-        counts=solid.counts,
-        indices=solid.indices,
-        points=solid.points,
-        look=Look("Wood", (0.42, 0.29, 0.16), 0.5),
-        role="collider",
-    )
+    ring = torus(MAJOR, MINOR, (64, 24)).collider("Ring", Look("Wood", (0.42, 0.29, 0.16), 0.5))
     return PlainStage("TorusShot", "A sheet pulled through a torus", (sheet, ring), 1.0 + np.arange(FRAMES))
 
 

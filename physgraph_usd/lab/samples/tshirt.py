@@ -6,8 +6,8 @@ import numpy as np
 
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainMesh, PlainStage, Skeleton, Skin
-from .grid import ease, quad_grid
 from .panel import Cut, Pillow, sew
+from .shapes import Solid, ease, mesh, quad_grid, rings
 
 SHIRT = Cut(0.200, 0.405, 0.575, 0.0, 0.16, 0.078, (18, 6, 18, 8))
 BODY = Cut(0.172, 0.440, 0.556, -0.10, 0.36, 0.0, (16, 12, 16, 8), closed=True)
@@ -26,20 +26,14 @@ FRAMES = 36
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        A shirt with two materials and a body collider on one skeleton, 36 samples.
-    """
+    """A shirt with two materials and a body on one skeleton."""
     times = np.arange(1.0, FRAMES + 1)
     shirt = sew(SHIRT)
-    points = _slope(dress(shirt))
-    garment = PlainMesh(
-        name="Shirt",
-        counts=np.full(len(shirt.quads), 4),
-        indices=shirt.quads.ravel(),
-        points=points,
-        look=Look("Body", (0.20, 0.40, 0.33)),
+    garment = mesh(
+        "Shirt",
+        shirt.quads,
+        _slope(dress(shirt)),
+        Look("Body", (0.20, 0.40, 0.33)),
         uv=shirt.uv,
         subsets=((Look("Trim", (0.78, 0.66, 0.40)), trim(shirt)),),
         fabric=PRESETS["jersey"],
@@ -63,24 +57,17 @@ def _form() -> PlainMesh:
     points[:, 2] *= 1.0 + arm * (thin - 1.0)
     points[:, 0] *= _round((-0.01 - points[:, 1]) / 0.09)
     neck = quad_grid(9, 20, closed=True)[:, ::-1] + len(points)
-    angle = 2 * np.pi * np.arange(20) / 20
     outline = np.array([[0.02, 0.690], [0.042, 0.684], [0.052, 0.67], [0.05, 0.64], [0.048, 0.61]])
     outline = np.concatenate([outline, [[0.05, 0.585], [0.058, 0.56], [0.075, 0.535], [0.08, 0.51]]])
-    ring = [outline[:, :1] * np.cos(angle), outline[:, 1:], 0.9 * outline[:, :1] * np.sin(angle)]
-    level = np.concatenate([points, np.stack(np.broadcast_arrays(*ring), axis=-1).reshape(-1, 3)])
+    radius, height = outline.T
+    level = np.concatenate([points, rings(radius, height, 0.9 * radius, 20).reshape(-1, 3)])
     cap = np.arange(20)[::-1] + len(points)
     weights = _weights(level)
     weights.weights[len(points) :] = 0.0, 1.0, 0.0
-    return PlainMesh(
-        name="Form",
-        counts=np.concatenate([np.full(len(body.quads) + len(neck), 4), [20]]),
-        indices=np.concatenate([body.quads.ravel(), neck.ravel(), cap]),
-        points=np.concatenate([_slope(points), level[len(points) :]]),
-        look=Look("Canvas", (0.60, 0.56, 0.50)),
-        role="collider",
-        skin=weights,
-        scheme="catmullClark",
-    )
+    counts = np.concatenate([np.full(len(body.quads) + len(neck), 4), [20]])
+    indices = np.concatenate([body.quads.ravel(), neck.ravel(), cap])
+    form = Solid(np.concatenate([_slope(points), level[len(points) :]]), counts, indices)
+    return form.collider("Form", Look("Canvas", (0.60, 0.56, 0.50)), skin=weights, scheme="catmullClark")
 
 
 def _round(t: np.ndarray) -> np.ndarray:
@@ -104,14 +91,7 @@ def _above(points: np.ndarray) -> np.ndarray:
 
 
 def dress(shirt: Pillow) -> np.ndarray:
-    """Shape the neckline and the shoulders; the sleeves stay level.
-
-    Args:
-        shirt: The pillow that `SHIRT` gives.
-
-    Returns:
-        Positions [m], shape (V, 3).
-    """
+    """Positions of `SHIRT`'s pillow with a neckline and shoulders; the sleeves stay level [m], shape (V, 3)."""
     points = shirt.points.copy()
     x, y = points[:, 0], points[:, 1]
     near = ease((y - 0.30) / (SHIRT.shoulder - 0.30)) * np.sqrt((1.0 - (x / (1.15 * SHIRT.neck)) ** 2).clip(0.0))
@@ -123,14 +103,7 @@ def dress(shirt: Pillow) -> np.ndarray:
 
 
 def trim(shirt: Pillow) -> np.ndarray:
-    """Faces of the hem, the cuffs and the collar.
-
-    Args:
-        shirt: The pillow that `SHIRT` gives.
-
-    Returns:
-        Face numbers.
-    """
+    """Numbers of the faces of the hem, the cuffs and the collar of `SHIRT`'s pillow."""
     row, column = shirt.cell.T
     torso, sleeve, below, across = SHIRT.cells
     centre = shirt.points[shirt.quads].mean(axis=1)

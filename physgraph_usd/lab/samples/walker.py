@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...usd.write.plain import FaceVarying
-from .grid import ease, grid_uv, quad_grid
-from .solids import Solid
+from .shapes import Solid, ease, grid_uv, quad_grid
 
 TRUNK = np.array(
     [
@@ -83,16 +82,7 @@ class Cage:
 
 
 def tube(heights: np.ndarray, around: int, gap: Gap) -> Cage:
-    """Quads round the trunk alone.
-
-    Args:
-        heights: Heights of the rows from the top [m].
-        around: Quads around.
-        gap: Distance from the body.
-
-    Returns:
-        The tube.
-    """
+    """Quads round the trunk alone: heights of the rows from the top [m], quads around, and distance from the body."""
     height, angle = np.meshgrid(heights, 2 * np.pi * np.arange(around) / around, indexing="ij")
     points = _trunk(height, angle, gap).reshape(-1, 3)
     rows = len(heights)
@@ -100,14 +90,9 @@ def tube(heights: np.ndarray, around: int, gap: Gap) -> Cage:
 
 
 def trousers(cells: Cells, gap: Gap) -> Cage:
-    """Quads round hips and legs, joined in the crotch.
+    """Quads round hips and legs at a distance from the body, joined in the crotch.
 
-    Args:
-        cells: How it is divided.
-        gap: Distance from the body.
-
-    Returns:
-        The surface, with a row of quads from the lowest row of the trunk and the crotch to each leg's highest.
+    A row of quads leads from the lowest row of the trunk and the crotch to each leg's highest.
     """
     around, between, rows = cells.around, cells.between, len(cells.trunk) + 1
     height, angle = np.meshgrid([*cells.trunk, 0.0], 2 * np.pi * np.arange(around) / around, indexing="ij")
@@ -175,11 +160,7 @@ def _squared(angle: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def body() -> Solid:
-    """The body at rest, closed at the chest and at the ankles.
-
-    Returns:
-        Hips, trunk and legs as one closed mesh [m].
-    """
+    """Hips, trunk and legs at rest as one mesh [m], closed at the chest and at the ankles."""
     cells = Cells(56, 14, np.linspace(1.32, 0.832, 26), np.linspace(0.745, 0.08, 34))
     cage = trousers(cells, np.zeros_like)
     ring, count = cells.around // 2 + cells.between, len(cage.points)
@@ -195,14 +176,11 @@ def body() -> Solid:
 
 
 def walk(points: np.ndarray, time: np.ndarray | float) -> np.ndarray:
-    """Where points of the body, or near it, are at a time.
+    """Positions at a time of points of the standing body, or near it [m], shape (V, 3).
 
     Args:
         points: Positions round the standing body [m], shape (V, 3).
         time: Time since it stood still [s], one for all or one each, shape (V,); cloth may lag.
-
-    Returns:
-        The positions [m], shape (V, 3).
     """
     x, y, z = points.T
     stride = ease(np.asarray(time) / 0.35)
