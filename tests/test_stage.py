@@ -162,7 +162,7 @@ def test_older_usd_is_understood_by_what_it_said() -> None:
         "version 0.7.0 is deprecated",
     ]
     found = composition_problems(Old(), warnings)  # type: ignore[arg-type]
-    assert [(problem.path, problem.missing) for problem in found] == [("/A", True), ("", True), ("", False)]
+    assert [(notice.path, missing) for notice, missing in found] == [("/A", True), ("", True), ("", False)]
 
 
 def test_names_that_are_no_text_are_a_stage_error() -> None:

@@ -1,4 +1,4 @@
-"""Which files a shot is made of, and which files may be written: never one of those, and never two results in one."""
+"""Files that a shot is made of, and targets checked against them: inputs are never written, nor two results in one."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
 _UDIM = "<UDIM>"
 
 Target = tuple[str, Path]
-"""What is to be written, in words, and where."""
+"""A result in words, and its file."""
 
 
 def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
-    """Every file that a shot is made of, or would be with other variants.
+    """Every file that a shot, a file or an open stage, is made of, or would be with other variants.
 
     Sublayers, references, payloads, value clips and assets such as textures, through all layers. A refined layer in it
-    is left out with what it needs: it is a result, which is not read and may be written again.
-
-    Args:
-        shot: Any file that USD opens; one that it cannot open is its only file. Or an open stage.
+    is left out with what it needs: it is a result, which is not read and may be written again. A file that USD cannot
+    open is its only one.
     """
     found: set[Path] = set()
     if isinstance(shot, Usd.Stage):
@@ -79,15 +77,7 @@ def _named_in(file: Path) -> Iterator[str]:
 
 
 def check_targets(targets: Sequence[Target], inputs: Iterable[Path]) -> None:
-    """Refuse to write over an input, or two results into one file; links count as the files that they lead to.
-
-    Args:
-        targets: What is to be written.
-        inputs: Files that are read.
-
-    Raises:
-        UsageError: A target is an input or another target.
-    """
+    """Refuse (UsageError) to write over an input, or two results into one file; links count as what they lead to."""
     read = {_identity(file): file for file in inputs}
     written: dict[object, str] = {}
     for what, path in targets:
@@ -101,7 +91,7 @@ def check_targets(targets: Sequence[Target], inputs: Iterable[Path]) -> None:
 
 
 def _identity(path: Path) -> object:
-    """What two paths to one file have in common, whether the file is there or not."""
+    """A key that is the same for two paths to one file, whether the file is there or not."""
     try:
         found = os.stat(path)
     except OSError:
@@ -111,11 +101,7 @@ def _identity(path: Path) -> object:
 
 
 def check_suffix(what: str, path: Path, known: Sequence[str]) -> None:
-    """Refuse a file's name whose suffix is none of those known.
-
-    Raises:
-        UsageError: The suffix is another one.
-    """
+    """Refuse (UsageError) a file's name whose suffix is none of those known."""
     if path.suffix not in known:
-        said = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"
-        raise UsageError(f"{what} {path} has {said}; known suffixes: {', '.join(known)}")
+        suffix = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"
+        raise UsageError(f"{what} {path} has {suffix}; known suffixes: {', '.join(known)}")

@@ -1,4 +1,4 @@
-"""Looking a value up: ``--set``, the prim, its ancestors, the bound material, the fallback.
+"""Values, looked up at ``--set``, the prim, its ancestors, the bound material, the fallback.
 
 Any numeric type is accepted, and Blender's ``userProperties:`` namespace, because a trip through a host program changes
 both and moves the attribute to the parent transform.
@@ -16,7 +16,7 @@ from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
 from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, find_property
-from .stage import in_brief
+from .stage import in_brief, timecode
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
 _WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0}
@@ -41,11 +41,11 @@ class Override:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Where a value comes from.
+    """A value and its source.
 
     Attributes:
         row: The attribute.
-        source: Who gives it, for the report.
+        source: The source in words, for the report.
         attribute: The authored attribute, or None for a constant.
         constant: The value when there is no attribute; None when nothing gives one.
         scale: Factor from the stage's number to SI.
@@ -63,22 +63,14 @@ class Found:
         return self.attribute is not None and self.attribute.ValueMightBeTimeVarying()
 
     def at(self, time: float | None) -> float | None:
-        """Value in SI at a time code; None when nothing gives one.
-
-        Raises:
-            SchemaError: When the value is no number or outside its limits.
-        """
+        """Value in SI at a time code, None when nothing gives one; SchemaError when it is none, or beyond limits."""
         if self.attribute is None:
             return self.constant
         return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[Override, ...]:
-    """Read ``</prim>.attribute=value`` or ``attribute=value`` texts.
-
-    Raises:
-        UsageError: When one cannot be read, names an unknown attribute or is out of limits.
-    """
+    """Read ``</prim>.attribute=value`` or ``attribute=value`` texts; UsageError names one that cannot be used."""
     return tuple(_parse_override(text) for text in texts)
 
 
@@ -98,15 +90,11 @@ def _parse_override(text: str) -> Override:
 
 
 def check_overrides(overrides: Sequence[Override], garments: Sequence[Sdf.Path]) -> None:
-    """Refuse an override that is for no garment.
-
-    Raises:
-        UsageError: Naming it and the garments there are.
-    """
+    """Refuse an override that is for no garment; UsageError names it and the garments."""
     for override in overrides:
         if not any(path.HasPrefix(override.prim) for path in garments):
-            known = ", ".join(str(path) for path in garments)
-            raise UsageError(f"--set {override.prim}.{override.row.name}: no such garment; garments: {known}")
+            paths = ", ".join(str(path) for path in garments)
+            raise UsageError(f"--set {override.prim}.{override.row.name}: no such garment; garments: {paths}")
 
 
 def with_ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:
@@ -153,19 +141,13 @@ def bound_materials(prim: Usd.Prim) -> tuple[Usd.Prim, ...]:
 
 
 def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> Found:
-    """Find who gives a value; the bound material counts for ``physgraph:material:`` values only.
+    """Find the source of a garment's or a collider's value: ``--set``, a prim, or else the fallback as a constant.
 
-    Args:
-        prim: The garment, or a collider.
-        row: The attribute.
-        overrides: What ``--set`` gave.
-
-    Returns:
-        The source; its ``constant`` is the fallback when nothing authors a value.
+    The bound material counts for ``physgraph:material:`` values only.
     """
-    mine = [item for item in overrides if item.row.name == row.name and prim.GetPath().HasPrefix(item.prim)]
-    if mine:
-        winner = max(enumerate(mine), key=lambda pair: (pair[1].prim.pathElementCount, pair[0]))[1]
+    matching = [item for item in overrides if item.row.name == row.name and prim.GetPath().HasPrefix(item.prim)]
+    if matching:
+        winner = max(enumerate(matching), key=lambda pair: (pair[1].prim.pathElementCount, pair[0]))[1]
         return Found(row, "--set", None, winner.value)
     attribute = nearest(prim, row.name)
     if attribute is None and row.name.startswith(MATERIAL):
@@ -177,11 +159,7 @@ def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
 
 
 def find_token(prim: Usd.Prim, row: Property) -> str:
-    """Value of a token attribute: the prim's, its nearest ancestor's, or the fallback.
-
-    Raises:
-        SchemaError: When it is none of the row's tokens.
-    """
+    """Token of the prim, its nearest ancestor, or the fallback; SchemaError when it is none of the row's tokens."""
     attribute = nearest(prim, row.name)
     if attribute is None:
         return str(row.fallback)
@@ -192,17 +170,13 @@ def find_token(prim: Usd.Prim, row: Property) -> str:
 
 
 def source_name(attribute: Usd.Attribute) -> str:
-    """How reports write an attribute: ``</prim>.name``."""
+    """An attribute as in reports: ``</prim>.name``."""
     return f"<{attribute.GetPrim().GetPath()}>.{attribute.GetName()}"
 
 
 def read_number(attribute: Usd.Attribute, time: float | None) -> float:
-    """Read an attribute of any numeric type.
-
-    Raises:
-        SchemaError: When it holds something else.
-    """
-    code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    """Read an attribute of any numeric type; SchemaError when it holds something else."""
+    code = timecode(time)
     resolved = attribute.GetResolveInfo(code).GetSource()
     if resolved in {Usd.ResolveInfoSourceNone, Usd.ResolveInfoSourceFallback}:  # samples only, asked for the default
         code = Usd.TimeCode.EarliestTime()
@@ -214,23 +188,24 @@ def read_number(attribute: Usd.Attribute, time: float | None) -> float:
 
 
 def check_limits(row: Property, value: float, source: str) -> float:
-    """Return the value when it is finite and inside its limits.
-
-    Limits are compared in float32, as the schema's attributes hold them: a limit that is authored is the limit.
-
-    Raises:
-        SchemaError: With the value, the source and the limits.
-    """
-    low = -math.inf if row.minimum is None else row.minimum
-    high = math.inf if row.maximum is None else row.maximum
+    """Return the value when it is finite and inside its limits; SchemaError gives value, source and limits."""
     with np.errstate(over="ignore"):
-        held = np.float32(value)
-    if not (np.isfinite(held) and np.float32(low) <= held <= np.float32(high)):
+        finite = np.isfinite(np.float32(value))
+    if not (finite and is_within(value, row.minimum, row.maximum)):
+        low = -math.inf if row.minimum is None else row.minimum
+        high = math.inf if row.maximum is None else row.maximum
         allowed = f"[{low:g}, {high:g}]" + (f" {row.unit}" if row.unit else "")
         raise SchemaError(f"{source}: {row.name} is {value:.7g}; it must be finite and in {allowed}")
     if row.type == "int" and value != round(value):
         raise SchemaError(f"{source}: {row.name} is {value:g}; it must be a whole number")
     return value
+
+
+def is_within(value: float, low: float | None, high: float | None) -> bool:
+    """Whether a value is inside limits, compared in float32 as the schema's attributes hold both."""
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return bool(np.float32(-np.inf if low is None else low) <= single <= np.float32(np.inf if high is None else high))
 
 
 def is_on(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> bool:

@@ -1,4 +1,4 @@
-"""Where a layer comes from: stage metadata that it must repeat, its record, and the root that shows it.
+"""A refined layer's provenance: stage metadata that it must repeat, its record, and the root that shows it.
 
 The record lies in ``customLayerData["physgraph"]``. It holds no clock and, unless asked for, no absolute path of this
 machine, so the same input gives the same bytes.
@@ -17,7 +17,7 @@ from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError, StageError
 from .lookup import bound_materials, with_ancestors
-from .stage import TRAVERSAL, USD_ERRORS, reason_of
+from .stage import TRAVERSAL, USD_ERRORS, paths_in, reason_of
 from .view import root_over
 from .write.atomic import prepare_target, publish, temporary_path
 
@@ -37,23 +37,19 @@ _TYPES: dict[str, Any] = {
     "left_out": Mapping,
     "chunk": Mapping,
 }
-_COPIED = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
+METADATA = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
+"""Stage metadata that a refined layer has in common with its shot."""
 
 
 def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float, float] | None = None) -> None:
-    """Repeat in a new layer what a stage says of its time and space.
+    """Repeat the metadata of a shot in a new layer; ``span`` is the range where the shot authors none.
 
     Time codes per second are always authored: a layer without them counts as 24 and USD would rescale its samples.
-
-    Args:
-        stage: The shot.
-        layer: The new layer.
-        span: First and last time code written, for a shot that does not author its range.
     """
     layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
     layer.framesPerSecond = stage.GetFramesPerSecond()
     root = stage.GetRootLayer().pseudoRoot
-    for key in _COPIED:
+    for key in METADATA:
         if stage.HasAuthoredMetadata(key):
             layer.pseudoRoot.SetInfo(key, stage.GetMetadata(key))
         elif root.HasInfo(key):
@@ -72,19 +68,17 @@ def _contents(layer: Sdf.Layer) -> str:
     digest = hashlib.sha256()
     others = sorted(set(layer.customLayerData) - {RECORD})
     digest.update(repr((str(layer.subLayerPaths), others)).encode())
-    paths: list[str] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(str(path)))
-    for path in sorted(paths):
+    for path in sorted(map(str, paths_in(layer))):
         spec = layer.GetObjectAtPath(path)
         if isinstance(spec, Sdf.PrimSpec):
             arcs = [spec.referenceList, spec.payloadList, spec.inheritPathList, spec.specializesList]
-            said = [str(spec.specifier), spec.typeName, *map(str, arcs)]
+            opinions = [str(spec.specifier), spec.typeName, *map(str, arcs)]
         elif isinstance(spec, Sdf.AttributeSpec):
             times = layer.ListTimeSamplesForPath(path)
-            said = [str(spec.typeName), *map(str, (spec.HasInfo("default"), spec.connectionPathList, times))]
+            opinions = [str(spec.typeName), *map(str, (spec.HasInfo("default"), spec.connectionPathList, times))]
         else:
-            said = []
-        digest.update(repr((path, said)).encode())
+            opinions = []
+        digest.update(repr((path, opinions)).encode())
     return digest.hexdigest()
 
 
@@ -112,22 +106,16 @@ def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
 
 
 def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False) -> bool:
-    """Whether a file is a layer that has this in its record, and every frame.
-
-    Args:
-        path: The layer.
-        record: Entries of the record, as `author_record` takes them.
-        settled: Whether every frame must have settled, too.
-    """
-    wanted = Sdf.Layer.CreateAnonymous()
-    wanted.customLayerData = {RECORD: _plain(record)}
+    """Whether a file is a layer with these entries in its record and every frame, settled ones if asked for."""
+    expected = Sdf.Layer.CreateAnonymous()
+    expected.customLayerData = {RECORD: _plain(record)}
     try:
         layer = Sdf.Layer.FindOrOpen(str(path))
     except USD_ERRORS:
         return False
-    there = (read_record(layer) if layer and is_only_ours(layer) else None) or {}
-    lacking = any(name in there for name in (LACKING if settled else LACKING[:2]))
-    return not lacking and all(there.get(key) == value for key, value in (read_record(wanted) or {}).items())
+    found = (read_record(layer) if layer and is_only_ours(layer) else None) or {}
+    lacking = any(name in found for name in (LACKING if settled else LACKING[:2]))
+    return not lacking and all(found.get(key) == value for key, value in (read_record(expected) or {}).items())
 
 
 def recorded_shot(layer: Sdf.Layer) -> str | None:
@@ -143,15 +131,9 @@ def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
 
 
 def mute_refined(stage: Usd.Stage) -> list[str]:
-    """Hide on a stage every layer that holds refined garments, so that what artists changed above them counts.
+    """Hide every layer of refined garments on this stage alone, so that what artists changed above them counts.
 
-    One that holds other things as well, or is the root, stays. Only this stage is affected; nothing is written.
-
-    Args:
-        stage: A stage that may show a shot through a refined layer, as `write_root` makes it.
-
-    Returns:
-        Identifiers of the layers hidden.
+    One that holds other things as well, or is the root, stays. Returns the identifiers of the layers hidden.
     """
     found = (layer for layer in refined_layers(stage) if layer != stage.GetRootLayer())
     identifiers = [layer.identifier for layer in found if is_only_ours(layer)]
@@ -161,15 +143,7 @@ def mute_refined(stage: Usd.Stage) -> list[str]:
 
 
 def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
-    """Refuse cloth that is refined already by a layer that cannot be hidden.
-
-    Args:
-        stage: The shot, its refined layers hidden.
-        paths: Garments; the root alone is looked at where none is given.
-
-    Raises:
-        StageError: The root is a refined layer, or a garment's fine cloth lies in one layer with other things.
-    """
+    """Refuse (StageError) a root that is a refined layer, and garments refined in a layer with other things."""
     for layer in refined_layers(stage):
         record, name = read_record(layer) or {}, Path(layer.identifier).name
         instead = f"refine the shot that it was made from, {record.get('shot') or 'which was in memory'}"
@@ -183,13 +157,9 @@ def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
 
 
 def selections(prims: Iterable[Usd.Prim]) -> tuple[str, ...]:
-    """Variant selections in force on prims, above them and on their materials.
+    """Variant selections in force on prims, above them and on their materials, sorted.
 
-    Args:
-        prims: Garments, colliders, skeletons: whatever the result depends on.
-
-    Returns:
-        Paths such as ``/World/coat{fit=loose}``, sorted; a set with nothing selected has an empty selection.
+    They are paths such as ``/World/coat{fit=loose}``; a set with nothing selected has an empty selection.
     """
     found = set()
     for prim in prims:
@@ -206,21 +176,12 @@ def unsaved_layers(stage: Usd.Stage) -> tuple[str, ...]:
     A layer in memory that holds no prims, such as an empty session, is none of them, unless it is the root.
     """
     dirty = [layer for layer in stage.GetUsedLayers() if layer.dirty]
-    held = [layer for layer in dirty if layer.rootPrims or not layer.anonymous or layer == stage.GetRootLayer()]
-    return tuple(sorted(layer.GetDisplayName() or "in memory" for layer in held))
+    dirty = [layer for layer in dirty if layer.rootPrims or not layer.anonymous or layer == stage.GetRootLayer()]
+    return tuple(sorted(layer.GetDisplayName() or "in memory" for layer in dirty))
 
 
 def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False) -> dict[str, str]:
-    """SHA-256 of every layer that a stage is composed from, value clips included.
-
-    Args:
-        stage: The shot.
-        folder: Folder to name the files from; None for absolute paths.
-        absolute: Whether to name them by absolute paths.
-
-    Returns:
-        Hash by path, with forward slashes, sorted.
-    """
+    """SHA-256 of every layer that a stage is composed from, value clips included, by `asset_path` from a folder."""
     files = {Path(layer.realPath) for layer in stage.GetUsedLayers() if layer.realPath}
     for prim in Usd.PrimRange.Stage(stage, TRAVERSAL):
         if prim.HasAuthoredMetadata("clips"):
@@ -228,13 +189,11 @@ def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False
             named = [found for name in clips.GetClips() for found in clips.ComputeClipAssetPaths(name)]
             files |= {Path(found.resolvedPath) for found in named if found.resolvedPath}
     paths = sorted(path for path in files if path.is_file())
-    return {asset_path(path, folder, absolute=absolute): _sha256(path) for path in paths}
-
-
-def _sha256(path: Path) -> str:
-    """Hash of a file's bytes."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    hashes = {}
+    for path in paths:
+        with path.open("rb") as stream:
+            hashes[asset_path(path, folder, absolute=absolute)] = hashlib.file_digest(stream, "sha256").hexdigest()
+    return hashes
 
 
 def asset_path(path: str | Path, folder: Path | None, *, absolute: bool = False) -> str:
@@ -272,19 +231,10 @@ def _plain_list(items: list[Any]) -> Any:
 
 
 def write_root(path: Path, *, layer: Path, shot: Path, absolute: bool = False, overwrite: bool = False) -> Path:
-    """Write a small root layer that shows a refined layer over its shot.
+    """Write a small root layer that shows a refined layer over its shot, and return its path.
 
-    It repeats the shot's stage metadata, expression variables included: those are read from a root layer alone.
-
-    Args:
-        path: Root to write, ``.usda`` by custom.
-        layer: The refined layer.
-        shot: The shot file, a ``.usdz`` too.
-        absolute: Whether it names them by absolute paths.
-        overwrite: Whether an existing file may be replaced.
-
-    Returns:
-        The path written.
+    It repeats the shot's stage metadata, expression variables included: those are read from a root layer alone. It
+    names both files from its own folder, or by absolute paths.
 
     Raises:
         UsageError: The root exists and may not be replaced.
@@ -299,11 +249,7 @@ def write_root(path: Path, *, layer: Path, shot: Path, absolute: bool = False, o
 
 
 def export_layer(layer: Sdf.Layer, path: Path) -> Path:
-    """Write a layer held in memory to a file, complete or not at all.
-
-    Raises:
-        LayerError: The file cannot be written.
-    """
+    """Write a layer held in memory to a file, complete or not at all (LayerError)."""
     temporary = temporary_path(path, suffix=path.suffix)
     try:
         if not layer.Export(str(temporary)):

@@ -235,8 +235,8 @@ def find_property(text: str) -> Property:
     if len(meant) > 1:
         raise UsageError(f"attribute {text!r} may mean {', '.join(row.short for row in meant)}; write one of them out")
     near = nearest_property(text, GARMENT.values())
-    said = f"did you mean {near.short}? " if near else ""
-    raise UsageError(f"unknown attribute {text!r}; {said}known attributes: {', '.join(sorted(GARMENT))}")
+    message = f"did you mean {near.short}? " if near else ""
+    raise UsageError(f"unknown attribute {text!r}; {message}known attributes: {', '.join(sorted(GARMENT))}")
 
 
 def nearest_property(text: str, rows: Iterable[Property]) -> Property | None:

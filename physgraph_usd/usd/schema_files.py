@@ -129,8 +129,8 @@ def _table_row(row: Property) -> str:
     kind = f"uniform {row.type}" if row.uniform else row.type
     unit = ", ".join(part for part in (row.unit, _ends(row, row.minimum, row.maximum) or ", ".join(row.tokens)) if part)
     soft = _ends(row, *(row.soft or (None, None)))
-    said = row.doc.removesuffix(SI)
-    return f"| `{row.name}` | {row.label} | {kind} | {_otherwise(row)} | {unit} | {soft} | {said} |"
+    message = row.doc.removesuffix(SI)
+    return f"| `{row.name}` | {row.label} | {kind} | {_otherwise(row)} | {unit} | {soft} | {message} |"
 
 
 def _ends(row: Property, low: float | None, high: float | None) -> str:

@@ -1,7 +1,4 @@
-"""Opening a stage: what was found wrong, units, axes and gravity.
-
-Nothing here is written to disk, and no pxr exception leaves this package.
-"""
+"""Opening a stage: what is wrong with it, its units, axes and gravity."""
 
 from __future__ import annotations
 
@@ -11,11 +8,12 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from ..errors import AbsentError, PhysGraphError, StageError
+from ..errors import AbsentError, LayerError, PhysGraphError, StageError
 from .view import StageView
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
@@ -30,6 +28,19 @@ MOST_GRAVITY = 1e5
 """Gravity beyond which a magnitude is a mistake [m/s^2]."""
 FALLBACK_METRES_PER_UNIT = 0.01
 """What USD says an unauthored metersPerUnit means [m]."""
+_HUGE = 1e15
+"""Sizes and rates of a stage are less than this, and more than its inverse: single precision holds what they scale."""
+_RATE = "rate; author one above 0, such as 24"
+_TIME = "time code; author one or remove it"
+_NUMBERS = {
+    "metersPerUnit": ("length; author one above 0, such as 0.01 for centimetres", True),
+    "kilogramsPerUnit": ("mass; author one above 0, such as 1", True),
+    "timeCodesPerSecond": (_RATE, True),
+    "framesPerSecond": (_RATE, True),
+    "startTimeCode": (_TIME, False),
+    "endTimeCode": (_TIME, False),
+}
+"""Stage metadata that are numbers: what each is and what to author, and whether it must be above zero."""
 TRAVERSAL = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 """Active, loaded, defined prims, those inside instances included."""
 
@@ -50,10 +61,23 @@ class Notice:
 
     def __str__(self) -> str:
         """Place, time and message in one line."""
-        place = f"<{self.path}>" if self.path else "stage"
-        return (
-            f"{place}: {self.message}" if self.time is None else f"{place} at time code {self.time:g}: {self.message}"
-        )
+        return f"{f'<{self.path}>' if self.path else 'stage'}{at_time(self.time)}: {self.message}"
+
+
+def at_time(time: float | None) -> str:
+    """Where in time, as messages end a place: " at time code 3", or "" for None."""
+    return "" if time is None else f" at time code {time:g}"
+
+
+def timecode(time: float | None) -> Usd.TimeCode:
+    """USD's time code for ours; None is the default value."""
+    return Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+
+
+def value_at(attribute: Usd.Attribute, time: float | None) -> Any:
+    """An attribute's value at a time code, or its first sample where it has none there."""
+    value = attribute.Get(timecode(time))
+    return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +90,9 @@ class GarmentSource:
         skinned: Whether the points came from baking UsdSkel skinning.
         instance_roots: Prims that must become ``instanceable = false`` in the output.
         times: The garment's own authored times in range; empty for a still one.
-        sources: Which source won, by short name of the value.
+        sources: Where each value comes from, by its short name.
         animated: Short names of the values whose source has time samples.
-        apart_from: What it never touches though it would, by path: colliders and garments, and what says so.
+        apart_from: Colliders and garments that it is kept apart from, by path, and what excludes each.
         left_out: Its own authored times outside the range, where the layer holds it still.
         velocities: Whether the shot has velocities for it.
         subsets: Faces of the cage in each GeomSubset, by its name.
@@ -96,15 +120,7 @@ class GarmentSource:
 
 @contextlib.contextmanager
 def pxr_errors(what: str, kind: type[PhysGraphError] = StageError) -> Iterator[None]:
-    """Turn an error that USD raises into one of ours.
-
-    Args:
-        what: What was being done, as the message's beginning.
-        kind: Our error.
-
-    Raises:
-        PhysGraphError: Of that kind, when pxr raised; its text is the first reasons USD gave.
-    """
+    """Turn an error that USD raises into one of ours: ``what`` was being done, and the first reasons that USD gives."""
     try:
         yield
     except USD_ERRORS as error:
@@ -122,13 +138,13 @@ def reason_of(error: Exception) -> str:
     if not isinstance(error, Tf.ErrorException):
         return f"the file is damaged or was cut short while it was read: {in_brief(text.partition(' - ')[0])}"
     reasons = [part.split(" : ", 1)[-1].strip().strip("'").strip() for part in text.split("\n\tError in ")]
-    kept = list(dict.fromkeys(in_brief(reason) for reason in reasons if reason))
-    return "; ".join(kept[:MOST_REASONS]) + _others(max(len(kept) - MOST_REASONS, 0)) or "USD gave no reason"
+    reasons = list(dict.fromkeys(in_brief(reason) for reason in reasons if reason))
+    return "; ".join(reasons[:MOST_REASONS]) + _others(max(len(reasons) - MOST_REASONS, 0)) or "USD gave no reason"
 
 
-def in_brief(said: object) -> str:
-    """What USD or a value says of itself, on one line of bounded length, without the names of USD's parser."""
-    text = _PARSER_RULE.sub("parse error", " ".join(str(said).split()))
+def in_brief(value: object) -> str:
+    """A text of USD's or a value on one line of bounded length, without the names of USD's parser."""
+    text = _PARSER_RULE.sub("parse error", " ".join(str(value).split()))
     return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} ..."
 
 
@@ -151,8 +167,8 @@ def check_metadata(stage: Usd.Stage) -> None:
         number = float(value) if isinstance(value, int | float) else math.nan
         if value is not None and not (1.0 / _HUGE < number < _HUGE if positive else math.isfinite(number)):
             raise StageError(f"{key} of the stage is {in_brief(value)}, which is no {what}, in its root layer")
-    if said := bad_rate(stage):
-        raise StageError(said)
+    if message := bad_rate(stage):
+        raise StageError(message)
 
 
 def bad_rate(stage: Usd.Stage) -> str:
@@ -164,21 +180,6 @@ def bad_rate(stage: Usd.Stage) -> str:
     return ""
 
 
-_HUGE = 1e15
-"""Sizes and rates of a stage are less than this, and more than its inverse: single precision holds what they scale."""
-_RATE = "rate; author one above 0, such as 24"
-_TIME = "time code; author one or remove it"
-_NUMBERS = {
-    "metersPerUnit": ("length; author one above 0, such as 0.01 for centimetres", True),
-    "kilogramsPerUnit": ("mass; author one above 0, such as 1", True),
-    "timeCodesPerSecond": (_RATE, True),
-    "framesPerSecond": (_RATE, True),
-    "startTimeCode": (_TIME, False),
-    "endTimeCode": (_TIME, False),
-}
-"""Stage metadata that are numbers: what each is and what to author, and whether it must be above zero."""
-
-
 def metres_per_unit(stage: Usd.Stage) -> tuple[float, list[Notice]]:
     """Length of one stage unit [m], and what is odd about it; never raises."""
     authored = root_metadata(stage, "metersPerUnit")
@@ -186,8 +187,8 @@ def metres_per_unit(stage: Usd.Stage) -> tuple[float, list[Notice]]:
         return FALLBACK_METRES_PER_UNIT, [Notice("", None, "metersPerUnit is not authored; 0.01 (centimetres) assumed")]
     value = float(authored) if isinstance(authored, int | float) else math.nan
     if not (math.isfinite(value) and value > 0):
-        said = f"metersPerUnit is {authored!r}, which is no length; 0.01 (centimetres) assumed"
-        return FALLBACK_METRES_PER_UNIT, [Notice("", None, said)]
+        message = f"metersPerUnit is {authored!r}, which is no length; 0.01 (centimetres) assumed"
+        return FALLBACK_METRES_PER_UNIT, [Notice("", None, message)]
     return float(f"{value:.7g}"), []
 
 
@@ -270,12 +271,7 @@ def is_there(path: str | Path) -> bool:
 
 
 def check_there(path: str | Path) -> None:
-    """Refuse a file that is not there; what USD says of one tells neither what nor where.
-
-    Raises:
-        AbsentError: It is not.
-        StageError: It is a pipe or a folder.
-    """
+    """Refuse a file that is not there (AbsentError), and a pipe or a folder (StageError)."""
     if not is_there(path):
         raise AbsentError(f"no such file: {path}")
     if not Sdf.Layer.IsAnonymousLayerIdentifier(str(path)):
@@ -286,13 +282,34 @@ def check_there(path: str | Path) -> None:
 
 def is_sound(layer: Sdf.Layer) -> bool:
     """Whether a layer holds every prim that it lists: USD ends the process where it follows one that is not there."""
-    paths: list[Sdf.Path] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(Sdf.Path(path)))
+    paths = paths_in(layer)
     return all(not path.isEmpty and (not path.IsPrimPath() or layer.GetPrimAtPath(path)) for path in paths)
 
 
+def paths_in(layer: Sdf.Layer) -> list[Sdf.Path]:
+    """Paths of everything that a layer has an opinion on."""
+    paths: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(Sdf.Path(path)))
+    return paths
+
+
+def open_layer(path: str | Path, kind: type[PhysGraphError] = LayerError) -> Sdf.Layer:
+    """Open a layer.
+
+    Raises:
+        AbsentError: It is not there.
+        PhysGraphError: Of that kind, when it cannot be read.
+    """
+    check_there(path)
+    with pxr_errors(f"cannot read {path}", kind), quiet():
+        layer = Sdf.Layer.FindOrOpen(str(path))
+    if not layer:
+        raise kind(f"cannot read {path}: it is no USD file")
+    return layer
+
+
 def shot_name(shot: str | Usd.Stage) -> str:
-    """What a shot is called: its file, or for a stage that has none the name of its root layer in memory."""
+    """A shot's file, or for a stage that has none the name of its root layer in memory."""
     if isinstance(shot, str):
         return shot
     root = shot.GetRootLayer()
@@ -303,8 +320,7 @@ def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
     """Open a stage of our own, for reading.
 
     Args:
-        shot: The shot file, which is opened with all payloads; or an open stage, which is not changed and whose session
-            layer, muted layers, payloads and population ours has too.
+        shot: The shot file, opened with all payloads; or an open stage, shown alike and not changed.
 
     Returns:
         The stage, and a notice for each layer, reference or payload that is missing.
@@ -322,67 +338,42 @@ def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
         stage = Usd.Stage.Open(shot, Usd.Stage.LoadAll) if isinstance(shot, str) else StageView.of(shot).open()
         if not stage:
             raise StageError(f"cannot open {path}")
-        said = [item.commentary for item in diagnostics.TakeUncoalescedDiagnostics()]
-        problems = composition_problems(stage, said)
+        problems = composition_problems(stage, [item.commentary for item in diagnostics.TakeUncoalescedDiagnostics()])
         rates = {layer.GetDisplayName(): layer.timeCodesPerSecond for layer in stage.GetUsedLayers()}
     endless = [name for name, rate in rates.items() if not math.isfinite(rate)]
     if endless:  # USD looks for samples without end.
-        said = f"timeCodesPerSecond of @{endless[0]}@ is {rates[endless[0]]}; author the shot's rate, such as 24"
-        raise StageError(f"cannot read {path}: {said}")
-    broken = [problem for problem in problems if not problem.missing]
+        message = f"timeCodesPerSecond of @{endless[0]}@ is {rates[endless[0]]}; author the shot's rate, such as 24"
+        raise StageError(f"cannot read {path}: {message}")
+    broken = [notice.message for notice, missing in problems if not missing]
     if broken:
-        raise StageError(f"cannot compose {path}: {broken[0].message}" + _others(len(broken) - 1))
-    return stage, [Notice(problem.path, None, problem.message) for problem in problems]
+        raise StageError(f"cannot compose {path}: {broken[0]}" + _others(len(broken) - 1))
+    return stage, [notice for notice, _ in problems]
 
 
-@dataclass(frozen=True)
-class CompositionProblem:
-    """One arc that USD could not follow.
-
-    Attributes:
-        path: Prim that has it; "" for the stage.
-        message: What USD said, in one line.
-        missing: Whether its file or prim is just not there; False for circles and files that cannot be read.
-    """
-
-    path: str
-    message: str
-    missing: bool
-
-
-def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[CompositionProblem]:
-    """Everything that USD could not compose, the same thing once.
+def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[tuple[Notice, bool]]:
+    """Arcs that USD could not follow, and whether a file or prim is just missing: no circle, no file that is damaged.
 
     Args:
         stage: The stage.
-        warnings: What USD said while opening it; read where USD is too old to list its composition errors.
+        warnings: USD's diagnostics while it opened, read where USD is too old to list its composition errors.
     """
     errors = getattr(stage, "GetCompositionErrors", None)
     if errors is None:
-        told = [match.groups() for text in warnings if (match := _WARNED.match(" ".join(text.split())))]
+        texts = [match.groups() for text in warnings if (match := _WARNED.match(" ".join(text.split())))]
     else:
-        told = [(str(error.rootSite.path) if error.rootSite else "/", str(error)) for error in errors()]
+        texts = [(str(error.rootSite.path) if error.rootSite else "/", str(error)) for error in errors()]
     found = {}
-    for path, text in told:
+    for path, text in texts:
         message = " ".join(text.split()).removesuffix(" .")
         asset = re.search(r"(?:load sublayer|open asset) @([^@]+)@", message)
         exists = asset is not None and bool(Ar.GetResolver().Resolve(asset.group(1)))
-        found[message] = CompositionProblem(
-            "" if path == "/" else path or "", in_brief(message), not (exists or "ycle" in message)
-        )
+        place = "" if path == "/" else path or ""
+        found[message] = Notice(place, None, in_brief(message)), not (exists or "ycle" in message)
     return list(found.values())
 
 
 def refuse_missing_arcs(prim: Usd.Prim, notices: Sequence[Notice]) -> None:
-    """Refuse a prim that a missing payload or reference would have given opinions to.
-
-    Args:
-        prim: A garment or collider.
-        notices: What ``open_stage`` gave.
-
-    Raises:
-        StageError: With what is missing.
-    """
+    """Refuse a prim that a missing payload or reference, one of the notices of `open_stage`, would have changed."""
     for notice in notices:
         if notice.path and prim.GetPath().HasPrefix(Sdf.Path(notice.path)):
             raise StageError(f"<{prim.GetPath()}> is incomplete: {notice.message}")

@@ -52,15 +52,14 @@ def _spline_times(attribute: Usd.Attribute) -> list[float]:
 
 
 def merge(times: Iterable[float]) -> tuple[float, ...]:
-    """Sort time codes and drop those that repeat an earlier given one up to rounding."""
-    ranked = sorted((time, rank) for rank, time in enumerate(times))
-    kept: list[tuple[float, int]] = []
-    for time, rank in ranked:
-        if kept and time - kept[-1][0] <= SAME_TIME:
-            kept[-1] = min(kept[-1], (time, rank), key=lambda pair: pair[1])
+    """Sort time codes and drop those that repeat one earlier in the input up to rounding."""
+    merged: list[tuple[float, int]] = []
+    for time, rank in sorted((time, rank) for rank, time in enumerate(times)):
+        if merged and time - merged[-1][0] <= SAME_TIME:
+            merged[-1] = min(merged[-1], (time, rank), key=lambda pair: pair[1])
         else:
-            kept.append((time, rank))
-    return tuple(time for time, _ in kept)
+            merged.append((time, rank))
+    return tuple(time for time, _ in merged)
 
 
 def snap(times: Iterable[float], merged: Sequence[float]) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""What an open stage shows, so that a second stage can show the same and be changed without touching the first."""
+"""The view of an open stage, so that a second stage can show the same and be changed without touching the first."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pxr import Sdf, Usd, UsdUtils
 
 Stage: TypeAlias = Usd.Stage
 Layer: TypeAlias = Sdf.Layer
-"""What the modules above `usd` call USD's own types by."""
+"""Names of USD's types for the modules above `usd`."""
 _NOT_FOR_ROOT = {"subLayers", "subLayerOffsets", "customLayerData", "documentation", "comment", "hasOwnedSubLayers"}
 
 
 @dataclass(frozen=True, eq=False)
 class StageView:
-    """What an open stage shows: its layers as they are in memory, and what it makes of them.
+    """An open stage's layers as they are in memory, and how they are composed.
 
     Attributes:
         root: Root layer, the stage's own: edits that are not saved are in it and in the layers that it names.
@@ -56,14 +56,11 @@ class StageView:
         return replace(cls.of(nothing), population=Usd.StagePopulationMask.All())
 
     def open(self, *, over: Sequence[Sdf.Layer] = (), mask: Usd.StagePopulationMask | None = None) -> Usd.Stage:
-        """Open a stage of its own that shows the same.
+        """Open a second stage that shows the same; sublayers of its session go over the first one's session.
 
         Args:
             over: Layers to lay over everything, strongest first; keep them alive as long as the stage.
             mask: Prims to compose; None for all that the first stage has.
-
-        Returns:
-            The stage. Its session layer holds no prims, so that a sublayer of it is over the first one's session.
         """
         session = root_over(self.session, [layer.identifier for layer in (*over, self.session)])
         population = self.population if mask is None else mask
@@ -88,15 +85,7 @@ def _session_of(stage: Usd.Stage) -> Sdf.Layer:
 
 
 def root_over(source: Sdf.Layer, below: list[str]) -> Sdf.Layer:
-    """Make a root layer in memory with a shot's stage metadata.
-
-    Args:
-        source: The shot's root layer.
-        below: Identifiers of its sublayers, strongest first.
-
-    Returns:
-        The anonymous layer.
-    """
+    """Make an anonymous root layer with the stage metadata of a shot's root and the sublayers ``below``."""
     root = Sdf.Layer.CreateAnonymous(".usda")
     for key in source.pseudoRoot.ListInfoKeys():
         if key not in _NOT_FOR_ROOT and "elocates" not in key:

@@ -1,6 +1,6 @@
-"""The rules that a refined garment must keep, one function each; `validate` runs them.
+"""The rules that a refined layer and its garments must keep, one function each; `validate` runs them.
 
-Every function yields what it finds wrong. USD's own validators check none of this.
+Every function yields problems. USD's own validators check none of this.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ...solver.mesh.topology import PolygonMesh
-from ..provenance import mute_refined, read_record
+from ..provenance import METADATA, mute_refined, read_record
 from ..read.authored import beyond_limits
-from ..stage import root_metadata
+from ..read.skinning import skel_root
+from ..stage import at_time, paths_in, root_metadata, timecode
+from ..times import SAME_TIME, garment_times
 from ..view import StageView
 from ..write.chunk import read_chunk
 from ..write.normals import VertexNormals
 from ..write.overs import EMPTIED
 from ..write.primvars import STALE
-from ..write.track import HEAT, PREFIX
+from ..write.track import HEAT, PREFIX, extent_of
 
 TOGETHER = ("points", "faceVertexCounts", "faceVertexIndices", "extent", "normals", "subdivisionScheme")
-_CLOTH = ("faceVertexCounts", "faceVertexIndices", "points")
-_SAME = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ class Problem:
 
     def __str__(self) -> str:
         """Place, time and message in one line."""
-        when = "" if self.time is None else f" at time code {self.time:g}"
-        return f"{self.severity}: <{self.path}>{when}: {self.message} [{self.rule}]"
+        return f"{self.severity}: <{self.path}>{at_time(self.time)}: {self.message} [{self.rule}]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class Fine:
 
     def value(self, name: str, time: float | None) -> object | None:
         """An attribute's composed value."""
-        return self.prim.GetAttribute(name).Get(code_of(time))
+        return self.prim.GetAttribute(name).Get(timecode(time))
 
     def array(self, name: str, time: float | None) -> np.ndarray | None:
         """An attribute's composed value as numpy, or None."""
@@ -111,13 +110,8 @@ class Fine:
         return Problem(severity, str(path), time, message, "")
 
 
-def code_of(time: float | None) -> Usd.TimeCode:
-    """USD's time code for ours."""
-    return Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-
-
 def opinions_together(fine: Fine) -> Iterator[Problem]:
-    """All that depends on topology is in this layer."""
+    """Everything that depends on topology is in this layer."""
     for name in TOGETHER:
         spec = fine.layer.GetAttributeAtPath(fine.prim.GetPath().AppendProperty(name))
         if spec is None or not (spec.HasDefaultValue() or fine.written(name)):
@@ -194,7 +188,7 @@ def extent(fine: Fine) -> Iterator[Problem]:
         if array is None or len(array) != 2 or positions is None or not len(positions):
             yield fine.problem("extent", "has no lower and upper corner", time)
             continue
-        exact = np.stack([positions.min(axis=0), positions.max(axis=0)]).astype(np.float64)
+        exact = extent_of(positions).astype(np.float64)
         slack = 1e-5 * max(float(np.abs(exact).max()), 1e-30)
         if not np.all(np.abs(exact - array) <= slack):
             yield fine.problem("extent", f"is {array.tolist()}; the points span {exact.tolist()}", time)
@@ -209,12 +203,10 @@ def primvars(fine: Fine) -> Iterator[Problem]:
             continue
         if not primvar.GetTypeName().isArray or interpolation not in sizes:
             continue
-        own = [time for time in fine.times if time is None or time in primvar.GetTimeSamples()]
-        for time in own:
-            message = _primvar_fault(primvar, time, sizes[interpolation])
-            if message:
+        for time in (each for each in fine.times if each is None or each in primvar.GetTimeSamples()):
+            if fault := _primvar_fault(primvar, time, sizes[interpolation]):
                 # A constant array may have any length by elementSize, but not by the coarse mesh's elements.
-                yield fine.problem(name, message, time, severity="warning" if interpolation == "constant" else "error")
+                yield fine.problem(name, fault, time, severity="warning" if interpolation == "constant" else "error")
 
 
 def heat_maps(fine: Fine) -> Iterator[Problem]:
@@ -234,13 +226,13 @@ def heat_maps(fine: Fine) -> Iterator[Problem]:
 
 def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) -> str:
     """What is wrong with a primvar at one time, or ""."""
-    value = primvar.Get(code_of(time))
+    value = primvar.Get(timecode(time))
     if value is None:
         return ""
     groups = len(np.atleast_1d(np.asarray(value))) / max(primvar.GetElementSize(), 1)
     if not primvar.IsIndexed():
         return "" if groups == expected else f"has {groups:g} elements; its interpolation needs {expected}"
-    indices = np.asarray(primvar.GetIndices(code_of(time)))
+    indices = np.asarray(primvar.GetIndices(timecode(time)))
     if len(indices) != expected:
         return f"has {len(indices)} indices; its interpolation needs {expected}"
     if len(indices) and not 0 <= indices.min() <= indices.max() < groups:
@@ -274,8 +266,8 @@ def subsets(fine: Fine) -> Iterator[Problem]:
         if kind != UsdGeom.Tokens.unrestricted and len(np.unique(named)) != len(named):
             yield fine.problem("", f"subset family {family!r} is {kind}, but subsets overlap")
         if kind == UsdGeom.Tokens.partition and len(np.unique(named)) != sizes[element]:
-            said = f"subset family {family!r} is a partition, but names {len(named)} of {sizes[element]} {element}s"
-            yield fine.problem("", said)
+            message = f"subset family {family!r} is a partition, but names {len(named)} of {sizes[element]} {element}s"
+            yield fine.problem("", message)
 
 
 def leftovers(fine: Fine) -> Iterator[Problem]:
@@ -319,9 +311,9 @@ def skinning(fine: Fine) -> Iterator[Problem]:
 
 
 def limits(fine: Fine) -> Iterator[Problem]:
-    """The garment's values are inside their limits; told only, for the cloth is solved already."""
-    for attribute, said, _ in beyond_limits(fine.prim):
-        yield Problem("warning", str(attribute.GetPath()), None, said, "")
+    """The garment's values are inside their limits; a warning only, for the cloth is solved already."""
+    for attribute, message, _ in beyond_limits(fine.prim):
+        yield Problem("warning", str(attribute.GetPath()), None, message, "")
 
 
 RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
@@ -346,7 +338,7 @@ def _error(message: str, path: str = "/", time: float | None = None) -> Problem:
 
 
 def record(layer: Sdf.Layer) -> Iterator[Problem]:
-    """The layer says where it comes from."""
+    """The layer records its garments and its shot."""
     found = read_record(layer)
     if found is None:
         yield _error('has no customLayerData["physgraph"]; is it a refined layer?')
@@ -362,21 +354,21 @@ def time_scale(layer: Sdf.Layer) -> Iterator[Problem]:
 
 def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
     """All samples of the shot were refined: outside those that were, the cloth stands still."""
-    for path, said in (read_record(layer) or {}).get("left_out", {}).items():
-        yield Problem("warning", path, None, f"was refined without {said}, where it stands still (--frames)", "")
+    for path, message in (read_record(layer) or {}).get("left_out", {}).items():
+        yield Problem("warning", path, None, f"was refined without {message}, where it stands still (--frames)", "")
     chunk = read_chunk(layer)
     if chunk is not None and chunk.times != chunk.every:
-        said = f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch it to the others"
-        yield Problem("warning", "/", None, said, "")
+        message = (
+            f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch it to the others"
+        )
+        yield Problem("warning", "/", None, message, "")
 
 
 def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:
     """The layer brings no other layer and authors in no variant."""
     if len(layer.subLayerPaths):
         yield _error(f"has sublayers {layer.subLayerPaths}; a refined layer stands over the shot, not on it")
-    found: list[Sdf.Path] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(Sdf.Path(path)))
-    for path in found:
+    for path in paths_in(layer):
         if path.IsPrimVariantSelectionPath():
             yield _error("authors inside a variant of an asset", str(path))
 
@@ -388,17 +380,17 @@ LAYER_RULES: tuple[Callable[[Sdf.Layer], Iterator[Problem]], ...] = (record, tim
 def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
     """Units, axes, rate and range are the shot's."""
     if layer.timeCodesPerSecond != shot.GetTimeCodesPerSecond():
-        said = f"timeCodesPerSecond is {layer.timeCodesPerSecond:g}; the shot has {shot.GetTimeCodesPerSecond():g}"
-        yield _error(said)
-    for key in _SAME:
-        wanted = root_metadata(shot, key)
+        rate = f"{layer.timeCodesPerSecond:g}; the shot has {shot.GetTimeCodesPerSecond():g}"
+        yield _error(f"timeCodesPerSecond is {rate}")
+    for key in METADATA:
+        expected = root_metadata(shot, key)
         found = layer.pseudoRoot.GetInfo(key) if layer.pseudoRoot.HasInfo(key) else None
-        if wanted is not None and found != wanted:
-            yield _error(f"{key} is {found!r}; the shot has {wanted!r}")
+        if expected is not None and found != expected:
+            yield _error(f"{key} is {found!r}; the shot has {expected!r}")
 
 
 def is_mesh(path: str, composed: Usd.Stage) -> str:
-    """Why a path holds no editable mesh, or ""."""
+    """The reason why a path holds no editable mesh, or ""."""
     prim = composed.GetPrimAtPath(path)
     if not prim:
         return "is not on the stage: the layer is not over the shot that it was made from"
@@ -411,46 +403,27 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
     """Samples lie at the shot's own times, and the fine mesh is about where and as large as the coarse one."""
     name = str(target.AppendProperty("points"))
     written = list(layer.ListTimeSamplesForPath(name))
-    if _is_skinned(coarse):
+    if skel_root(coarse) is not None:  # A skeleton may move it; then its points are a bind pose.
         return
-    known = np.array(sorted(_times(coarse)))
+    authored = np.array(garment_times(coarse))
     for time in written:
-        if not len(known) or np.abs(known - time).min() > 1e-6:
+        if not len(authored) or np.abs(authored - time).min() > SAME_TIME:
             yield _error("is a sample at a time that the shot does not author", name, time)
             break
     spec, clouds = layer.GetAttributeAtPath(name), []
     for time in written[:1] + written[-1:] if written else [None]:
         value = layer.QueryTimeSample(name, time) if time is not None else (spec.default if spec else None)
-        below = UsdGeom.Mesh(coarse).GetPointsAttr().Get(code_of(time))
+        below = UsdGeom.Mesh(coarse).GetPointsAttr().Get(timecode(time))
         if value is not None and below is not None and len(value) and len(below):
             clouds.append((np.asarray(value), np.asarray(below), time))
     yield from _compare(clouds, name)
 
 
-def _times(prim: Usd.Prim) -> set[float]:
-    """Authored times of a mesh's points and of every transform above it."""
-    times = set(UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples())
-    while prim and not prim.IsPseudoRoot():
-        if UsdGeom.Xformable(prim):
-            times.update(UsdGeom.Xformable(prim).GetTimeSamples())
-        prim = prim.GetParent()
-    return times
-
-
-def _is_skinned(prim: Usd.Prim) -> bool:
-    """Whether a skeleton may move the coarse mesh; then its own points are a bind pose."""
-    while prim and not prim.IsPseudoRoot():
-        if UsdSkel.Root(prim):
-            return True
-        prim = prim.GetParent()
-    return False
-
-
 def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name: str) -> Iterator[Problem]:
     """Compare fine and coarse clouds in the same local space by size and place, at some times.
 
-    A sample that is broken, such as one whose points are all at one place, is not the size of the cloth: what is as
-    large as the coarse mesh is at any of the times will do.
+    A sample may be broken, such as one whose points are all at one place: it is enough to be as large as the coarse
+    mesh is at any of the times.
     """
     whole = [(fine.astype(np.float64), below[np.isfinite(below).all(axis=1)], time) for fine, below, time in clouds]
     whole = [each for each in whole if len(each[1]) and np.isfinite(each[0]).all()]
@@ -459,8 +432,8 @@ def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name
         least, most = min(sizes), max(sizes)
         away = float(np.linalg.norm(fine.mean(axis=0) - below.mean(axis=0, dtype=np.float64)))
         if not least / 4 <= _size(fine) <= 4 * most:
-            said = f"is {_size(fine):g} units large; the coarse mesh is {_size(below):g}"
-            yield _error(f"{said}: units or transforms are wrong", name, time)
+            message = f"is {_size(fine):g} units large; the coarse mesh is {_size(below):g}"
+            yield _error(f"{message}: units or transforms are wrong", name, time)
         elif away > most:
             yield _error(f"lies {away:g} units from the coarse mesh, which is {most:g} large", name, time)
 
@@ -471,40 +444,31 @@ def _size(cloud: np.ndarray) -> float:
 
 
 def same_variants(layer: Sdf.Layer, shot: StageView, garments: Sequence[str]) -> Iterator[Problem]:
-    """The shot selects what the layer was made under; another selection's cloth must be refined by itself.
+    """The shot selects the variants of the layer; an error where a coarse mesh differs now, else a warning.
 
-    What a layer authors at a garment's own path is stronger than variants: whatever is selected over it, it shows the
+    What a layer authors at a garment's path is stronger than variants: whatever is selected over it, it shows the
     garment of the selections that were in force when it was made.
-
-    Args:
-        layer: The refined layer.
-        shot: The shot.
-        garments: Paths of the coarse meshes.
-
-    Yields:
-        An error where the shot's own cloth is another one now, else a warning.
     """
-    wanted = [Sdf.Path(text) for text in (read_record(layer) or {}).get("variants", ())]
-    mask = Usd.StagePopulationMask([*garments, *dict.fromkeys(path.GetPrimPath() for path in wanted)])
-    now = _coarse(shot, mask, ()) if wanted else None
-    changed = {path: _selected(now, path) for path in wanted if now and _selected(now, path) != path}
+    recorded = [Sdf.Path(text) for text in (read_record(layer) or {}).get("variants", ())]
+    mask = Usd.StagePopulationMask([*garments, *dict.fromkeys(path.GetPrimPath() for path in recorded)])
+    now = _coarse(shot, mask, ()) if recorded else None
+    changed = {path: _selected(now, path) for path in recorded if now and _selected(now, path) != path}
     then = _coarse(shot, mask, tuple(changed)) if changed else None
     others = [path for path in garments if then and now and _cloth(now, path) != _cloth(then, path)]
     for path, selected in changed.items():
-        said = f"was refined with {_words(path)} and shows that; the shot has {_words(selected)} now"
+        message = f"was refined with {_words(path)} and shows that; the shot has {_words(selected)} now"
         if others:
-            differ = (
-                f", where {', '.join(f'<{other}>' for other in others)} is another mesh; refine it into its own layer"
-            )
-            yield Problem("error", str(path.GetPrimPath()), None, said + differ, "")
+            meshes = ", ".join(f"<{other}>" for other in others)
+            message += f", where {meshes} is another mesh; refine it into its own layer"
+            yield Problem("error", str(path.GetPrimPath()), None, message, "")
         else:
-            yield Problem("warning", str(path.GetPrimPath()), None, f"{said}; the garments' meshes are the same", "")
+            yield Problem("warning", str(path.GetPrimPath()), None, f"{message}; the garments' meshes are the same", "")
 
 
-def _coarse(shot: StageView, mask: Usd.StagePopulationMask, wanted: Sequence[Sdf.Path]) -> Usd.Stage:
+def _coarse(shot: StageView, mask: Usd.StagePopulationMask, selections: Sequence[Sdf.Path]) -> Usd.Stage:
     """A shot without refined layers, with variants selected."""
     selected = Sdf.Layer.CreateAnonymous("selections.usda")
-    for path in wanted:
+    for path in selections:
         name, selection = path.GetVariantSelection()
         Sdf.CreatePrimInLayer(selected, path.GetPrimPath()).variantSelections[name] = selection
     stage = shot.open(over=[selected], mask=mask)
@@ -513,12 +477,11 @@ def _coarse(shot: StageView, mask: Usd.StagePopulationMask, wanted: Sequence[Sdf
 
 
 def _selected(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
-    """A selection's path with what a stage selects in its place."""
+    """A selection's path with the stage's selection in its place."""
     name, _ = path.GetVariantSelection()
     prim = stage.GetPrimAtPath(path.GetPrimPath())
-    return path.GetPrimPath().AppendVariantSelection(
-        name, prim.GetVariantSet(name).GetVariantSelection() if prim else ""
-    )
+    selection = prim.GetVariantSet(name).GetVariantSelection() if prim else ""
+    return path.GetPrimPath().AppendVariantSelection(name, selection)
 
 
 def _words(path: Sdf.Path) -> str:
@@ -532,10 +495,7 @@ def _cloth(stage: Usd.Stage, path: str) -> list[bytes | None]:
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
     if not mesh:
         return []
-    times = mesh.GetPointsAttr().GetTimeSamples()
-    codes = [
-        Usd.TimeCode.Default(),
-        *(Usd.TimeCode(t) for t in {*times[:1], *times[len(times) // 2 :][:1], *times[-1:]}),
-    ]
-    values = [mesh.GetPrim().GetAttribute(name).Get(code) for name in _CLOTH for code in codes]
+    samples = mesh.GetPointsAttr().GetTimeSamples()
+    times = [None, *sorted({*samples[:1], *samples[len(samples) // 2 :][:1], *samples[-1:]})]
+    values = [mesh.GetPrim().GetAttribute(name).Get(timecode(time)) for name in TOGETHER[:3] for time in times]
     return [None if value is None else np.asarray(value).tobytes() for value in values]

@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdUtils
 
 from ...errors import LayerError
 from ..provenance import read_record, recorded_shot
-from ..stage import USD_ERRORS, bad_rate, check_there, is_there, pxr_errors, quiet, reason_of
+from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
 from ..view import StageView
 from .rules import LAYER_RULES, RULES, Fine, Problem, against_shot, is_mesh, same_metadata, same_variants, subsets
 from .validators import PLUGIN
@@ -23,7 +23,7 @@ _COUNTS = "InvalidSubsetFamily"
 
 
 def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage | None = None) -> list[Problem]:
-    """Check a refined layer.
+    """Check a refined layer, by itself and over its shot.
 
     Args:
         layer: The layer, a file or in memory.
@@ -36,40 +36,37 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
         AbsentError: The layer or the shot is not there.
         LayerError: The layer or the shot cannot be opened or read.
     """
-    opened = layer if isinstance(layer, Sdf.Layer) else _open(layer)
+    opened = layer if isinstance(layer, Sdf.Layer) else open_layer(layer)
     below = shot if shot is not None else recorded_shot(opened)
     lost = isinstance(below, str) and shot is None and not is_there(below)
     view = None if lost else _view(below)
     with pxr_errors(f"cannot read {layer} over {below}", LayerError):
-        if said := _bad_rate(opened, view):
-            return [Problem("error", "/", None, said, "time_scale")]
+        if message := _bad_rate(opened, view):
+            return [Problem("error", "/", None, message, "time_scale")]
         opened = _played(opened)
         problems = check_layer(opened, view)
         if lost:
-            said = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
-            problems.append(Problem("error", "/", None, said, "record"))
+            message = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
+            problems.append(Problem("error", "/", None, message, "record"))
         elif view is not None and not any(problem.rule == "composition" for problem in problems):
             problems += _own_validators(opened, view)
     return sorted(problems, key=lambda problem: problem.severity != "error")
 
 
 def _bad_rate(layer: Sdf.Layer, shot: StageView | None) -> str:
-    """What is wrong with the rate of a layer or of its shot, or ""."""
+    """The fault in the rate of a layer or of its shot, or ""."""
     nothing = Usd.StagePopulationMask()
     stages = [Usd.Stage.OpenMasked(layer, nothing)] + ([] if shot is None else [shot.open(mask=nothing)])
     return next(filter(None, map(bad_rate, stages)), "")
 
 
 def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None = None) -> list[Problem]:
-    """Run our rules.
+    """Run our rules on a layer, and over its shot where there is one.
 
     Args:
         layer: The refined layer.
         shot: The shot, or None to check the layer alone.
-        samples: How many time samples to look at, spread over the range; None for all.
-
-    Returns:
-        Problems in the order of the rules.
+        samples: Number of time samples to check, spread over the range; None for all.
     """
     problems = [replace(problem, rule=rule.__name__) for rule in LAYER_RULES for problem in rule(layer)]
     if shot is None:
@@ -94,20 +91,18 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
 
 
 def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coarse: Usd.Prim) -> Iterator[Problem]:
-    """Run the rules for one garment; subsets that break a rule in the shot already are its own, and only told."""
+    """Run the rules for one garment; for subsets that break a rule in the shot already there is a warning."""
     written = list(layer.ListTimeSamplesForPath(prim.GetPath().AppendProperty("points")))
     if samples is not None and len(written) > samples:
         written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
     fine = Fine(prim, layer, (None, *written))
-    of_the_shot = bool(coarse) and any(subsets(Fine(coarse, layer, (None,))))
+    in_shot = bool(coarse) and any(subsets(Fine(coarse, layer, (None,))))
     for rule in RULES:
         for problem in _named(rule.__name__, rule(fine)):
-            told = rule is subsets and of_the_shot
-            yield (
-                replace(problem, severity="warning", message=f"{problem.message}; so it is in the shot")
-                if told
-                else problem
-            )
+            if rule is subsets and in_shot:
+                yield replace(problem, severity="warning", message=f"{problem.message}; so it is in the shot")
+            else:
+                yield problem
 
 
 def _named(rule: str, problems: Iterable[Problem]) -> Iterator[Problem]:
@@ -120,9 +115,7 @@ def _garments(layer: Sdf.Layer) -> Sequence[str]:
     named = (read_record(layer) or {}).get("garments")
     if named:
         return [str(path) for path in named]
-    found: list[Sdf.Path] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(Sdf.Path(path)))
-    return sorted(str(path.GetPrimPath()) for path in found if path.name == "points")
+    return sorted(str(path.GetPrimPath()) for path in paths_in(layer) if path.name == "points")
 
 
 def _coarse_path(layer: Sdf.Layer, path: str) -> str:
@@ -132,20 +125,8 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
     return str(references[0].primPath) if references else path
 
 
-def _open(path: str | Path) -> Sdf.Layer:
-    """Open a layer."""
-    check_there(path)
-    try:
-        layer = Sdf.Layer.FindOrOpen(str(path))
-    except USD_ERRORS as error:
-        raise LayerError(f"cannot read {path}: {reason_of(error)}") from error
-    if not layer:
-        raise LayerError(f"cannot read {path}")
-    return layer
-
-
 def _played(layer: Sdf.Layer) -> Sdf.Layer:
-    """A layer that `stitch --clips` wrote, with what its clips play as samples of its own; any other as it is."""
+    """A layer that `stitch --clips` wrote, with the samples that its clips play; any other as it is."""
     stage = Usd.Stage.Open(layer) if "chunks" in (read_record(layer) or {}) and layer.subLayerPaths else None
     moving = [prim for prim in stage.TraverseAll() if prim.HasAuthoredMetadata("clips")] if stage else []
     if stage is None or not moving:
@@ -160,14 +141,14 @@ def _played(layer: Sdf.Layer) -> Sdf.Layer:
 
 
 def _view(shot: str | Path | Usd.Stage | None) -> StageView | None:
-    """What a shot shows; None for no shot."""
+    """The view of a shot; None for no shot."""
     if shot is None:
         return None
-    return StageView.of(shot) if isinstance(shot, Usd.Stage) else StageView.of_layer(_open(shot))
+    return StageView.of(shot) if isinstance(shot, Usd.Stage) else StageView.of_layer(open_layer(shot))
 
 
 def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
-    """Run USD's validators, as many as there are here; what the shot itself already has is left out."""
+    """Problems that USD's validators, as many as there are, find in the layer and not in its shot."""
     try:
         from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
     except ImportError:
@@ -195,10 +176,7 @@ def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]
 
 
 def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
-    """Whether a finding is what we did on purpose.
-
-    Skinning is taken off, its coarse properties stay below; a family whose faces were all left out has none.
-    """
+    """Whether a finding is on purpose: skinning is taken off, and a family whose faces were all left out has none."""
     emptied = problem.rule.endswith(_COUNTS) and "No indices in family" in problem.message
     return problem.path in fine and (emptied or problem.rule.endswith("MissingSkelBindingAPI"))
 
@@ -215,22 +193,22 @@ def _findings(
     for name in sorted(name for name in names if not name.startswith(f"{PLUGIN}:")):  # Ours have run.
         try:
             context = module.ValidationContext([registry.GetOrLoadValidatorByName(name)])
-            own = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]
+            reports = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]
         except USD_ERRORS:
             failed.append(name)
             continue
-        for findings, problems in zip(found, own, strict=True):
+        for findings, problems in zip(found, reports, strict=True):
             findings.update({(p.rule, p.path, _without_names(p.message)): p for p in problems})
-    said = f"{len(failed)} of USD's own validators do not run with this USD: {', '.join(failed)}"
-    return found, [Problem("warning", "/", None, said, "validators")] if failed else []
+    message = f"{len(failed)} of USD's own validators do not run with this USD: {', '.join(failed)}"
+    return found, [Problem("warning", "/", None, message, "validators")] if failed else []
 
 
 def _as_problem(module: Any, found: Any) -> Problem:
     """One finding of USD's as ours."""
     sites = found.GetSites()
     path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
-    if sites and not path:
-        path = str(sites[0].GetPrim().GetPath()) if sites[0].IsPrim() else "/"
+    if sites and not path and sites[0].IsPrim():
+        path = str(sites[0].GetPrim().GetPath())
     severity = "error" if found.GetType() == module.ValidationErrorType.Error else "warning"
     return Problem(severity, path or "/", None, found.GetMessage(), str(found.GetIdentifier()))
 

@@ -1,8 +1,7 @@
 """The rules of `validate` as validators of UsdValidation, for usdchecker and host programs.
 
-What they check are refined layers in a stage's layer stack, as composed there. Rules that compare with the shot below
-stay with `validate`. Registering from Python takes USD 26.5; plugins/usdvalidation holds the plugInfo.json that names
-each rule.
+They check refined layers in a stage's layer stack, as composed there; rules that compare with the shot below stay with
+`validate`. Registering from Python takes USD 26.5; plugins/usdvalidation holds the plugInfo.json that names each rule.
 """
 
 from __future__ import annotations
@@ -14,6 +13,8 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ..provenance import read_record
+from ..stage import at_time
+from ..write.track import extent_of
 from .rules import LAYER_RULES, RULES, Fine, Problem, extent
 
 PLUGIN = "physgraph_validators"
@@ -22,11 +23,7 @@ EXTENT_FIXER = "recomputeExtent"
 
 
 def register() -> bool:
-    """Register every rule as ``PLUGIN:RULE``.
-
-    Returns:
-        Whether this USD lets Python register validators.
-    """
+    """Register every rule as ``PLUGIN:RULE``; False where this USD lets no Python register validators."""
     try:
         from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
     except ImportError:
@@ -71,8 +68,7 @@ def _errors(module: Any, name: str, problems: Iterable[Problem], site: Callable[
     kinds = {"error": module.ValidationErrorType.Error, "warning": module.ValidationErrorType.Warn}
     found = []
     for problem in problems:
-        when = "" if problem.time is None else f" at time code {problem.time:g}"
-        message = f"<{problem.path}>{when}: {problem.message}"
+        message = f"<{problem.path}>{at_time(problem.time)}: {problem.message}"
         found.append(module.ValidationError(name, kinds[problem.severity], [site(Sdf.Path(problem.path))], message))
     return found
 
@@ -89,8 +85,8 @@ def refined(prim: Usd.Prim) -> Fine | None:
 
 
 def _extent_fixer(module: Any) -> Any:
-    said = "Writes the extent of the points, at the times of the points, into the refined layer."
-    return module.ValidationFixer(EXTENT_FIXER, said, _fix_extent, _can_fix_extent, [], extent.__name__)
+    message = "Writes the extent of the points, at the times of the points, into the refined layer."
+    return module.ValidationFixer(EXTENT_FIXER, message, _fix_extent, _can_fix_extent, [], extent.__name__)
 
 
 def _at(error: Any, target: Usd.EditTarget) -> Fine | None:
@@ -122,7 +118,7 @@ def _fix_extent(error: Any, target: Usd.EditTarget, _time: Usd.TimeCode) -> bool
         for time in set(fine.written("extent")) - set(fine.written("points")):
             fine.layer.EraseTimeSample(path, time)
         for time, value in _points(fine).items():
-            box = Vt.Vec3fArray.FromNumpy(np.stack([np.min(value, axis=0), np.max(value, axis=0)]).astype(np.float32))
+            box = Vt.Vec3fArray.FromNumpy(extent_of(np.asarray(value)))
             if time is None:
                 spec.default = box
             else:

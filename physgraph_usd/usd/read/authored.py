@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ..lookup import USER_PROPERTIES, bound_materials, connected, find_value, with_ancestors
+from ..lookup import USER_PROPERTIES, bound_materials, connected, find_value, is_within, with_ancestors
 from ..schema import COLLIDER_API, GARMENT_API, MATERIAL, PROPERTIES, Property, nearest_property
 from ..stage import Notice
 from ..write.track import HEAT, PREFIX
@@ -53,8 +53,8 @@ def _fault(name: str, *, material: bool) -> str:
     if name in _NAMES:
         return "is not read on a material; author it on the garment" if material and MATERIAL not in name else ""
     near = nearest_property(name, PROPERTIES)
-    said = f"did you mean {near.name}?" if near else "docs/attributes.md lists all"
-    return "" if name in _WRITTEN | _BLENDERS else f"is no attribute that refining reads; {said}"
+    message = f"did you mean {near.name}?" if near else "docs/attributes.md lists all"
+    return "" if name in _WRITTEN | _BLENDERS else f"is no attribute that refining reads; {message}"
 
 
 def _connection_fault(attribute: Usd.Attribute) -> str:
@@ -81,8 +81,8 @@ def beyond_limits(prim: Usd.Prim, schema: str = GARMENT_API) -> Iterator[tuple[U
             continue
         attribute = _giver(prim, row)
         values = [] if attribute is None else _extremes(attribute)
-        hard = next((value for value in values if not _inside(value, row.minimum, row.maximum)), None)
-        soft = next((value for value in values if not _inside(value, *row.soft)), None)
+        hard = next((value for value in values if not is_within(value, row.minimum, row.maximum)), None)
+        soft = next((value for value in values if not is_within(value, *row.soft)), None)
         if attribute is not None and hard is not None:
             yield attribute, _said(row, hard, "hard", (row.minimum, row.maximum)), True
         elif attribute is not None and soft is not None:
@@ -93,8 +93,8 @@ def beyond_limits_of_all(garments: list[Usd.Prim], colliders: list[Usd.Prim]) ->
     """Iterate over paths and faults of what is authored beyond limits for garments and colliders."""
     for schema, prims in ((GARMENT_API, garments), (COLLIDER_API, colliders)):
         for prim in prims:
-            for attribute, said, _ in beyond_limits(prim, schema):
-                yield str(attribute.GetPrim().GetPath()), f"{attribute.GetName()} {said}"
+            for attribute, message, _ in beyond_limits(prim, schema):
+                yield str(attribute.GetPrim().GetPath()), f"{attribute.GetName()} {message}"
 
 
 def _giver(prim: Usd.Prim, row: Property) -> Usd.Attribute | None:
@@ -111,12 +111,6 @@ def _extremes(attribute: Usd.Attribute) -> list[float]:
     arrays = [np.asarray(attribute.Get(code)).ravel() for code in codes]
     numbers = [array for array in arrays if array.size and array.dtype.kind in "biuf"]
     return [float(pick(each)) for pick in (np.min, np.max) for each in numbers]
-
-
-def _inside(value: float, low: float | None, high: float | None) -> bool:
-    """Whether a value is inside limits, compared in float32, as a layer holds both."""
-    held = np.float32(value)
-    return bool(np.float32(-np.inf if low is None else low) <= held <= np.float32(np.inf if high is None else high))
 
 
 def _said(row: Property, value: float, kind: str, ends: tuple[float | None, float | None]) -> str:

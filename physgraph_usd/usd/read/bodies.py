@@ -15,8 +15,8 @@ from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import COLLIDER_OFFSET, COLLIDER_SIDE, find_token, find_value
-from ..stage import Notice
-from .placement import is_flipped, place, timecode
+from ..stage import Notice, timecode
+from .placement import is_flipped, place
 
 _EVEN = 1e-4
 """Relative difference under which two scales count as the same."""
@@ -128,14 +128,14 @@ class ColliderReader:
 
     def _bounded(self, pose: Pose, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         """The pose without what is out of bounds: the faces with such points, or a primitive itself."""
-        if not (said := out_of_bounds(pose.corners())):
+        if not (message := out_of_bounds(pose.corners())):
             return pose, ()
         if not isinstance(pose, MeshPose):
-            return None, (self._out(time, said),)
+            return None, (self._out(time, message),)
         near = np.asarray((np.abs(pose.points) <= FARTHEST).all(axis=1))
-        said = f"{said}; faces with it, and with {(~near).sum() - 1} more such, are left out"
+        message = f"{message}; faces with it, and with {(~near).sum() - 1} more such, are left out"
         whole = MeshPose(np.where(near[:, None], pose.points, np.nan), pose.triangles)
-        return whole, (Notice(self.collider.path, time, said),)
+        return whole, (Notice(self.collider.path, time, message),)
 
     def _out(self, time: float | None, why: str) -> Notice:
         return Notice(self.collider.path, time, f"this collider is left out here: {why}")

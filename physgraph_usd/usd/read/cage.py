@@ -14,7 +14,7 @@ from pxr import Usd, UsdGeom
 
 from ...errors import GarmentError, counted
 from ...solver.mesh.topology import PolygonMesh
-from ..stage import Notice
+from ..stage import Notice, timecode
 
 _CONTROLS = {
     "subdivisionScheme": ("catmullClark", "loop", "bilinear", "none"),
@@ -78,13 +78,13 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
 
 def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
     """Integer array at a time code, or at the first sample where there is no default; empty when unauthored."""
-    value = attribute.Get(Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
+    value = attribute.Get(timecode(time))
     if value is None:
         value = attribute.Get(Usd.TimeCode.EarliestTime())
     array = np.zeros(0) if value is None else np.asarray(value)
     if array.ndim != 1 or (len(array) and not np.issubdtype(array.dtype, np.integer)):
-        said = f"{attribute.GetName()} is {type(value).__name__}, not an array of integers"
-        raise GarmentError(str(attribute.GetPrim().GetPath()), said, time=time, remedy="author int[]")
+        message = f"{attribute.GetName()} is {type(value).__name__}, not an array of integers"
+        raise GarmentError(str(attribute.GetPrim().GetPath()), message, time=time, remedy="author int[]")
     return array.astype(np.int32)
 
 
@@ -100,8 +100,8 @@ def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
     first = read_integers(attribute, times[0])
     for time in samples:
         if times[0] < time <= times[-1] and not np.array_equal(first, read_integers(attribute, time)):
-            said = f"{attribute.GetName()} changes: the topology of a garment must stay the same over the shot"
-            raise GarmentError(str(attribute.GetPrim().GetPath()), said, time=time, remedy=_SPLIT)
+            message = f"{attribute.GetName()} changes: the topology of a garment must stay the same over the shot"
+            raise GarmentError(str(attribute.GetPrim().GetPath()), message, time=time, remedy=_SPLIT)
 
 
 def check_topology(
@@ -114,19 +114,19 @@ def check_topology(
     """
     remedy = "export the mesh again or repair it in its host program"
     if len(counts) == 0 or vertex_count == 0 or not (counts >= 3).any():
-        said = f"the mesh is empty: {vertex_count} points, {len(counts)} faces"
-        raise GarmentError(path, said, time=time, remedy="leave it out with --garment, or remove the schema from it")
+        message = f"the mesh is empty: {vertex_count} points, {len(counts)} faces"
+        raise GarmentError(path, message, time=time, remedy="leave it out with --garment, or remove the schema from it")
     if counts.min() < 0:
         face = int(np.argmin(counts))
         raise GarmentError(path, f"faceVertexCounts[{face}] is {counts[face]}", time=time, remedy=remedy)
     if counts.sum(dtype=np.int64) != len(indices):
-        said = f"faceVertexCounts sum to {counts.sum(dtype=np.int64)} but there are {len(indices)} faceVertexIndices"
-        raise GarmentError(path, said, time=time, remedy=remedy)
+        message = f"faceVertexCounts sum to {counts.sum(dtype=np.int64)} but there are {len(indices)} faceVertexIndices"
+        raise GarmentError(path, message, time=time, remedy=remedy)
     outside = np.flatnonzero((indices < 0) | (indices >= vertex_count))
     if len(outside):
         corner = int(outside[0])
-        said = f"faceVertexIndices[{corner}] is {indices[corner]} but there are {vertex_count} points"
-        raise GarmentError(path, said, time=time, remedy=remedy)
+        message = f"faceVertexIndices[{corner}] is {indices[corner]} but there are {vertex_count} points"
+        raise GarmentError(path, message, time=time, remedy=remedy)
 
 
 def _refuse_large_faces(path: str, counts: np.ndarray, indices: np.ndarray, keep: np.ndarray) -> None:
@@ -146,8 +146,10 @@ def _left_out(path: str, keep: np.ndarray, unknown_holes: int) -> list[Notice]:
     notices = []
     if not keep.all():
         face = int(np.argmin(keep))
-        said = f"{counted(int(np.sum(~keep)), 'face')} with fewer than three corners left out, the first is face {face}"
-        notices.append(Notice(path, None, said))
+        message = (
+            f"{counted(int(np.sum(~keep)), 'face')} with fewer than three corners left out, the first is face {face}"
+        )
+        notices.append(Notice(path, None, message))
     if unknown_holes:
         notices.append(Notice(path, None, f"{unknown_holes} holeIndices name no face and are ignored"))
     return notices
@@ -160,8 +162,10 @@ def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
         for attribute in (usd.GetCreaseIndicesAttr(), usd.GetCornerIndicesAttr())
         if attribute.HasAuthoredValue() and np.size(attribute.Get(Usd.TimeCode.EarliestTime()) or ())
     ]
-    said = f"{' and '.join(authored)} sharpen the cage's limit surface; cloth has no sharp edges, so they are dropped"
-    return [Notice(str(usd.GetPath()), None, said)] if authored else []
+    message = (
+        f"{' and '.join(authored)} sharpen the cage's limit surface; cloth has no sharp edges, so they are dropped"
+    )
+    return [Notice(str(usd.GetPath()), None, message)] if authored else []
 
 
 def _odd_controls(usd: UsdGeom.Mesh) -> list[Notice]:
@@ -207,28 +211,32 @@ class PointReader:
         """
         points = self._raw(time)
         if len(points) != self.count:
-            said = f"the number of points changes from {self.count} to {len(points)}"
+            message = f"the number of points changes from {self.count} to {len(points)}"
             remedy = "export the garment with one topology, or use --frames for the part where it is the same"
-            raise GarmentError(self.path, said, time=time, remedy=remedy)
+            raise GarmentError(self.path, message, time=time, remedy=remedy)
         broken = ~np.isfinite(points).all(axis=1)
         if not broken.any():
             return points, ()
         if broken.mean() > MOST_BROKEN and broken.sum() > 1:
-            said = f"{broken.sum()} of {self.count} points are NaN or infinite, the first is points[{broken.argmax()}]"
+            message = (
+                f"{broken.sum()} of {self.count} points are NaN or infinite, the first is points[{broken.argmax()}]"
+            )
             remedy = "cache that frame again, or leave it out with --frames"
-            raise GarmentError(self.path, said, time=time, remedy=remedy)
+            raise GarmentError(self.path, message, time=time, remedy=remedy)
         reference = self._good_sample(time)
         repaired = repair(points, edges, reference)
         if not np.isfinite(repaired).all():
-            said = f"points[{broken.argmax()}] is NaN or infinite, with no neighbour or other sample to repair it from"
-            raise GarmentError(self.path, said, time=time, remedy="cache that frame again")
+            message = (
+                f"points[{broken.argmax()}] is NaN or infinite, with no neighbour or other sample to repair it from"
+            )
+            raise GarmentError(self.path, message, time=time, remedy="cache that frame again")
         which = ", ".join(f"points[{index}]" for index in np.flatnonzero(broken)[:3])
         more = " ..." if broken.sum() > 3 else ""
-        said = f"{which}{more} NaN or infinite: {broken.sum()} repaired from neighbours and the nearest good sample"
-        return repaired, (Notice(self.path, time, said),)
+        message = f"{which}{more} NaN or infinite: {broken.sum()} repaired from neighbours and the nearest good sample"
+        return repaired, (Notice(self.path, time, message),)
 
     def _raw(self, time: float | None) -> np.ndarray:
-        value = self._attribute.Get(Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
+        value = self._attribute.Get(timecode(time))
         if value is None:
             value = self._attribute.Get(Usd.TimeCode.EarliestTime())
         return as_points(value, self.path, "points", time=time)

@@ -184,9 +184,9 @@ def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
         "inside a prototype": prim.IsInPrototype(),
         "only an over, defined nowhere,": not prim.IsDefined(),
     }
-    said = [name for name, holds in states.items() if holds]
-    if said:
-        raise AbsentError(f"<{item}> is {said[0]} and does not exist for refining; {_meshes_said(stage)}")
+    found = [name for name, holds in states.items() if holds]
+    if found:
+        raise AbsentError(f"<{item}> is {found[0]} and does not exist for refining; {_meshes_said(stage)}")
     return prim
 
 
@@ -242,7 +242,7 @@ def _named(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str], list[
     """Gprims at and below the targets of one garment, and by which target."""
     found: dict[Sdf.Path, str] = {}
     notices = []
-    said = f"<{prim.GetPath()}>.{EXCLUDE}"
+    message = f"<{prim.GetPath()}>.{EXCLUDE}"
     for target in targets_of(prim, EXCLUDE):
         try:
             paths = find_paths(stage, str(target), UsdGeom.Gprim)
@@ -250,5 +250,5 @@ def _named(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str], list[
             notices.append(Notice(str(prim.GetPath()), None, f"{EXCLUDE} excludes nothing by <{target}>: {error}"))
             continue
         for path in paths:
-            found.setdefault(path, said if path == target else f"{said} = <{target}>")
+            found.setdefault(path, message if path == target else f"{message} = <{target}>")
     return found, notices

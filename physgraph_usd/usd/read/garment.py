@@ -91,9 +91,9 @@ class GarmentReader:
         guide, detail, offset = (self.values.number(name, time) for name in names)
         fabric, most = self.values.fabric(time), float(np.linalg.norm(np.ptp(self.garment.rest, axis=0))) / _THICK
         if max(fabric.thickness, offset) > most:
-            said = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
-            said += f" {1e3 * fabric.thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
-            notices = (*notices, Notice(self.garment.path, None, said))
+            message = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
+            message += f" {1e3 * fabric.thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
+            notices = (*notices, Notice(self.garment.path, None, message))
         fabric, offset = replace(fabric, thickness=min(fabric.thickness, most)), min(offset, most)
         return GarmentFrame(place(local, matrix), fabric, guide, detail, offset), notices
 
@@ -182,8 +182,8 @@ def _rest_auto(
     found = list(poses.values())
     shape, nearest = median_shape(edges_of(mesh.triangulate(found[0]).triangles, mesh.vertex_count).vertices, found)
     at = [*poses][nearest]
-    said = f"median edge lengths of {len(poses)} time codes" + ("" if at is None else f", from the points at {at:g}")
-    return Rest(shape, f"auto: {said} (--rest)")
+    message = f"median edge lengths of {len(poses)} time codes" + ("" if at is None else f", from the points at {at:g}")
+    return Rest(shape, f"auto: {message} (--rest)")
 
 
 def _subsets(prim: Usd.Prim, kept: np.ndarray) -> dict[str, np.ndarray]:
@@ -243,8 +243,8 @@ def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notic
     largest = float(size.max())
     if not request.assumed_units and _SMALL <= largest <= _LARGE:
         return []
-    said = " x ".join(f"{length:.3g}" for length in size)
-    return [Notice(path, None, f"measures {said} m with {request.units.metres:g} m per unit; check metersPerUnit")]
+    message = " x ".join(f"{length:.3g}" for length in size)
+    return [Notice(path, None, f"measures {message} m with {request.units.metres:g} m per unit; check metersPerUnit")]
 
 
 def _unit_notices(prim: Usd.Prim, matrix: np.ndarray, request: Request) -> list[Notice]:
@@ -254,8 +254,8 @@ def _unit_notices(prim: Usd.Prim, matrix: np.ndarray, request: Request) -> list[
     for layer in dict.fromkeys(spec.layer for spec in UsdGeom.Mesh(prim).GetPointsAttr().GetPropertyStack()):
         own = layer.pseudoRoot.GetInfo("metersPerUnit") if layer.pseudoRoot.HasInfo("metersPerUnit") else None
         if isinstance(own, int | float) and not np.isclose(own, metres) and not np.isclose(own, scale, rtol=0.01):
-            said = f"its layer @{layer.GetDisplayName()}@ has {own:g} m per unit, the stage has {metres:g}"
-            notices.append(Notice(str(prim.GetPath()), None, f"{said}; USD does not convert, check its size"))
+            message = f"its layer @{layer.GetDisplayName()}@ has {own:g} m per unit, the stage has {metres:g}"
+            notices.append(Notice(str(prim.GetPath()), None, f"{message}; USD does not convert, check its size"))
     return notices
 
 
@@ -294,12 +294,12 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
     if len(values) == 1 and (interpolation not in _PER_VERTEX or count == 1):
         values = np.full(count, values[0])
     elif interpolation not in _PER_VERTEX or len(values) != count:
-        said = f"{len(values)} values with {interpolation} interpolation on {count} points"
-        raise SchemaError(f"{where} has {said}; author one value per point (vertex) or one for all (constant)")
+        message = f"{len(values)} values with {interpolation} interpolation on {count} points"
+        raise SchemaError(f"{where} has {message}; author one value per point (vertex) or one for all (constant)")
     notices: tuple[Notice, ...] = ()
     if row is GARMENT["pin"] and (values > 1.0).any():  # Weights that other programs paint are over 1 by rounding.
-        said = f"{row.name} goes up to {values.max():g}; values over 1 are taken as 1"
-        values, notices = np.minimum(values, 1.0), (Notice(str(prim.GetPath()), None, said),)
+        message = f"{row.name} goes up to {values.max():g}; values over 1 are taken as 1"
+        values, notices = np.minimum(values, 1.0), (Notice(str(prim.GetPath()), None, message),)
     for index in (int(values.argmin()), int(values.argmax())) if count else ():  # NaN is either's first.
         check_limits(row, float(values[index]), f"{where}[{index}]")
     return values, notices

@@ -211,8 +211,8 @@ def read_thickness(prim: Usd.Prim, materials: Sequence[Usd.Prim], row: Property,
     for material in materials:
         old = authored(material, OLD_THICKNESS)
         if old is not None and read_number(old, None) > 0:
-            said = f"{OLD_THICKNESS} is the proposal's older name; author {THICKNESSES} on <{prim.GetPath()}>"
-            notice = Notice(str(material.GetPath()), None, said)
+            message = f"{OLD_THICKNESS} is the proposal's older name; author {THICKNESSES} on <{prim.GetPath()}>"
+            notice = Notice(str(material.GetPath()), None, message)
             return Thickness(Found(row, source_name(old), old, None, units.metres), None, (notice,))
     return None
 
@@ -233,8 +233,8 @@ def _from_youngs(material: Usd.Prim, row: Property, thickness: Found | Derived, 
         youngs = read_number(own, time) * per_pascal if own is not None else _YOUNGS_FALLBACK
         nu = read_number(ratio, time) if ratio is not None else _POISSONS_FALLBACK
         if not (0.0 <= youngs < math.inf and -1.0 < nu <= 0.5):
-            said = f"{YOUNGS} is {youngs:g} Pa and {POISSONS} {nu:g}; they must be in [0, inf) and (-1, 0.5]"
-            raise SchemaError(f"<{material.GetPath()}>: {said}")
+            message = f"{YOUNGS} is {youngs:g} Pa and {POISSONS} {nu:g}; they must be in [0, inf) and (-1, 0.5]"
+            raise SchemaError(f"<{material.GetPath()}>: {message}")
         sheet = youngs * float(thickness.at(time) or 0.0)
         if row.short == "shearStiffness":
             return sheet / (2 * (1 + nu))
@@ -259,8 +259,10 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     element = prim.GetAttribute(f"{THICKNESSES}:elementType").Get()
     expected = {"constant": 1, "face": len(counts), "point": count}.get(str(element))
     if len(values) != expected:
-        said = f"{len(values)} values, and {THICKNESSES}:elementType is {element!r}, which takes {expected or 'none'}"
-        raise SchemaError(f"{where} has {said}; author constant (one), face or point")
+        message = (
+            f"{len(values)} values, and {THICKNESSES}:elementType is {element!r}, which takes {expected or 'none'}"
+        )
+        raise SchemaError(f"{where} has {message}; author constant (one), face or point")
     for index in (int(values.argmin()), int(values.argmax())):
         check_limits(row, float(values[index]) * units.metres, f"{where}[{index}]")
     mean = float(values.mean())
@@ -272,8 +274,8 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
         sums = np.bincount(indices, np.repeat(values, counts), minlength=count)
         values = np.divide(sums, faces, out=np.full(count, mean), where=faces > 0)
     low, high = 1e3 * values.min() * units.metres, 1e3 * values.max() * units.metres
-    said = f"{THICKNESSES} goes from {low:.3g} to {high:.3g} mm: stiffnesses derived from {YOUNGS} follow it,"
-    notice = Notice(str(prim.GetPath()), None, f"{said} contact and mass take the mean")
+    message = f"{THICKNESSES} goes from {low:.3g} to {high:.3g} mm: stiffnesses derived from {YOUNGS} follow it,"
+    notice = Notice(str(prim.GetPath()), None, f"{message} contact and mass take the mean")
     return Thickness(found, values / mean, (notice,))
 
 
@@ -287,5 +289,5 @@ def rest_angle_notices(prim: Usd.Prim) -> list[Notice]:
     attribute = nearest(prim, "physics:restBendAnglesDefault")
     value = str(attribute.Get()) if attribute is not None else ""
     new = {"restShapeDefault": "restShape", "flatDefault": "flat"}.get(value)
-    said = f"physics:restBendAnglesDefault is {value!r}, the proposal's older name; author {new!r}"
-    return [Notice(str(attribute.GetPrim().GetPath()), None, said)] if attribute is not None and new else []
+    message = f"physics:restBendAnglesDefault is {value!r}, the proposal's older name; author {new!r}"
+    return [Notice(str(attribute.GetPrim().GetPath()), None, message)] if attribute is not None and new else []

@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from ...errors import LayerError, StageError
 from ..provenance import read_record, recorded_shot
-from ..stage import bad_rate, check_there, list_meshes, metres_per_unit, pxr_errors, quiet, up_vector
+from ..stage import bad_rate, list_meshes, metres_per_unit, open_layer, paths_in, pxr_errors, quiet, timecode, up_vector
 from ..times import garment_times, merge
 from ..view import root_over
 from .find import has_schema, traverse
@@ -59,14 +59,14 @@ class DrawnStage:
 
     def __init__(self, shot: Path, over: Path | None = None) -> None:
         """Compose and open."""
-        base = _open_layer(shot)
+        base = open_layer(shot, StageError)
         self._refined = _refined_times(over) if over is not None else ()
-        layers = [_open_layer(path) for path in (over, shot) if path is not None]
+        layers = [open_layer(path, StageError) for path in (over, shot) if path is not None]
         self._root = root_over(base, [layer.identifier for layer in layers])
         with pxr_errors(f"cannot open {shot}"), quiet():
             self.stage = Usd.Stage.Open(self._root)
-        if said := bad_rate(self.stage):
-            raise StageError(f"cannot draw {shot}: {said}")
+        if message := bad_rate(self.stage):
+            raise StageError(f"cannot draw {shot}: {message}")
         self.rate = float(self.stage.GetTimeCodesPerSecond())
         self._scale = metres_per_unit(self.stage)[0]
         self._turn = Z_UP if up_vector(self.stage)[0][2] == 1.0 else np.eye(3)
@@ -113,7 +113,7 @@ class DrawnStage:
         Returns:
             The meshes in stage order; those without usable faces are left out.
         """
-        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        code = timecode(time)
         transforms = UsdGeom.XformCache(code)
         drawn = []
         for prim in traverse(self.stage):
@@ -137,37 +137,20 @@ def shot_of(layer: Path) -> Path | None:
     Returns:
         The shot's file, or None when the layer does not name one.
     """
-    shot = recorded_shot(_open_layer(layer))
+    shot = recorded_shot(open_layer(layer, StageError))
     return Path(shot) if shot else None
 
 
 def refined_in(layer: Path) -> tuple[str, ...]:
     """Return the paths whose points a layer authors itself."""
-    opened, found = _open_layer(layer), []
-
-    def visit(path: Sdf.Path | str) -> None:
-        path = Sdf.Path(str(path))
-        if path.IsPropertyPath() and path.name == "points":
-            found.append(str(path.GetPrimPath()))
-
-    opened.Traverse(Sdf.Path.absoluteRootPath, visit)
-    return tuple(sorted(found))
+    paths = paths_in(open_layer(layer, StageError))
+    return tuple(sorted(str(path.GetPrimPath()) for path in paths if path.IsPropertyPath() and path.name == "points"))
 
 
 def _refined_times(layer: Path) -> tuple[float, ...]:
     """Time codes at which a refined layer has points."""
-    opened = _open_layer(layer)
+    opened = open_layer(layer, StageError)
     return merge(time for path in refined_in(layer) for time in opened.ListTimeSamplesForPath(f"{path}.points"))
-
-
-def _open_layer(path: Path) -> Sdf.Layer:
-    """Open a layer or say that it cannot be read."""
-    check_there(path)
-    with pxr_errors(f"cannot open {path}"), quiet():
-        layer = Sdf.Layer.FindOrOpen(str(path)) if path.is_file() else None
-    if not layer:
-        raise StageError(f"cannot open {path}: it is no USD file")
-    return layer
 
 
 def _is_seen(mesh: UsdGeom.Mesh, code: Usd.TimeCode) -> bool:

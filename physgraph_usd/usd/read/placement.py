@@ -8,17 +8,12 @@ import numpy as np
 from pxr import Gf, Usd, UsdGeom
 
 from ...errors import GarmentError
-from ..stage import Notice
+from ..stage import Notice, timecode
 
 _SINGULAR = 1e-9
 _EXTREME = 1e30
 """A scale beyond which, or under one over which, no volume is a number."""
 _REMEDY = "give the prim and its ancestors a scale other than zero there, or leave that time out with --frames"
-
-
-def timecode(time: float | None) -> Usd.TimeCode:
-    """USD's time code for ours: None is the default value."""
-    return Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
 
 
 def to_metres(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
@@ -50,11 +45,11 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
         raise GarmentError(path, "its transform to the world is NaN or infinite", time=time, remedy=_REMEDY)
     stretches = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if stretches[2] <= _SINGULAR * stretches[0]:
-        said = f"its transform to the world is singular: it scales by {stretches[0]:.3g}, {stretches[1]:.3g}"
-        raise GarmentError(path, f"{said} and {stretches[2]:.3g}", time=time, remedy=_REMEDY)
+        message = f"its transform to the world is singular: it scales by {stretches[0]:.3g}, {stretches[1]:.3g}"
+        raise GarmentError(path, f"{message} and {stretches[2]:.3g}", time=time, remedy=_REMEDY)
     if not 1.0 / _EXTREME < stretches[0] < _EXTREME:
-        said = f"its transform to the world scales by {stretches[0]:.3g}"
-        raise GarmentError(path, said, time=time, remedy=f"give a scale of {1 / _EXTREME:g} to {_EXTREME:g}")
+        message = f"its transform to the world scales by {stretches[0]:.3g}"
+        raise GarmentError(path, message, time=time, remedy=f"give a scale of {1 / _EXTREME:g} to {_EXTREME:g}")
     if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise GarmentError(
             path, "its transform to the world is projective", time=time, remedy="author affine transforms"
@@ -84,5 +79,5 @@ def check_placement(prim: Usd.Prim, metres: float, times: Sequence[float]) -> tu
     """
     mirrored = [bool(np.linalg.det(to_metres(prim, metres, time)[:3, :3]) < 0) for time in times]
     switches = [time for time, now, then in zip(times[1:], mirrored[1:], mirrored, strict=False) if now != then]
-    said = "its transform starts or stops mirroring here; the winding of its first time code is used throughout"
-    return tuple(Notice(str(prim.GetPath()), time, said) for time in switches[:1])
+    message = "its transform starts or stops mirroring here; the winding of its first time code is used throughout"
+    return tuple(Notice(str(prim.GetPath()), time, message) for time in switches[:1])

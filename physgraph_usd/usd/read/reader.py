@@ -27,6 +27,7 @@ from ..schema import GARMENT
 from ..stage import (
     GarmentSource,
     Notice,
+    at_time,
     check_metadata,
     open_stage,
     pxr_errors,
@@ -131,7 +132,7 @@ class Shot:
             StageError: When USD cannot read the files any more.
         """
         garments, told = [], []
-        with pxr_errors(f"cannot read {self.path}" + ("" if time is None else f" at time code {time:g}")):
+        with pxr_errors(f"cannot read {self.path}" + at_time(time)):
             for index, reader in enumerate(self._readers):
                 garment, notices = reader.frame(self.to_metres(index, time), time)
                 garments.append(garment)
@@ -235,7 +236,7 @@ def open_shot(
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
         notices += unread([*prims, *found])
-        notices += [Notice(path, None, said) for path, said in dict.fromkeys(beyond_limits_of_all(prims, found))]
+        notices += [Notice(path, None, message) for path, message in dict.fromkeys(beyond_limits_of_all(prims, found))]
         units, odd = read_units(stage)
         assumed = root_metadata(stage, "metersPerUnit") is None
         prims = [
@@ -288,7 +289,9 @@ def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str],
     excluded, odd = read_apart(shot.stage, prims)
     notices += odd
     cloth = {prim.GetPath() for prim in prims}
-    apart = [{p: said for p, said in off.items() if p in own | cloth} for own, off in zip(named, excluded, strict=True)]
+    apart = [
+        {p: message for p, message in off.items() if p in own | cloth} for own, off in zip(named, excluded, strict=True)
+    ]
     felt = [{str(path) for path in own - set(off)} for own, off in zip(named, apart, strict=True)]
     bodies, anywhere = [], set[str]().union(*felt)
     for path in paths:
@@ -299,7 +302,7 @@ def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str],
         bodies += [body] if body is not None else []
     order = {body.collider.path: number for number, body in enumerate(bodies)}
     numbers = [tuple(sorted(order[path] for path in own & order.keys())) for own in felt]
-    shot.add_colliders(bodies, numbers, [{str(path): said for path, said in off.items()} for off in apart])
+    shot.add_colliders(bodies, numbers, [{str(path): message for path, message in off.items()} for off in apart])
 
 
 def _read(
@@ -329,8 +332,8 @@ def _read(
         else:
             readers.append(read_garment(prim, held, request))
     if request.frames and every and not within(every, request.frames):
-        said = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
-        raise StageError(f"{said}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
+        message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
+        raise StageError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")

@@ -73,8 +73,8 @@ def read_rest(
     if default is None:
         return checked(prim, edges, Rest(first, "first sample of points"), first=first)
     if len(default) != count:
-        said = f"the default points are {len(default)}, the mesh has {count}; the first sample is the rest shape"
-        return checked(prim, edges, Rest(first, "first sample of points", (Notice(path, None, said),)), first=first)
+        message = f"the default points are {len(default)}, the mesh has {count}; the first sample is the rest shape"
+        return checked(prim, edges, Rest(first, "first sample of points", (Notice(path, None, message),)), first=first)
     points = place(default)
     notices: tuple[Notice, ...] = ()
     if not np.isfinite(points).all():
@@ -93,27 +93,30 @@ def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray)
         GarmentError: When all of its points are at one place, or one is out of bounds.
     """
     path = str(prim.GetPath())
-    if said := out_of_bounds(rest.points):
-        raise GarmentError(path, f"the rest shape's ({rest.source}) {said}", remedy="check units and transforms")
+    if message := out_of_bounds(rest.points):
+        raise GarmentError(path, f"the rest shape's ({rest.source}) {message}", remedy="check units and transforms")
     edges = edges[edges[:, 0] != edges[:, 1]]
     lengths = np.linalg.norm(rest.points[edges[:, 0]] - rest.points[edges[:, 1]], axis=1)
     mean = float(lengths.mean()) if len(lengths) else 0.0
     if len(lengths) and mean == 0.0:
-        said, remedy = f"all points of the rest shape ({rest.source}) are at one place", "choose another --rest FRAME"
-        raise GarmentError(path, said, remedy=remedy)
+        message, remedy = (
+            f"all points of the rest shape ({rest.source}) are at one place",
+            "choose another --rest FRAME",
+        )
+        raise GarmentError(path, message, remedy=remedy)
     short = np.flatnonzero(lengths <= _TINY * mean)
     notices = rest.notices
     if len(short):
         low, high = edges[short[0]]
         edge = "edge has" if len(short) == 1 else "edges have"
-        said = f"{len(short)} {edge} no length in the rest shape ({rest.source}), the first between points[{low}]"
-        notices = (*notices, Notice(path, None, f"{said} and points[{high}]: points at one place are taken for one"))
+        message = f"{len(short)} {edge} no length in the rest shape ({rest.source}), the first between points[{low}]"
+        notices = (*notices, Notice(path, None, f"{message} and points[{high}]: points at one place are taken for one"))
     now = float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean()) if len(edges) else 0.0
     ratio = mean / now if now > 0 else 1.0
     if 1 / _MOST_SCALED <= ratio <= _MOST_SCALED:
         return Rest(rest.points, rest.source, notices)
-    said = f"the rest shape ({rest.source}) has edges {ratio:.3g} times as long as the animation's; check its units"
-    return Rest(rest.points, rest.source, (*notices, Notice(path, None, said)))
+    message = f"the rest shape ({rest.source}) has edges {ratio:.3g} times as long as the animation's; check its units"
+    return Rest(rest.points, rest.source, (*notices, Notice(path, None, message)))
 
 
 def rests_bent(prim: Usd.Prim) -> bool:
@@ -134,9 +137,9 @@ def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
             continue
         points = as_points(value, str(prim.GetPath()), name)
         if len(points) != count:
-            said = f"{name} has {len(points)} values, the mesh has {count} points"
+            message = f"{name} has {len(points)} values, the mesh has {count} points"
             remedy = "author one value per point (vertex interpolation), or remove it"
-            raise GarmentError(str(prim.GetPath()), said, remedy=remedy)
+            raise GarmentError(str(prim.GetPath()), message, remedy=remedy)
         return points, source_name(attribute)
     return None
 
@@ -153,5 +156,5 @@ def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:
 def _refuse_broken(path: str, points: np.ndarray, source: str) -> None:
     broken = ~np.isfinite(points).all(axis=1)
     if broken.any():
-        said = f"{source}[{broken.argmax()}] is NaN or infinite"
-        raise GarmentError(path, said, remedy="author finite rest positions, or remove them")
+        message = f"{source}[{broken.argmax()}] is NaN or infinite"
+        raise GarmentError(path, message, remedy="author finite rest positions, or remove them")

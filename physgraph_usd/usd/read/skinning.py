@@ -14,7 +14,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ...errors import GarmentError, StageError
 from ..lookup import with_ancestors
-from ..stage import TRAVERSAL, Notice
+from ..stage import TRAVERSAL, Notice, timecode
 from ..times import SAME_TIME, garment_times, merge, transform_times
 from .find import instance_roots
 
@@ -97,7 +97,7 @@ class Bake:
     def rest_transform(self, path: Sdf.Path, time: float | None) -> Gf.Matrix4d:
         """Matrix (row vectors) from a skinned mesh's rest points to world: geomBindTransform, then the skeleton's."""
         skinned = self.skinned[path]
-        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        code = timecode(time)
         skeleton = self._stage.GetPrimAtPath(skinned.skeleton)
         return skinned.query.GetGeomBindTransform(code) * UsdGeom.XformCache(code).GetLocalToWorldTransform(skeleton)
 
@@ -237,7 +237,7 @@ def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
     """Move a baked transform into the points, so that the prim keeps the transform of its own layers."""
     mesh = UsdGeom.Mesh.Get(stage, path)
     times = mesh.GetTimeSamples() or [None]
-    codes = [Usd.TimeCode.Default() if time is None else Usd.TimeCode(time) for time in times]
+    codes = [timecode(time) for time in times]
     baked = [UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()) for code in codes]
     spec = layer.GetPrimAtPath(path)
     for each in [each for each in spec.properties if each.name.startswith("xformOp")]:

@@ -13,11 +13,11 @@ from ...errors import GarmentError
 from ...solver.colliders.pose import Collider, MeshPose, Pose
 from ..lookup import with_ancestors
 from ..schema import COLLIDER_API, GARMENT_API
-from ..stage import TRAVERSAL, pxr_errors, quiet
+from ..stage import TRAVERSAL, pxr_errors, quiet, timecode
 from .bodies import ColliderReader
 from .find import has_schema, traverse
 from .garment import is_visible
-from .placement import timecode, to_metres
+from .placement import to_metres
 from .reader import Shot
 
 _MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")

@@ -61,10 +61,15 @@ def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
         written: Whether velocities are written for the fine mesh.
     """
     blocked = "are blocked: they belong to the coarse points"
-    said = {"velocities": "are written anew, from the refined points" if written else blocked, "accelerations": blocked}
+    message = {
+        "velocities": "are written anew, from the refined points" if written else blocked,
+        "accelerations": blocked,
+    }
     path = str(prim.GetPath())
     return [
-        Notice(path, None, f"its {name} {s}") for name, s in said.items() if prim.GetAttribute(name).HasAuthoredValue()
+        Notice(path, None, f"its {name} {s}")
+        for name, s in message.items()
+        if prim.GetAttribute(name).HasAuthoredValue()
     ]
 
 
@@ -94,8 +99,8 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
             stream.attribute(path, attribute.GetTypeName())
             stream.set(path, Vt.Vec3fArray.FromNumpy(fine.interpolate(np.asarray(value, np.float32))))
         elif len(value) > 1:
-            said = f"{name} has one entry per {sizes[len(value)]} element of the coarse mesh and stays as authored"
-            notices.append(Notice(str(prim.GetPath()), None, said))
+            message = f"{name} has one entry per {sizes[len(value)]} element of the coarse mesh and stays as authored"
+            notices.append(Notice(str(prim.GetPath()), None, message))
     return notices
 
 

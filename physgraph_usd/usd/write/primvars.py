@@ -20,7 +20,7 @@ from ...solver.mesh.attributes import (
 )
 from ...solver.mesh.subdivide import Refinement, compose
 from ...solver.mesh.topology import PolygonMesh
-from ..stage import Notice
+from ..stage import Notice, timecode
 from .stream import LayerStream
 
 STALE = ("primvars:normals", "primvars:skel:jointIndices", "primvars:skel:jointWeights")
@@ -79,7 +79,7 @@ def _carry(
     indices_path = target.AppendProperty(f"{path.name}:indices")
     was_indexed, is_indexed = primvar.IsIndexed(), False
     for time in (None, *_times(primvar.GetTimeSamples(), span)):
-        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        code = timecode(time)
         value = primvar.Get(code)
         if value is None:
             continue
@@ -146,7 +146,7 @@ def carry_subsets(
         stream.attribute(path, Sdf.ValueTypeNames.IntArray)
         try:
             for time in (None, *_times(attribute.GetTimeSamples(), span)):
-                value = attribute.Get(Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))
+                value = attribute.Get(timecode(time))
                 if value is not None:
                     exclusive = family != UsdGeom.Tokens.unrestricted
                     indices = fine.subset(element, np.asarray(value), exclusive=exclusive)

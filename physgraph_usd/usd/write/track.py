@@ -10,6 +10,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ...errors import LayerError
+from ..stage import at_time, timecode
 from .normals import VertexNormals
 from .stream import LayerStream
 
@@ -77,7 +78,7 @@ class PointTrack:
             LayerError: The shape is wrong.
         """
         if points.shape != (self._count, 3):
-            place = f"<{self._paths['points'].GetPrimPath()}>" + ("" if time is None else f" at time code {time:g}")
+            place = f"<{self._paths['points'].GetPrimPath()}>" + at_time(time)
             raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {self._count} vertices")
 
     def write(self, time: float | None, world: np.ndarray, to_metres: np.ndarray, *, changed: bool = True) -> None:
@@ -195,7 +196,7 @@ def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | 
     Raises:
         LayerError: A position is not finite, or the matrix cannot be inverted.
     """
-    when = "" if time is None else f" at time code {time:g}"
+    when = at_time(time)
     try:
         inverse = np.linalg.inv(to_metres[:3, :3])
     except np.linalg.LinAlgError as error:
@@ -244,7 +245,7 @@ class HeatTrack:
             LayerError: Naming the primvar and the time.
         """
         for name, values in heat.items():
-            place = f"<{self._path(name)}>" + ("" if time is None else f" at time code {time:g}")
+            place = f"<{self._path(name)}>" + at_time(time)
             if name not in HEAT:
                 raise LayerError(f"{place}: no such heat map; known: {', '.join(HEAT)}")
             if values.shape != (self._count,) or not np.isfinite(values).all():
@@ -319,7 +320,7 @@ class ModelHints:
         """
         if not self._models:
             return
-        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        code = timecode(time)
         cache = UsdGeom.XformCache(code)
         corners = np.array([[box[i][0], box[j][1], box[k][2], 1.0] for i, j, k in product((0, 1), repeat=3)])
         local = np.array(cache.GetLocalToWorldTransform(self._prim))
@@ -334,7 +335,7 @@ class ModelHints:
         attribute = model.GetAttribute(ATTRIBUTE)
         time = time if attribute.GetNumTimeSamples() > 0 else None
         path = model.GetPath().AppendProperty(ATTRIBUTE)
-        code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+        code = timecode(time)
         spec = self._stream.attribute(path, Sdf.ValueTypeNames.Float3Array)
         ours = self._stream.layer.QueryTimeSample(path, time) if time is not None else spec.default
         value = attribute.Get(code) if ours is None else ours
