@@ -29,7 +29,7 @@ from .options import (
 from .printing import outline, tell
 from .refine import refine
 from .show_file import values_for
-from .structure import DONE, FAILED
+from .structure import DONE, FAILED, imports_uncollected
 from .types import FrameRange, PictureSize
 
 
@@ -78,7 +78,8 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 
     Exits with 1 when SHOT cannot be refined as asked, with 2 when what was named is not there.
     """
-    from ..shot.refine import inspect_shot
+    with imports_uncollected():
+        from ..shot.refine import inspect_shot
 
     values, _ = values_for(ctx, shot, refine)
     found = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})

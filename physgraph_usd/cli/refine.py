@@ -26,7 +26,7 @@ from .options import (
 )
 from .printing import LOGGER, Saying, say
 from .show_file import values_for
-from .structure import FAILED, GroupedCommand
+from .structure import FAILED, GroupedCommand, imports_uncollected
 
 if TYPE_CHECKING:
     from ..shot.options import RefineOptions
@@ -178,7 +178,8 @@ def _solved(jobs: Sequence[Job], saying: Saying) -> Generator[RefineReport | Phy
     """What becomes of the jobs that are not finished."""
     if not jobs:
         return
-    from ..shot.refine import refine_shots
+    with imports_uncollected():
+        from ..shot.refine import refine_shots
 
     if not saying.several:
         try:
@@ -201,7 +202,8 @@ def _refine_shown(
     shot: str, layer: Path, options: RefineOptions, *, saying: Saying, alone: bool = True
 ) -> RefineReport:
     """Refine a shot and show how far it is where it is alone at work."""
-    from ..shot.refine import refine_shot
+    with imports_uncollected():
+        from ..shot.refine import refine_shot
 
     with saying.progress(Path(shot).name) if alone else nullcontext() as progress:
         return refine_shot(shot, layer, replace(options, progress=progress))
