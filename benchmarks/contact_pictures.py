@@ -36,7 +36,7 @@ from physgraph_usd.solver.scene import recentred
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage, refined_in
 from physgraph_usd.usd.read.reader import open_shot
 
-LEVEL, RUN_UP = 2, 6
+LEVEL, PREROLL = 2, 6
 """Subdivisions, and frames solved before the one drawn."""
 PANEL, BAND, COLORS = (540, 420), 50, 144
 """A panel's size, the height of its label [pixels], and colours in a picture."""
@@ -118,7 +118,7 @@ def picture(name: str, shown: Shown, folder: Path, out: Path) -> Path:
     shot = write_sample(name, folder)
     layers = [folder / f"{i}.usdc" for i in range(len(shown.forms))]
     for layer, options in zip(layers, shown.forms.values(), strict=True):
-        frames = (max(shown.time - RUN_UP, 1.0), shown.time)
+        frames = (max(shown.time - PREROLL, 1.0), shown.time)
         refine_shot(shot, layer, replace(options, frames=frames, level=LEVEL, heat_map=True))
     garments = refined_in(layers[0])
     meshes = [DrawnStage(shot).meshes(shown.time)]

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from shots import EDGE, cloth_shot, faults, fine, refine, sample_times
 
 from physgraph_usd.errors import GarmentError, LayerError, PhysGraphError, SolveError, UsageError
-from physgraph_usd.shot.chunks import RUN_UP, chunks_of, solve_in_chunks
+from physgraph_usd.shot.chunks import PREROLL, chunks_of, solve_in_chunks
 from physgraph_usd.shot.frames import FrameFolder, Outcome
 from physgraph_usd.shot.processes import memory_is_named
 
@@ -34,7 +34,7 @@ TIMES = [float(t) for t in range(8)]
 def solve(solver: Callable[..., Iterator[Outcome]], folder: Path, *, workers: int, **options: Any) -> list[Outcome]:
     """Solve eight frames; each says in its points how many frames its process had solved before."""
     with FrameFolder(folder, {}, **options) as frames:
-        return list(solve_in_chunks(solver, TIMES, frames, workers=workers, run_up=3))
+        return list(solve_in_chunks(solver, TIMES, frames, workers=workers, preroll=3))
 
 
 def before(outcomes: Sequence[Outcome]) -> list[int]:
@@ -64,12 +64,12 @@ def test_chunks_cover_what_is_missing_once_evenly(missing: set[int], workers: in
 def test_the_longest_process_says_how_much_quicker_a_shot_can_be(count: int, workers: int, times: float):
     """The figures of docs/frames.md, by N / (N / W + R)."""
     parts = [part for share in chunks_of(range(count), workers) for part in share]
-    longest = max(part.stop - max(0, part.start - RUN_UP) for part in parts)
-    assert longest == count / workers + RUN_UP
+    longest = max(part.stop - max(0, part.start - PREROLL) for part in parts)
+    assert longest == count / workers + PREROLL
     assert count / longest == pytest.approx(times, rel=0.02)
 
 
-def test_order_and_run_up(tmp_path: Path):
+def test_order_and_preroll(tmp_path: Path):
     outcomes = solve(Counting(), tmp_path / "f", workers=2)
     assert [outcome.time for outcome in outcomes] == TIMES
     assert before(outcomes) == [0, 1, 2, 3, 3, 4, 5, 6]
@@ -178,9 +178,9 @@ class TestKeptFrames:
         return tmp_path / "f"
 
     @pytest.mark.parametrize("workers", [1, 2])
-    def test_are_used_and_the_others_are_solved_after_a_run_up(self, folder: Path, workers: int):
+    def test_are_used_and_the_others_are_solved_after_a_preroll(self, folder: Path, workers: int):
         with FrameFolder(folder, {"level": 2}, resume=True) as frames:
-            outcomes = list(solve_in_chunks(Counting(), TIMES, frames, workers=workers, run_up=3))
+            outcomes = list(solve_in_chunks(Counting(), TIMES, frames, workers=workers, preroll=3))
         assert [outcome.time for outcome in outcomes] == TIMES
         assert before(outcomes)[:5] == [0, 0, 2, 3, 0]
         assert before(outcomes)[5] == 3
@@ -248,7 +248,7 @@ class TestLayers:
 
     @pytest.mark.parametrize("temporal", ["tether", pytest.param("warm", marks=pytest.mark.slow)])
     def test_s34_seams_do_not_show_with_history(self, tmp_path: Path, temporal: str):
-        """The run-up leaves less at a seam than a twentieth of a fine edge, RMS, and it fades; cloth moves far more."""
+        """Less than a twentieth of a fine edge, RMS, is left at a seam, and it fades; cloth moves far more."""
         shot = cloth_shot(tmp_path / "shot.usdc", times=LONG)
         one, two = (layer_with(shot, tmp_path / str(n), workers=n, temporal=temporal) for n in (1, 2))
         apart = [rms(fine(shot, one, time) - fine(shot, two, time)) / (EDGE / 2) for time in LONG]
@@ -263,7 +263,7 @@ class TestLayers:
 
     @pytest.mark.parametrize("workers", [1, 2])
     def test_a_resumed_run_goes_on_as_if_it_had_not_been_interrupted(self, tmp_path: Path, workers: int):
-        """What the run-up leaves where it goes on is no more than what it leaves between two workers."""
+        """What the pre-roll leaves where it goes on is no more than what it leaves between two workers."""
         shot, out = cloth_shot(tmp_path / "shot.usdc", times=LONG), tmp_path / "fine.usdc"
 
         def interrupt(done: int, _: int) -> None:

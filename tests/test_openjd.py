@@ -51,7 +51,7 @@ def test_its_reader_finds_progress_and_status_of_a_chunk(tmp_path: Path):
     reader = ActionMonitoringFilter(session_id="s", callback=lambda kind, value, *_: told.append((kind, value)))
     shot = cloth_shot(tmp_path / "shot.usdc", times=TIMES[:4])
     empty = [word for option in ("--garment", "--collider", "--level") for word in (option, "")]
-    line = ["--frames", "1-2", "--run-up", "1", *empty, "--openjd", "--steps", "1"]
+    line = ["--frames", "1-2", "--preroll", "1", *empty, "--openjd", "--steps", "1"]
     done = command("refine", shot, "-o", tmp_path / "c.usdc", *line)
     assert done.returncode == 0, done.stderr
     for text in done.stderr.splitlines():
@@ -82,7 +82,7 @@ def test_a_job_makes_one_layer_and_a_second_run_of_it_solves_nothing_again(tmp_p
 
 @pytest.mark.slow
 def test_a_job_fails_where_a_chunk_is_missing(tmp_path: Path):
-    refine(cloth_shot(tmp_path / "shot.usdc", times=TIMES), tmp_path / "chunk.usdc", frames=(1.0, 4.0), run_up=6)
+    refine(cloth_shot(tmp_path / "shot.usdc", times=TIMES), tmp_path / "chunk.usdc", frames=(1.0, 4.0), preroll=6)
     done = openjd("run", TEMPLATE, "--step", "Stitch", *parameters(tmp_path, Chunks=str(tmp_path / "chunk.usdc")))
     assert done.returncode != 0
     assert "frames 5:8 are in no chunk" in done.stdout

@@ -280,7 +280,7 @@ class TestOptions:
     def test_options_that_decide_the_result_are_in_the_record(self, shot: Path, tmp_path: Path):
         refine(shot, tmp_path / "fine.usdc", steps=3)
         record = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc")).customLayerData["physgraph"]
-        plain = RefineOptions(level=1, steps=3, heat_map=True, run_up=0).plain()
+        plain = RefineOptions(level=1, steps=3, heat_map=True, preroll=0).plain()
         assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
             "progress", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths", "resume",
             "keep_frames", "strict", "skip_existing", "sources", "scheduler",

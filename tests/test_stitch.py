@@ -27,12 +27,12 @@ SPANS = ((1.0, 12.0), (13.0, 24.0), (25.0, 36.0), (37.0, 48.0))
 
 
 def refine_chunks(
-    shot: Path, folder: Path, spans: Sequence[tuple[float, float]] = SPANS, *, run_up: int = 6, **options: Any
+    shot: Path, folder: Path, spans: Sequence[tuple[float, float]] = SPANS, *, preroll: int = 6, **options: Any
 ) -> list[Path]:
     """Refine parts of a shot, each by itself."""
     chunks = [folder / f"chunk{first:g}.usdc" for first, _ in spans]
     for span, chunk in zip(spans, chunks, strict=True):
-        assert refine(shot, chunk, frames=span, run_up=run_up, **options).exit_code == 0
+        assert refine(shot, chunk, frames=span, preroll=preroll, **options).exit_code == 0
     return chunks
 
 
@@ -84,7 +84,7 @@ class TestOneLayer:
         assert record is not None
         assert one is not None
         assert list(record.pop("chunks")) == ["1:12", "13:24", "25:36", "37:48"]
-        assert record["options"].pop("run_up") == 6
+        assert record["options"].pop("preroll") == 6
         assert record == one
 
     def test_a_chunk_by_itself_is_valid_and_told_to_be_one(self, runs: Runs):
@@ -102,6 +102,18 @@ class TestOneLayer:
             "seam at 37",
         ]
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
+
+
+def test_the_old_name_of_the_option_works_and_no_help_shows_it(tmp_path: Path):
+    shot, out = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "chunk.usdc"
+    done = command("refine", shot, "-o", out, "--frames", "3:4", "--run-up=1", "--steps", "1", "--level", "0")
+    assert done.returncode == 0, done.stderr
+    chunk = read_chunk(Sdf.Layer.FindOrOpen(str(out)))
+    assert chunk is not None
+    assert [*chunk.preroll] == [2.0]
+    shown = command("refine", "--help").stdout
+    assert "--preroll" in shown
+    assert "run-up" not in shown
 
 
 class TestRefused:
@@ -147,7 +159,7 @@ class TestRefused:
             stitch(chunks, tmp_path / "joined.usdc")
 
     def test_a_layer_that_is_no_chunk(self, runs: Runs, tmp_path: Path):
-        with pytest.raises(LayerError, match=r"one\.usdc is no chunk of a shot; refine with --run-up"):
+        with pytest.raises(LayerError, match=r"one\.usdc is no chunk of a shot; refine with --preroll"):
             stitch([runs.one], tmp_path / "joined.usdc")
 
     @pytest.mark.parametrize("chunk", [0, 3])
@@ -168,7 +180,7 @@ class TestRefused:
 
     def test_a_seam_of_which_nothing_is_known(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc")
-        chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0), (4.0, 6.0)], run_up=0)
+        chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0), (4.0, 6.0)], preroll=0)
         with pytest.raises(LayerError, match="nothing tells how far the seam at 4 moves"):
             stitch(chunks, tmp_path / "joined.usdc")
         assert stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf")) == []
@@ -185,7 +197,7 @@ def test_frames_that_failed_are_told_of_and_leave_their_seam_unknown(tmp_path: P
     shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: float("nan")})
     chunks = [tmp_path / "c1.usdc", tmp_path / "c2.usdc"]
     codes = [
-        refine(shot, chunk, frames=span, run_up=2).exit_code
+        refine(shot, chunk, frames=span, preroll=2).exit_code
         for chunk, span in zip(chunks, ((1.0, 3.0), (4.0, 6.0)), strict=True)
     ]
     assert codes == [3, 0]
@@ -208,9 +220,9 @@ def test_part_of_a_shot_is_stitched_where_it_is_asked_for(runs: Runs, tmp_path: 
 
 
 def test_an_interrupted_chunk_goes_on_to_the_same_bytes_where_frames_stand_alone(tmp_path: Path):
-    """And keeps where its run-up ended, which it does not solve again."""
+    """And keeps where its pre-roll ended, which it does not solve again."""
     shot, out = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "chunk.usdc"
-    given: dict[str, Any] = {"frames": (4.0, 6.0), "run_up": 2}
+    given: dict[str, Any] = {"frames": (4.0, 6.0), "preroll": 2}
     refine(shot, tmp_path / "whole.usdc", **given)
 
     def interrupt(done: int, _: int) -> None:
@@ -223,9 +235,9 @@ def test_an_interrupted_chunk_goes_on_to_the_same_bytes_where_frames_stand_alone
     ended, whole = (read_chunk(Sdf.Layer.FindOrOpen(str(file))) for file in (out, tmp_path / "whole.usdc"))
     assert ended is not None
     assert whole is not None
-    assert [*ended.run_up] == [*whole.run_up] == [2.0, 3.0]
-    for time, points in whole.run_up.items():
-        assert np.array_equal(ended.run_up[time][CLOTH], points[CLOTH])
+    assert [*ended.preroll] == [*whole.preroll] == [2.0, 3.0]
+    for time, points in whole.preroll.items():
+        assert np.array_equal(ended.preroll[time][CLOTH], points[CLOTH])
 
 
 @pytest.fixture
@@ -346,7 +358,7 @@ class TestSeamsBeforeAllIsThere:
         (whole, *_) = stitch(runs.chunks, tmp_path / "joined.usdc")
         assert seam == whole
         done = command("stitch", *runs.chunks[:2], "--check-seams", "--seam-bound", 0.2 * seam.rms)
-        assert (done.returncode, "is allowed: refine with --run-up" in done.stderr) == (1, True), done.stderr
+        assert (done.returncode, "is allowed: refine with --preroll" in done.stderr) == (1, True), done.stderr
         assert sorted(runs.chunks[0].parent.iterdir()) == there
 
     def test_a_chunk_is_looked_at_beside_those_of_its_folder(self, runs: Runs, tmp_path: Path):
@@ -364,7 +376,7 @@ def test_warnings_of_usd_itself_stay_off_the_terminal(tmp_path: Path, capfd: pyt
     layer = Sdf.Layer.FindOrOpen(str(shot))
     layer.subLayerPaths.append("gone.usda")
     layer.Save()
-    chunks = refine_chunks(shot, tmp_path, ((1.0, 2.0), (3.0, 4.0)), run_up=2)
+    chunks = refine_chunks(shot, tmp_path, ((1.0, 2.0), (3.0, 4.0)), preroll=2)
     told = capfd.readouterr().err
     stitch(chunks, tmp_path / "joined.usdc")
     stitch(chunks, tmp_path / "clips.usda", clips=True)

@@ -49,7 +49,7 @@ from .types import FrameRange, PictureSize
 @click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot.")
 @overwrite_option
 def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, seam_bound: float, **options: Any) -> None:
-    """Join each CHUNK of a shot, as refine --run-up writes them, into one layer and print its path.
+    """Join each CHUNK of a shot, as refine --preroll writes them, into one layer and print its path.
 
     A folder stands for all layers in it. How far each seam moves goes to stderr.
     """

@@ -194,7 +194,7 @@ run_options = together(
 )
 farm_options = together(
     _farm(
-        "--run-up",
+        "--preroll",
         type=click.IntRange(min=0),
         metavar="N",
         help="Write --frames as a chunk for stitch, which joins it to the one before over the N frames before it.",
@@ -203,7 +203,7 @@ farm_options = together(
         "--seam-bound",
         type=click.FloatRange(min=0),
         metavar="EDGES",
-        help="With --run-up: fail where a seam to a chunk beside it, in the same folder, moves more (see stitch).",
+        help="With --preroll: fail where a seam to a chunk beside it, in the same folder, moves more (see stitch).",
     ),
     _farm("--openjd", is_flag=True, help="Say progress in the lines that OpenJD reads."),
     _farm(

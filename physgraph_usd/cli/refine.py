@@ -48,11 +48,13 @@ NOT_OF_THE_CALL = {
     "openjd",
 }
 """Options of the command that `RefineOptions` has not, or has one for each shot."""
+RENAMED = {"run-up": "preroll"}
+"""Names that options had before, without dashes; they still work and are in no help."""
 
 Job = tuple[str, Path, "RefineOptions"]
 
 
-@click.command(cls=GroupedCommand)
+@click.command(cls=GroupedCommand, context_settings={"token_normalize_func": lambda name: RENAMED.get(name, name)})
 @click.argument("shots", nargs=-1, required=True, metavar="SHOT...", type=click.Path(dir_okay=False))
 @out_option("OUT", "Layer to write, or a folder.")
 @file_options

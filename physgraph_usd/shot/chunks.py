@@ -1,6 +1,6 @@
 """Solves a shot's time codes, in this process or in several, and hands the states back in order.
 
-Each process opens the shot for itself and begins a few frames before its chunk (the run-up), so that warm starts have
+Each process opens the shot for itself and begins a few frames before its chunk (the pre-roll), so that warm starts have
 settled when the chunk begins; over these frames, which two processes solve, `joined` goes from one result to the
 other. Results go through files, so memory does not grow with the frames and what is finished
 outlives an interruption; frames that an earlier run finished are not solved again.
@@ -20,7 +20,7 @@ from ..errors import SolveError
 from .frames import FrameFolder, Lead, Outcome
 from .processes import POLL_SECONDS, Call, memory_is_named
 
-RUN_UP = 6
+PREROLL = 6
 """Frames solved before a chunk, when frames depend on one another."""
 
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
@@ -63,13 +63,13 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
     return [range(numbers[a], numbers[b - 1] + 1) for a, b in pairwise([*starts, len(numbers)])]
 
 
-def seams_of(shares: Sequence[Sequence[range]], frames: FrameFolder, *, run_up: int) -> dict[int, tuple[int, float]]:
+def seams_of(shares: Sequence[Sequence[range]], frames: FrameFolder, *, preroll: int) -> dict[int, tuple[int, float]]:
     """The frames that are solved on both sides of a seam.
 
     Args:
         shares: The frames of each worker.
         frames: Where results are; frames of an earlier run in it have seams of their own.
-        run_up: Frames solved before each range.
+        preroll: Frames solved before each range.
 
     Returns:
         By the frame's number: that of the first frame after the seam, and its `Lead.weight`.
@@ -81,7 +81,7 @@ def seams_of(shares: Sequence[Sequence[range]], frames: FrameFolder, *, run_up: 
     found: dict[int, tuple[int, float]] = {}
     before = 0
     for start in sorted(starts):
-        both = range(max(start - run_up, before), start)
+        both = range(max(start - preroll, before), start)
         found |= {index: (start, (k + 1) / (len(both) + 1)) for k, index in enumerate(both)}
         before = start
     return found
@@ -93,7 +93,7 @@ def solve_in_chunks(
     frames: FrameFolder,
     *,
     workers: int,
-    run_up: int = RUN_UP,
+    preroll: int = PREROLL,
     start: Callable[..., Work] | None = None,
 ) -> Generator[Outcome, None, None]:
     """Solve all time codes but those that are kept, in this process or in several, and yield all in order.
@@ -103,7 +103,7 @@ def solve_in_chunks(
         times: The time codes.
         frames: Where results go; frames in its ``kept`` are taken from there.
         workers: Number of processes; 1 solves in this one.
-        run_up: Frames solved before each chunk but the first of the shot; they are yielded as the ``lead`` of the same
+        preroll: Frames solved before each chunk but the first of the shot; they are yielded as the ``lead`` of the same
             frames of the chunk before.
         start: What starts a function in a process of its own, with its arguments, in place of `Call`; then one chunk
             is not solved in this process either.
@@ -113,11 +113,11 @@ def solve_in_chunks(
         LayerError: A result cannot be written.
     """
     shares = chunks_of([k for k in range(len(times)) if k not in frames.kept], workers)
-    seams = seams_of(shares, frames, run_up=run_up)
+    seams = seams_of(shares, frames, preroll=preroll)
     if len(shares) < 2 and start is None:
-        yield from _solve_here(solver, times, shares[0] if shares else [], frames, run_up=run_up, seams=seams)
+        yield from _solve_here(solver, times, shares[0] if shares else [], frames, preroll=preroll, seams=seams)
         return
-    calls = [(start or Call)(_work, solver, list(times), share, frames, run_up) for share in shares]
+    calls = [(start or Call)(_work, solver, list(times), share, frames, preroll) for share in shares]
     owners = {k: call for share, call in zip(shares, calls, strict=True) for part in share for k in part}
     try:
         for index, time in enumerate(times):
@@ -140,11 +140,11 @@ def _solve_here(
     share: Sequence[range],
     frames: FrameFolder,
     *,
-    run_up: int,
+    preroll: int,
     seams: Mapping[int, tuple[int, float]],
 ) -> Iterator[Outcome]:
     """Solve ranges of frames in this process, as far as the next frame to yield needs, and yield all frames."""
-    solved = _solve(solver, times, share, frames=frames, run_up=run_up)
+    solved = _solve(solver, times, share, frames=frames, preroll=preroll)
     made: dict[tuple[int, int | None], Outcome] = {}
 
     def taken(index: int, seam: int | None) -> Outcome:
@@ -175,11 +175,11 @@ def _with_lead(
 
 
 def _solve(
-    solver: Solver, times: Sequence[float | None], share: Sequence[range], *, frames: FrameFolder, run_up: int
+    solver: Solver, times: Sequence[float | None], share: Sequence[range], *, frames: FrameFolder, preroll: int
 ) -> Iterator[tuple[int, int | None, Outcome]]:
-    """Solve ranges of frames, each after its run-up, and file them; yields number, seam that it is before, outcome."""
+    """Solve ranges of frames, each after its pre-roll, and file them; yields number, seam it is before, outcome."""
     for part in share:
-        first = max(0, part.start - run_up)
+        first = max(0, part.start - preroll)
         with memory_is_named():
             for index, outcome in enumerate(solver(times[first : part.stop]), start=first):
                 seam = part.start if index < part.start else None
@@ -188,10 +188,10 @@ def _solve(
 
 
 def _work(
-    solver: Solver, times: Sequence[float | None], share: Sequence[range], frames: FrameFolder, run_up: int
+    solver: Solver, times: Sequence[float | None], share: Sequence[range], frames: FrameFolder, preroll: int
 ) -> None:
     """What a worker process does."""
-    for _ in _solve(solver, times, share, frames=frames, run_up=run_up):
+    for _ in _solve(solver, times, share, frames=frames, preroll=preroll):
         pass
 
 

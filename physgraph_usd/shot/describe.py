@@ -96,7 +96,7 @@ def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> Gar
 def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
     """What decides the size of a run beside its garments."""
     levels = [garment["level"] for garment in report.garments]
-    times = opened.scene.times if options.run_up is None else within(opened.scene.times, options.frames)
+    times = opened.scene.times if options.preroll is None else within(opened.scene.times, options.frames)
     return {"levels": levels, "frames": max(len(times), 1), "workers": options.workers}
 
 

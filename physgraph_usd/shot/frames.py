@@ -197,7 +197,7 @@ class FrameFolder:
         return self.__dict__ | {"folder": self.folder.absolute()}
 
     def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
-        """Write what came of a frame; ``seam`` where it serves for the run-up of the frame of that number.
+        """Write what came of a frame; ``seam`` where it serves for the pre-roll of the frame of that number.
 
         Raises:
             LayerError: The disk is full, or the folder is gone or another run's: a task on another machine may outlast

@@ -1,6 +1,6 @@
 """Joins what two processes solved of the same frames: cloth that can lie in several ways lies in one of them at a time.
 
-Over the L frames of a run-up the positions go from one solution to the other in equal parts,
+Over the L frames of a pre-roll the positions go from one solution to the other in equal parts,
 
     x_k = (1 - s_k) a_k + s_k b_k,   s_k = k / (L + 1),   k = 1 .. L,
 
@@ -55,7 +55,7 @@ def stitch(
     """Join chunks of one shot into one layer, as `usd.stitch.stitch` does, and look at the joined frames in the shot.
 
     Args:
-        chunks: Layers that `refine_shot` wrote with ``run_up``, in any order; a folder stands for all layers in it.
+        chunks: Layers that `refine_shot` wrote with ``preroll``, in any order; a folder stands for all layers in it.
         out: Layer to write.
         frames: First and last time code that the layer must have; None for all of the shot.
         seam_bound: Most that a seam may add to a frame's move, RMS over a garment, in mean fine edge lengths.
@@ -96,7 +96,7 @@ def joined(outcomes: Iterable[Outcome], look: Join, tell: Callable[[str], object
         if ends:
             yield from _over(both, look, tell)
             both = []
-        # What it equals is the run-up's last frame, not the one that was written.
+        # What it equals is the pre-roll's last frame, not the one that was written.
         given = replace(outcome, reused=(False,) * len(outcome.reused)) if ends else outcome
         if outcome.lead is None:
             yield given
@@ -202,7 +202,7 @@ def _looking(stack: ExitStack, shot: Path, options: Mapping[str, Any], meshes: M
     """
     if not is_there(shot):
         return None
-    plain = {name: value for name, value in options.items() if name not in ("frames", "run_up", "weights")}
+    plain = {name: value for name, value in options.items() if name not in ("frames", "preroll", "weights")}
     made_with = RefineOptions(**plain)
     given = {name: getattr(made_with, name) for name in ("garments", "colliders", "level", "overrides", "rest_frame")}
     opened = stack.enter_context(closing(open_with_colliders(str(shot), **given)))

@@ -60,7 +60,7 @@ class RefineOptions:
         contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
         self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
         workers: Processes that share the frames; with a scheduler, tasks.
-        run_up: Frames solved before ``frames`` and no samples: the layer is a chunk, which `stitch` joins to others.
+        preroll: Frames solved before ``frames`` and no samples: the layer is a chunk, which `stitch` joins to others.
             None for a layer by itself.
         scheduler: Address of a Dask scheduler whose workers solve the frames, or None.
         report: JSON file to write, or a folder for it and a page, or None.
@@ -98,7 +98,7 @@ class RefineOptions:
     contact: str = "quadratic"
     self_contact: str = "auto"
     workers: int = 1
-    run_up: int | None = None
+    preroll: int | None = None
     scheduler: str | None = None
     report: Path | None = None
     overwrite: bool = False
@@ -121,7 +121,7 @@ class RefineOptions:
         # A layer without these is as it was before there were any.
         names -= {
             name
-            for name in ("heat_map", "weights", "run_up")
+            for name in ("heat_map", "weights", "preroll")
             if getattr(self, name) is None or getattr(self, name) is False
         }
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
@@ -187,8 +187,8 @@ class RefineOptions:
             raise UsageError("skip existing leaves layers that are there, overwrite replaces them; choose one")
         if self.workers < 1 or self.steps < 0 or not self.tolerance >= 0:
             raise UsageError("workers must be at least 1, steps and tolerance at least 0")
-        if self.run_up is not None and self.run_up < 0:
-            raise UsageError(f"run-up of {self.run_up} frames: give 0 or more")
+        if self.preroll is not None and self.preroll < 0:
+            raise UsageError(f"pre-roll of {self.preroll} frames: give 0 or more")
         if self.budget_ms is not None and not self.budget_ms > 0:
             raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
         if self.frame_limit is not None and not self.frame_limit > 0:

@@ -30,7 +30,7 @@ from ..usd.view import Layer, Stage
 from ..usd.write.atomic import check_place
 from ..usd.write.chunk import Chunk, chunk_of
 from ..usd.write.writer import LayerWriter
-from .chunks import RUN_UP, solve_in_chunks
+from .chunks import PREROLL, solve_in_chunks
 from .describe import begin_report, describe, describe_meshes, say_what_was, too_large
 from .farm import connected, shots_at_once
 from .finished import Job, check_jobs, finished, in_order, made_from, may_be_done, skipped, taken_as_done
@@ -234,7 +234,7 @@ def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
     options.check()
     if options.workers > 1:
         raise UsageError(f"workers is {options.workers}: an open stage lives in one process; save it, or take 1")
-    for name in ("resume", "dry_run", "root", "scheduler", "run_up"):
+    for name in ("resume", "dry_run", "root", "scheduler", "preroll"):
         if getattr(options, name):
             raise UsageError(f"{name} is for layers on disk; an open stage is refined into a layer in memory")
     if options.report is not None:
@@ -295,7 +295,7 @@ def _open(shot: str | Stage, options: RefineOptions) -> Shot:
         shot,
         garments=options.garments,
         colliders=options.colliders,
-        frames=options.frames if options.run_up is None else None,
+        frames=options.frames if options.preroll is None else None,
         level=options.level,
         overrides=options.overrides,
         rest_frame=options.rest_frame,
@@ -377,7 +377,7 @@ def _write_layer(
     opened: Shot, solver: _ShotSolver, out: Path | None, options: RefineOptions, *, report: RefineReport
 ) -> Layer | None:
     """Solve and write all frames; returns the layer where it is in memory."""
-    chunk = None if options.run_up is None else chunk_of(opened.scene.times, options.frames)
+    chunk = None if options.preroll is None else chunk_of(opened.scene.times, options.frames)
     times, leads = _to_solve(opened, chunk, options)
     began, provenance = clock.perf_counter(), made_from(opened, out, options)
     known = len(opened.warnings)  # What is said of the shot itself has been.
@@ -469,38 +469,38 @@ def _solved(
     report: RefineReport,
 ) -> Outcomes:
     """Frames in order, those of an interrupted run among them, joined where several processes solved them."""
-    run_up = _run_up(options)
-    report.warn(*_resumed(frames, len(times), run_up))
+    preroll = _preroll(options)
+    report.warn(*_resumed(frames, len(times), preroll))
     look = Looking(opened, options, solver.levels)
     with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
-        solved = solve_in_chunks(solver, times, frames, workers=options.workers, run_up=run_up, start=farm)
+        solved = solve_in_chunks(solver, times, frames, workers=options.workers, preroll=preroll, start=farm)
         with closing(solved):
             yield from joined(solved, look, report.warn)
 
 
-def _run_up(options: RefineOptions) -> int:
+def _preroll(options: RefineOptions) -> int:
     """Frames solved before a chunk, where frames depend on one another."""
-    asked = RUN_UP if options.run_up is None else options.run_up
+    asked = PREROLL if options.preroll is None else options.preroll
     return 0 if options.temporal == "off" else asked
 
 
 def _to_solve(opened: Shot, chunk: Chunk | None, options: RefineOptions) -> tuple[list[float | None], int]:
-    """Time codes to solve, in order, and how many of the first are the run-up of a chunk."""
+    """Time codes to solve, in order, and how many of the first are the pre-roll of a chunk."""
     every: list[float | None] = list(opened.scene.times) or [None]
     if chunk is None or not chunk.times:
         return every, 0
     first = every.index(chunk.times[0])
-    lead = min(first, _run_up(options))
+    lead = min(first, _preroll(options))
     return every[first - lead : first + len(chunk.times)], lead
 
 
 def _begin_after(outcome: Outcome, writer: LayerWriter) -> None:
-    """Keep a frame of a chunk's run-up, unless it failed."""
+    """Keep a frame of a chunk's pre-roll, unless it failed."""
     if outcome.points and outcome.time is not None:
         writer.begin_after(outcome.time, outcome.points)
 
 
-def _resumed(frames: FrameFolder, count: int, run_up: int) -> list[str]:
+def _resumed(frames: FrameFolder, count: int, preroll: int) -> list[str]:
     """A warning where frames of an earlier run are used, or could have been."""
     if frames.dropped:
         one, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
@@ -508,7 +508,7 @@ def _resumed(frames: FrameFolder, count: int, run_up: int) -> list[str]:
         return [f"{dropped} of a run that was interrupted {one} solved anew; --resume would have used {them}"]
     if not frames.kept:
         return []
-    again = f", each stretch after {counted(run_up, 'frame')} solved again" if run_up else ""
+    again = f", each stretch after {counted(preroll, 'frame')} solved again" if preroll else ""
     how = f"{again}; folds that can lie in several ways may lie otherwise there than in an undisturbed run"
     kept = f"{len(frames.kept)} of {counted(count, 'frame')}"
     return [f"{kept} are those of a run that was interrupted; the others are solved{how}"]

@@ -1,7 +1,7 @@
 """A part of a shot's frames as a layer of its own, a chunk, and what its record says so that `stitch` can join it.
 
 A chunk opens the whole shot, so that what all frames decide is the same in every chunk, and writes some of its frames.
-Those that it solves before them, the run-up, are no samples; where the cloth was in them stays in the record, for
+Those that it solves before them, the pre-roll, are no samples; where the cloth was in them stays in the record, for
 `stitch` to go over from the chunk before.
 """
 
@@ -20,7 +20,7 @@ from ..times import within
 
 CHUNK = "chunk"
 """The chunk's entry of a layer's record."""
-_TIMES, _ALL, _RUN_UP = "frames", "all_frames", "run_up"
+_TIMES, _ALL, _PREROLL = "frames", "all_frames", "preroll"
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,20 +30,20 @@ class Chunk:
     Attributes:
         times: Time codes that it has, or failed to solve.
         every: Time codes of the whole shot, in order.
-        run_up: Where the cloth was in the frames before them: by time code, local points by the path of the fine mesh,
+        preroll: Where the cloth was in the frames before them: by time code, local points by the path of the fine mesh,
             shape (V, 3), float32.
     """
 
     times: tuple[float, ...]
     every: tuple[float, ...]
-    run_up: Mapping[float, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    preroll: Mapping[float, Mapping[str, np.ndarray]] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """The entry for the layer's record."""
         return {
             _TIMES: list(self.times),
             _ALL: list(self.every),
-            _RUN_UP: {repr(time): dict(points) for time, points in self.run_up.items()} or None,
+            _PREROLL: {repr(time): dict(points) for time, points in self.preroll.items()} or None,
         }
 
 
@@ -71,11 +71,11 @@ def read_chunk(layer: Sdf.Layer) -> Chunk | None:
     if not isinstance(told, Mapping):
         return None
     try:
-        run_up = {
+        preroll = {
             float(time): {str(path): np.asarray(value) for path, value in dict(points).items()}
-            for time, points in dict(told.get(_RUN_UP, {})).items()
+            for time, points in dict(told.get(_PREROLL, {})).items()
         }
         times, every = (tuple(float(time) for time in told.get(name, ())) for name in (_TIMES, _ALL))
     except (TypeError, ValueError):  # Somebody else wrote it.
         return None
-    return Chunk(times, every, run_up)
+    return Chunk(times, every, preroll)

@@ -1,4 +1,4 @@
-"""Joins chunks, which `refine --run-up` writes, into one layer, or into value clips where one file would be too large.
+"""Joins chunks, which `refine --preroll` writes, into one layer, or into value clips where one file would be too large.
 
 Each chunk begins a few frames early, and its record says where the cloth was in these. The chunk before holds the same
 frames: over them the cloth goes from one to the other.
@@ -105,7 +105,7 @@ def stitch(
     """Join chunks of one shot into one layer.
 
     Args:
-        chunks: Layers that `refine_shot` wrote with ``run_up``, in any order; a folder stands for all layers in it.
+        chunks: Layers that `refine_shot` wrote with ``preroll``, in any order; a folder stands for all layers in it.
         out: Layer to write.
         frames: First and last time code that the layer must have; None for all of the shot.
         seam_bound: Most that a seam may add to a frame's move, RMS over a garment, in mean fine edge lengths.
@@ -227,7 +227,7 @@ def _open(file: Path) -> _Part:
     layer = Sdf.Layer.FindOrOpen(str(file))
     chunk, record = (read_chunk(layer), read_record(layer)) if layer else (None, None)
     if chunk is None or record is None:
-        raise LayerError(f"{file} is no chunk of a shot; refine with --run-up writes one")
+        raise LayerError(f"{file} is no chunk of a shot; refine with --preroll writes one")
     return _Part(file, layer, record, chunk)
 
 
@@ -326,10 +326,10 @@ def _options(part: _Part) -> dict[str, Any]:
 
 
 def _both(before: _Part, after: _Part) -> list[float]:
-    """Time codes without a gap, up to the seam, that the run-up of a chunk and the chunk before it have."""
+    """Time codes without a gap, up to the seam, that the pre-roll of a chunk and the chunk before it have."""
     every = after.chunk.every
     first = last = every.index(after.chunk.times[0])
-    while first > 0 and every[first - 1] in after.chunk.run_up and before.has(every[first - 1]):
+    while first > 0 and every[first - 1] in after.chunk.preroll and before.has(every[first - 1]):
         first -= 1
     return list(every[first:last])
 
@@ -342,7 +342,7 @@ def _joint(before: _Part, after: _Part, both: Sequence[float], look: Look | None
     lag: dict[str, np.ndarray] = {}
     why = ""
     for number, time in enumerate(both, start=1):
-        ours, theirs = _sides(before, after.chunk.run_up[time], time)
+        ours, theirs = _sides(before, after.chunk.preroll[time], time)
         weight = number / (len(both) + 1)
         made = {path: between(own, theirs[path], weight).astype(np.float32) for path, own in ours.items()}
         given: Points = made
@@ -365,11 +365,11 @@ def _joint(before: _Part, after: _Part, both: Sequence[float], look: Look | None
     return _Joint(before, after, seams, {} if why else points)
 
 
-def _sides(before: _Part, run_up: Points, time: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _sides(before: _Part, preroll: Points, time: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Positions in a frame that two chunks have, of the garments that both have there."""
-    found = {path: points_at(before.layer, path, time) for path in run_up}
-    ours = {path: each for path, each in found.items() if each is not None and each.shape == run_up[path].shape}
-    return ours, {path: run_up[path] for path in ours}
+    found = {path: points_at(before.layer, path, time) for path in preroll}
+    ours = {path: each for path, each in found.items() if each is not None and each.shape == preroll[path].shape}
+    return ours, {path: preroll[path] for path in ours}
 
 
 def _size(moves: np.ndarray, edge: float) -> tuple[float, float]:
@@ -414,15 +414,15 @@ def _check_seams(parts: Sequence[_Part], seams: Sequence[Seam], bound: float) ->
     worst = max(seams, key=lambda seam: seam.rms, default=None)
     if worst is not None and worst.rms > bound:
         longer = ceil(worst.rms * (worst.frames + 1) / bound) if bound > 0 else 0
-        longer = f"--run-up {longer}" if longer else "a longer --run-up"
+        longer = f"--preroll {longer}" if longer else "a longer --preroll"
         remedy = f"refine with {longer} or with --temporal off, or allow more by --seam-bound"
         raise LayerError(f"{worst}; at most {bound:g} RMS is allowed: {remedy}")
     known = {seam.after for seam in seams}
     for part in parts[1:] if dict(parts[0].record["options"]).get("temporal") != "off" else ():
         if part.chunk.times[0] not in known and np.isfinite(bound):
             said = f"nothing tells how far the seam at {part.chunk.times[0]:g} moves"
-            remedy = "refine it with --run-up 1 or more, or give --seam-bound inf"
-            raise LayerError(f"{said}: {part.file} has no run-up that ended in the frame before it; {remedy}")
+            remedy = "refine it with --preroll 1 or more, or give --seam-bound inf"
+            raise LayerError(f"{said}: {part.file} has no pre-roll that ended in the frame before it; {remedy}")
 
 
 def _record(parts: Sequence[_Part], shot: Path, out: Path, *, frames: tuple[float, float] | None) -> dict[str, Any]:

@@ -132,7 +132,7 @@ class LayerWriter:
         self._time = np.inf if time is None else time
 
     def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
-        """Take a frame of a chunk's run-up into the chunk's record.
+        """Take a frame of a chunk's pre-roll into the chunk's record.
 
         Args:
             time: Its time code.
@@ -141,13 +141,13 @@ class LayerWriter:
         Raises:
             LayerError: A point is not finite.
         """
-        assert self._chunk is not None, "only a chunk has a run-up"
+        assert self._chunk is not None, "only a chunk has a pre-roll"
         found = {
             str(mesh.target): mesh.before(time, array)
             for index, mesh in self._meshes.items()
             if (array := points[index]) is not None
         }
-        self._chunk = replace(self._chunk, run_up={**self._chunk.run_up, time: found})
+        self._chunk = replace(self._chunk, preroll={**self._chunk.preroll, time: found})
 
     def _author_values(self, time: float | None) -> None:
         """Leave the values used on the coarse prims."""
@@ -277,7 +277,7 @@ class _RefinedMesh:
         self._heat.write(time, heat)
 
     def before(self, time: float, points: np.ndarray) -> np.ndarray:
-        """Local points of a frame of the run-up, float32; the hints hold them, since `stitch` may show part of them."""
+        """Local points of a frame of the pre-roll, float32; the hints hold them, since `stitch` shows part of it."""
         local = to_local(points, self._shot.to_metres(self._index, time), str(self.target), time)
         self._hints.write(time, extent_of(local))
         return local
