@@ -51,9 +51,7 @@ FRAMES = 6
 @click.option("--short", is_flag=True, help="Only three samples.")
 def main(folder: Path | None, shots: Sequence[str], prerolls: Sequence[int], *, short: bool) -> None:
     """Print the table."""
-    say(
-        "sample level  options       a frame moves  pre-roll  first frame  sixth frame  joined adds  seconds of pre-roll"
-    )
+    say("sample level  options       a frame moves  pre-roll  first frame  sixth frame  joined adds  pre-roll [s]")
     real: tuple[tuple[str, int, dict[str, Any]], ...] = tuple((name, 1, {}) for name in (SHOTS if folder else ()))
     with tempfile.TemporaryDirectory() as place:
         for index, (name, level, options) in enumerate((CASES if short else CASES + MORE) + real):
