@@ -22,8 +22,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import preview
 from physgraph_usd.shot.refine import refine_shot
-from physgraph_usd.solver.frame.pipeline import Refiner
-from physgraph_usd.solver.level import Level, build_levels
+from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 STIFFNESSES = (4.7e-6, 47e-6)
@@ -35,7 +34,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = write_sample("tshirt", Path(folder))
         shot = open_shot(path)
-        refinements = Refiner.subdivide(shot.scene, [garment.level for garment in shot.scene.garments])
+        refinements = refine_garments(shot.scene.garments, [garment.level for garment in shot.scene.garments])
         level = build_levels(shot.scene.garments, refinements)[-1]
         pictures = []
         for stiffness in STIFFNESSES:

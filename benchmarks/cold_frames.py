@@ -31,7 +31,7 @@ from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.solver.frame import level_forces
 from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.level import hinge_geometry
 from physgraph_usd.usd.read.reader import Shot, open_shot

@@ -24,7 +24,7 @@ from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene

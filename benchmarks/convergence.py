@@ -87,7 +87,7 @@ def trained_like(device: str, config: PatchConfig = CONFIG) -> Iterator[Problem]
     for patch in make_patches(config, seed=SEED):
         garment = patch.garment
         chains, settings = refine_garments([garment], [garment.level]), SolveSettings(METHODS["quasi-newton"])
-        group = Group([garment], chains, patch.gravity, settings, dtype=torch.float32, device=device)
+        group = Group.of([garment], chains, patch.gravity, settings, dtype=torch.float32, device=device)
         systems, coarse = group.systems([patch.frame])
         known = reference_of(garment, patch.gravity, patch.frame, level=garment.level, device=device)
         yield Problem(patch.words, group, systems, coarse, known)

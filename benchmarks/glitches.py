@@ -22,7 +22,7 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Frame, GarmentFrame
 
 from .sheet_over_ball import SheetOverBall

@@ -20,7 +20,7 @@ import numpy as np
 
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import prepare_device
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Frame
 
 from .contact_shots import REAL, SAMPLES, THREADS, open_one

@@ -23,7 +23,7 @@ from scipy.sparse.linalg import splu
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level
 from physgraph_usd.solver.resolution import choose_levels, sample_frames
 from physgraph_usd.usd.read.reader import open_shot

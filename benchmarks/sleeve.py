@@ -26,12 +26,11 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import prepare_device, refine_shot
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
-from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.level import Level, refine_garments
 from physgraph_usd.usd.read.reader import open_shot
 
 REPEATS = 5
@@ -58,9 +57,9 @@ def main() -> None:
         shot_path = write_sample("sleeve", Path(folder))
         shot = open_shot(str(shot_path))
         frame = shot.frame(shot.scene.times[-1]).garments
-        refinements = Refiner.subdivide(shot.scene, [g.level for g in shot.scene.garments])
+        refinements = refine_garments(shot.scene.garments, [g.level for g in shot.scene.garments])
         settings = SolveSettings(method_named("quasi-newton"))
-        single = Group(
+        single = Group.of(
             shot.scene.garments,
             refinements,
             shot.scene.gravity,

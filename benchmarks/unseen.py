@@ -22,9 +22,8 @@ from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import method_named
-from physgraph_usd.solver.integrate.base import Carry, Integrator, System
+from physgraph_usd.solver.integrate.base import Integrator, System
 from physgraph_usd.solver.integrate.saddle import leave_saddle
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
 from physgraph_usd.usd.read.reader import open_shot
@@ -164,12 +163,11 @@ def descend(
 
 def history(system: System, integrator: Integrator, x: torch.Tensor, steps: int) -> list[float]:
     """Energies of so many steps at one level, the start first [J]."""
-    energies: list[float] = []
-
-    def observe(carry: Carry) -> None:
+    carry = integrator.start(system, x)
+    energies = [carry.energy]
+    for _ in range(steps):
+        carry = integrator.step(system, carry)
         energies.append(carry.energy)
-
-    solve_level(system, integrator, x, level=0, budget=Budget(steps), observe=observe)
     return energies
 
 
@@ -193,4 +191,4 @@ def plain_group(garment: Garment, gravity: np.ndarray, dtype: torch.dtype, *, le
     """One garment's levels, without contact."""
     settings = SolveSettings(method_named("quasi-newton"))
     chains = refine_garments([garment], [level])
-    return Group([garment], chains, gravity, settings, dtype=dtype, device=device, threads=THREADS)
+    return Group.of([garment], chains, gravity, settings, dtype=dtype, device=device, threads=THREADS)

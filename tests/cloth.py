@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -13,10 +13,10 @@ from sheets import garment_of
 
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import method_named
-from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.base import Carry, Integrator, System
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
@@ -114,7 +114,7 @@ def group_of(
 ) -> Group:
     """One garment's group."""
     garments = [garment_of(mesh, rest)]
-    return Group(
+    return Group.of(
         garments, refine_garments(garments, [level]), gravity, settings_of(**options), dtype=dtype, device="cpu"
     )
 
@@ -140,3 +140,20 @@ def rms(values: np.ndarray) -> float:
 def total(telemetry: dict[str, Any], which: str) -> float:
     """Total energy of the "input" or the "output" of a frame [J]."""
     return sum(telemetry["energy_joules"][which].values())
+
+
+class Watched:
+    """An integrator whose carries are seen, after the start and after each step."""
+
+    def __init__(self, integrator: Integrator, see: Callable[[Carry], object]) -> None:
+        self.name, self._inner, self._see = integrator.name, integrator, see
+
+    def start(self, system: System, x: torch.Tensor) -> Carry:
+        return self._seen(self._inner.start(system, x))
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        return self._seen(self._inner.step(system, carry))
+
+    def _seen(self, carry: Carry) -> Carry:
+        self._see(carry)
+        return carry

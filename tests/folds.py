@@ -20,7 +20,7 @@ from physgraph_usd.solver.contact.seams import Seams
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces.seam import Seam
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene

@@ -19,7 +19,8 @@ from physgraph_usd.solver.colliders.pose import Collider
 from physgraph_usd.solver.contact.bodies import Touching
 from physgraph_usd.solver.contact.frame import FrameContact, LevelContact
 from physgraph_usd.solver.forces.base import ForceModule
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
@@ -158,7 +159,7 @@ QUESTIONS: dict[str, Callable[[Asked], Any]] = {
     "Group.potential": potential,
     "Group.modules": forces,
     "Group.systems": lambda a: descents(a.group.systems(a.frames)[0], a),
-    "Group.solve": lambda a: a.group.solve(FrameInput(a.frames, touching=a.touching), None),
+    "Group.solve": lambda a: solve_frame(a.group, FrameInput(a.frames, touching=a.touching), None),
     "System": lambda a: descents(a.systems, a),
     "FrameContact.aim": lambda a: a.contact.aim,
     "FrameContact.crossed": lambda a: a.contact.crossed,

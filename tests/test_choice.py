@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,44 +12,40 @@ from folds import frame_with, named, refiner_with, square
 from sheets import garment_of
 
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.solver.integrate.choice import LONGER, LONGER_CUDA, Choice, choose
-from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.frame.choice import LONGER, LONGER_CUDA, Choice, choose
+from physgraph_usd.solver.frame.problem import Problem
 
 
 @dataclass
-class Seen:
-    """Contact where some part of the cloth lies near cloth."""
+class Cold:
+    """What the choice asks of a frame: how crowded its cage is and how far from rest."""
 
-    crowding: float
+    finest: int
+    crowding: float = 0.0
     crossed: bool = False
+    remaining: float = 0.3
+    warm: bool = False
+    device: str = "cpu"
 
 
-def moving() -> float:
-    """A cage far from rest."""
-    return 0.3
+def chosen(nested: bool | None, *given: Any, **options: Any) -> Choice:
+    return choose(cast(Problem, Cold(*given, **options)), nested)
 
 
 @pytest.mark.parametrize("nested", [True, False])
 def test_a_method_that_says_how_is_taken_at_its_word(nested: bool):
-    assert choose(nested, 1, Seen(1.0), remaining=moving) == Choice(nested)
-    assert choose(nested, 1, None, warm=True, remaining=moving) == Choice(False)
+    assert chosen(nested, 1, 1.0) == Choice(nested)
+    assert chosen(nested, 1, warm=True) == Choice(False)
 
 
 @pytest.mark.parametrize(
-    ("subdivisions", "contact", "nested"),
-    [
-        (0, None, True),
-        (1, None, False),
-        (1, Seen(0.0), False),
-        (1, Seen(0.05), False),
-        (1, Seen(0.2), True),
-        (2, None, True),
-    ],
+    ("subdivisions", "crowding", "nested"),
+    [(0, 0.0, True), (1, 0.0, False), (1, 0.05, False), (1, 0.2, True), (2, 0.0, True)],
 )
 def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart(
-    subdivisions: int, contact: Seen | None, nested: bool
+    subdivisions: int, crowding: float, nested: bool
 ):
-    found = choose(None, subdivisions, contact, remaining=moving)
+    found = chosen(None, subdivisions, crowding)
     assert found.nested == nested
     assert found.steps == (1 if nested else LONGER)
     assert found.reason
@@ -70,30 +66,29 @@ def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart
 def test_the_network_makes_the_steps_on_cuda_and_where_levels_are_many(
     device: str, subdivisions: int, warm: bool, learned: bool
 ):
-    options: dict[str, Any] = {"warm": warm, "device": device, "remaining": moving}
-    found = choose(None, subdivisions, None, **options)
+    options: dict[str, Any] = {"warm": warm, "device": device}
+    found = chosen(None, subdivisions, **options)
     assert found.learned == learned
     assert ("physgraph" in found.reason) == learned
-    assert found.integrator(QuasiNewton).name == ("physgraph" if learned else "quasi-newton")
     cold = not warm and (device == "cuda" or subdivisions > 1)
-    assert choose(None, subdivisions, Seen(0.01), **options).learned == cold
-    assert not choose(None, subdivisions, Seen(1.0, crossed=True), **options).learned
-    assert not choose(True, subdivisions, None, **options).learned
+    assert chosen(None, subdivisions, 0.01, **options).learned == cold
+    assert not chosen(None, subdivisions, 1.0, crossed=True, **options).learned
+    assert not chosen(True, subdivisions, **options).learned
 
 
 @pytest.mark.parametrize(("move", "crowding", "nested"), [(0.02, 0.0, False), (0.02, 0.5, True), (0.3, 0.0, True)])
 def test_a_cage_nearly_at_rest_is_passed_over(move: float, crowding: float, nested: bool):
     for subdivisions in (2, 3):
-        assert choose(None, subdivisions, Seen(crowding), remaining=lambda: move).nested == nested
-        assert not choose(None, subdivisions, None, remaining=lambda: move, warm=True).nested
+        assert chosen(None, subdivisions, crowding, remaining=move).nested == nested
+        assert not chosen(None, subdivisions, remaining=move, warm=True).nested
 
 
-@pytest.mark.parametrize(("move", "contact", "nested"), [(0.3, 0.0, False), (0.5, 0.0, True), (0.3, 0.5, True)])
-def test_on_cuda_coarse_levels_serve_cages_far_from_rest(move: float, contact: float, nested: bool):
-    found = choose(None, 2, Seen(contact), remaining=lambda: move, device="cuda")
+@pytest.mark.parametrize(("move", "crowding", "nested"), [(0.3, 0.0, False), (0.5, 0.0, True), (0.3, 0.5, True)])
+def test_on_cuda_coarse_levels_serve_cages_far_from_rest(move: float, crowding: float, nested: bool):
+    found = chosen(None, 2, crowding, remaining=move, device="cuda")
     assert (found.nested, found.learned) == (nested, True)
     assert found.steps == (1 if nested else LONGER_CUDA)
-    crossed = choose(None, 2, Seen(1.0, crossed=True), remaining=lambda: move, device="cuda")
+    crossed = chosen(None, 2, 1.0, crossed=True, remaining=move, device="cuda")
     assert (crossed.nested, crossed.learned) == (True, False)
 
 

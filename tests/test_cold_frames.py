@@ -12,7 +12,7 @@ from sheets import garment_of
 
 from benchmarks.cold_frames import folds_on_cage
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Scene
 from physgraph_usd.usd.read.reader import open_shot
 

@@ -20,6 +20,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.fused import fused_physgraph
 from physgraph_usd.solver.integrate.learned import LearnedMetric, LearnedPaper
@@ -45,7 +46,7 @@ def cloth(device: str, dtype: torch.dtype, **options: Any) -> tuple[Group, list[
     garments = [garment_of(mesh, rest)]
     chains = refine_garments(garments, [2])
     down = np.array([0.0, 0.0, -9.81])
-    one = Group(garments, chains, down, settings_of(**options), dtype=dtype, device=device)
+    one = Group.of(garments, chains, down, settings_of(**options), dtype=dtype, device=device)
     return one, list(frame_of(wave(rest, height=0.005, squeeze=0.02)).garments)
 
 
@@ -74,7 +75,7 @@ def test_s33_a_solved_frame_agrees_and_repeats() -> None:
     answers = []
     for device in ("cpu", "cuda", "cuda"):
         one, frames = cloth(device, torch.float64, steps=60, tolerance=1e-7)
-        answers.append(one.solve(FrameInput(frames), None).points[0])
+        answers.append(solve_frame(one, FrameInput(frames), None).points[0])
     here, there, again = answers
     assert there.tobytes() == again.tobytes()
     assert np.abs(here - there).max() < 1e-3 * EDGE / 4
@@ -126,8 +127,8 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     garments, frames = [garment_of(mesh, points)], frame_of(points * [0.95, 0.9, 1.0]).garments
     chains, down, answers = refine_garments(garments, [4]), np.array([0.0, -9.81, 0.0]), []
     for device in ("cpu", "cuda", "cuda"):
-        one = Group(garments, chains, down, settings_of(steps=60), dtype=torch.float32, device=device)
-        answers.append(one.solve(FrameInput(frames), None))
+        one = Group.of(garments, chains, down, settings_of(steps=60), dtype=torch.float32, device=device)
+        answers.append(solve_frame(one, FrameInput(frames), None))
     assert answers[0].crossings == answers[1].crossings == (0, 0)
     assert np.abs(answers[1].points[0] - answers[0].points[0]).max() < 1e-3 * 0.05
     assert np.array_equal(answers[1].points[0], answers[2].points[0])
@@ -186,12 +187,12 @@ def test_samples_are_refined_alike(tmp_path: Path, sample: str, integrator: str)
 def test_a_recording_keeps_what_it_writes_to() -> None:
     """Others may use up the cache of networks that are laid out, and the memory of those that it drops."""
     one, frames = cloth("cuda", torch.float32, integrator="physgraph", steps=8)
-    first = one.solve(FrameInput(frames), None).points[0]
+    first = solve_frame(one, FrameInput(frames), None).points[0]
     fused_physgraph.cache_clear()
     gc.collect()
     torch.cuda.empty_cache()
     waste = [torch.full((1 << k,), 7.0, device="cuda") for k in range(8, 24) for _ in range(4)]
-    again = one.solve(FrameInput(frames), None).points[0]
+    again = solve_frame(one, FrameInput(frames), None).points[0]
     assert np.array_equal(first, again)
     assert all(bool((each == 7.0).all()) for each in waste)
 

@@ -14,7 +14,7 @@ from physgraph_usd.solver.frame.values import State
 
 MESH, REST = sheet(6, 4)
 GROUP = group_of(MESH, REST, level=2)
-FRAMES: MovingFrames = GROUP._frames
+FRAMES: MovingFrames = GROUP.moving_frames
 FINEST = GROUP.levels[-1]
 
 
@@ -104,7 +104,7 @@ def test_a_small_turn_moves_no_detail_far(seed: int):
     faces = MESH.indices.reshape(-1, 3)[rng.permutation(len(MESH.indices) // 3)]
     turned = [np.roll(face, turn).tolist() for face, turn in zip(faces, rng.integers(3, size=len(faces)), strict=True)]
     group = group_of(mesh_of(turned), rest, level=2)
-    frames, finest = group._frames, group.levels[-1]
+    frames, finest = group.moving_frames, group.levels[-1]
     before, after = tensor(wave(rest, height=0.02)), tensor(wave(rest, height=0.022))
     detail = 0.01 * tensor(rng.normal(size=(finest.vertex_count, 3)))
     kept = frames.store(before, finest.smooth_base.apply(before) + detail)
@@ -122,7 +122,7 @@ def test_stretching_does_not_stretch_detail():
 
 @pytest.mark.parametrize("rest", [np.zeros((3, 3)), np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]])])
 def test_a_cage_without_area_gives_finite_frames(rest: np.ndarray):
-    frames = group_of(mesh_of([[0, 1, 2]]), rest)._frames.frames(tensor(rest))
+    frames = group_of(mesh_of([[0, 1, 2]]), rest).moving_frames.frames(tensor(rest))
     assert bool(frames.isfinite().all())
 
 
@@ -132,7 +132,7 @@ def test_an_isolated_point_and_no_point_at_all():
     group = group_of(mesh, rest, level=1)
     coarse = tensor(rest)
     x = group.levels[-1].smooth_base.apply(coarse)
-    assert torch.allclose(group._frames.predict(group._frames.store(coarse, x), coarse)[0], x)
+    assert torch.allclose(group.moving_frames.predict(group.moving_frames.store(coarse, x), coarse)[0], x)
     empty = group_of(mesh_of([], 0), np.zeros((0, 3)), level=1)
     nothing = torch.zeros((0, 3), dtype=torch.float64)
-    assert empty._frames.store(nothing, nothing).detail.shape == (0, 3)
+    assert empty.moving_frames.store(nothing, nothing).detail.shape == (0, 3)

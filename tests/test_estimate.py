@@ -25,7 +25,7 @@ from physgraph_usd.shot.refine import ending, inspect_shot
 from physgraph_usd.shot.untagged import open_with_colliders
 from physgraph_usd.solver.colliders.pose import Collider, ShapePose
 from physgraph_usd.solver.contact.crowding import Crowding, CrowdingMeter
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.mesh.subdivide import fine_count, subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Scene

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
-from cloth import finest_system, group_of, sheet, wave
+from cloth import Watched, finest_system, group_of, sheet, wave
 
 from physgraph_usd.errors import SolveError, UsageError
 from physgraph_usd.solver.forces.base import ForceModule
@@ -210,11 +210,10 @@ class TestQuasiNewton:
         seen: list[float] = []
         solve_level(
             system,
-            method_named(name).build(),
+            Watched(method_named(name).build(), lambda carry: seen.append(carry.energy)),
             x,
             level=0,
             budget=Budget(25),
-            observe=lambda carry: seen.append(carry.energy),
         )
         assert all(after <= before for before, after in pairwise(seen))
         assert seen[-1] < seen[0]
@@ -305,11 +304,13 @@ class TestNewton:
         moves: list[float] = []
         solve_level(
             system,
-            Newton(inner_steps=1000),
+            Watched(
+                Newton(inner_steps=1000),
+                lambda carry: moves.append(system.remaining_move(system.apply_metric_inverse(carry.force))),
+            ),
             x,
             level=0,
             budget=Budget(60, 1e-9),
-            observe=lambda carry: moves.append(system.remaining_move(system.apply_metric_inverse(carry.force))),
         )
         assert moves[-1] < 1e-9
         assert moves[-1] < 0.05 * moves[-2], moves[-4:]

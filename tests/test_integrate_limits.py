@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
+from cloth import Watched
 
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
@@ -67,11 +68,13 @@ def test_the_solve_stops_under_its_tolerance_and_not_before(tolerance: float):
     moves: list[float] = []
     _, report = solve_level(
         problem,
-        QuasiNewton(history=1),
+        Watched(
+            QuasiNewton(history=1),
+            lambda carry: moves.append(problem.remaining_move(problem.apply_metric_inverse(carry.force))),
+        ),
         near_the_saddle() + 1.5,
         level=0,
         budget=Budget(200, tolerance),
-        observe=lambda carry: moves.append(problem.remaining_move(problem.apply_metric_inverse(carry.force))),
     )
     assert report.stopped == "tolerance"
     assert moves[-1] < tolerance

@@ -12,7 +12,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.frame.lead_in import lead_in
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 

@@ -234,7 +234,9 @@ def test_s10_without_means_a_patch_moves_as_it_would_in_a_larger_garment():
     one = run(integrator, alone, x).x - x
     group = group_of(mesh, rest, level=1)
     garments = list(group.garments) * 2
-    both = Group(garments, refine_garments(garments, [1, 1]), DOWN, group._settings, dtype=torch.float64, device="cpu")
+    both = Group.of(
+        garments, refine_garments(garments, [1, 1]), DOWN, group.settings, dtype=torch.float64, device="cpu"
+    )
     frames = [GarmentFrame(wave(rest), FABRIC, GUIDE), GarmentFrame(rest + np.array([0.0, 0.0, 1.0]), FABRIC, GUIDE)]
     systems, coarse = both.systems(frames)
     begin = both.levels[-1].base.apply(coarse)

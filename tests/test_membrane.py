@@ -19,6 +19,7 @@ from physgraph_usd.solver.forces.membrane import Membrane, in_plane_terms
 from physgraph_usd.solver.forces.stretch import Stretch
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
@@ -143,8 +144,8 @@ def test_a_mixed_group_is_what_its_garments_are_alone(dtype: torch.dtype):
     def solve(chosen: list[GarmentFrame]) -> tuple[list[np.ndarray], dict[str, float]]:
         garments = [garment_of(mesh, points) for _ in chosen]
         refinements = refine_garments(garments, [1] * len(garments))
-        group = Group(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=dtype, device="cpu")
-        solved = group.solve(FrameInput(chosen), None)
+        group = Group.of(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=dtype, device="cpu")
+        solved = solve_frame(group, FrameInput(chosen), None)
         shapes, energies = solved.points, solved.telemetry["energy_joules"]
         assert isinstance(energies, dict)
         return shapes, energies["output"]

@@ -22,7 +22,7 @@ from physgraph_usd.errors import GarmentError, SolveError
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.colliders.pose import Collider, MeshPose
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
 from physgraph_usd.usd.read.reader import open_shot
 

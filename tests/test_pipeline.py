@@ -13,7 +13,7 @@ from sheets import garment_of
 
 from physgraph_usd.errors import SolveError
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.mesh.subdivide import smooth
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
 

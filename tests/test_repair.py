@@ -19,7 +19,7 @@ from physgraph_usd.solver.contact.bodies import FrameBodies, Touching
 from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
 from physgraph_usd.solver.contact.repair import repaired_cage
 from physgraph_usd.solver.contact.settings import ContactSettings
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.usd.read.reader import open_shot
 
 

@@ -90,7 +90,7 @@ class TestFramesThatFail:
         def fail(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("physgraph_usd.solver.frame.pipeline.Refiner.solve", fail)
+        monkeypatch.setattr("physgraph_usd.solver.frame.refiner.Refiner.solve", fail)
         with pytest.raises(KeyboardInterrupt):
             refine(shot, tmp_path / "fine.usdc")
         assert only(tmp_path, "shot.usdc")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -14,7 +17,9 @@ from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.contact.bodies import STALE, FrameBodies, Touching
 from physgraph_usd.solver.contact.settings import ContactSettings
-from physgraph_usd.solver.contact.solve import solve_touching
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.frame.problem import LevelProblem
+from physgraph_usd.solver.frame.solve import solve_one_level
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
@@ -64,16 +69,18 @@ class Fold:
     ) -> tuple[torch.Tensor, list[LevelReport]]:
         """The level solved from x, drawn to a goal."""
         system = system_of(self.level, Springs(goal))
-        return solve_touching(
-            lambda *_: system,
-            QuasiNewton(),
-            x,
-            view=self.view,
+        problem = SimpleNamespace(
             level=self.level,
-            outward=torch.ones(1),
-            smoothing=None if warm else torch.zeros_like(x),
+            view=self.view,
+            module=ForceModule(()),
+            alone=system,
+            system=lambda *_, **__: system,
+            integrator=QuasiNewton(),
             budget=Budget(steps, tolerance=1e-6),
-        )[:2]
+            outward=torch.ones(1),
+        )
+        smoothing = None if warm else torch.zeros_like(x)
+        return solve_one_level(cast(LevelProblem, problem), x, smoothing)[:2]
 
     def crossings(self, x: torch.Tensor) -> int:
         return len(crossings(Soup.of(self.level, x)))

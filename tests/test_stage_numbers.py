@@ -16,7 +16,7 @@ from shots import CLOTH, cloth_shot
 
 from physgraph_usd.cli import main
 from physgraph_usd.shot.plain_json import to_json
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.usd.schema import COLLIDER, GARMENT
 
 NAN, INF = float("nan"), float("inf")

@@ -11,7 +11,7 @@ from cloth import finest_system, group_of, sheet, wave
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.solver.fabric import PRESETS, Fabric
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton

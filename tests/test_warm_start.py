@@ -16,13 +16,20 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.frame.pipeline import Refiner
-from physgraph_usd.solver.frame.start import STILL
-from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.frame.solve import solve_frame
+from physgraph_usd.solver.frame.start import STILL, Start, start_of
+from physgraph_usd.solver.frame.values import Cage, FrameInput, State
 from physgraph_usd.solver.resolution import edge_strain
 from physgraph_usd.usd.read.reader import open_shot
 
 MESH, REST = sheet(8, 6)
+
+
+def begun(group: Group, state: State, cage: Cage) -> Start:
+    """Where a frame starts, with no body that has moved."""
+    given = {"frames": group.moving_frames, "finest": group.levels[-1], "reset": group.settings.reset}
+    return start_of(state, cage, **given, moved=0.0)
 
 
 def said(group: Group, *, strain: float, squeeze: float = 0.0) -> tuple[str, float]:
@@ -31,15 +38,15 @@ def said(group: Group, *, strain: float, squeeze: float = 0.0) -> tuple[str, flo
     The detail of a solved frame is enlarged until the 99th percentile of the edges' strain is what is asked for.
     """
     frames = list(frame_of(wave(REST)).garments)
-    state = group.solve(FrameInput(frames), None).state
-    cage = group._cage(frame_of(REST * np.array([1.0 - squeeze, 1.0, 1.0])).garments)
+    state = solve_frame(group, FrameInput(frames), None).state
+    cage = group.cage(frame_of(REST * np.array([1.0 - squeeze, 1.0, 1.0])).garments)
     world = torch.as_tensor(cage.world)
     low, high, found, here = 0.0, 1e4, "", 0.0
     for _ in range(60):
         middle = 0.5 * (low + high)
         detailed = replace(state, coarse=world, detail=middle * state.detail)
-        start = group._start(detailed, cage)
-        moved = group._frames.predict(replace(detailed, coarse=cage.points), cage.points)[0]
+        start = begun(group, detailed, cage)
+        moved = group.moving_frames.predict(replace(detailed, coarse=cage.points), cage.points)[0]
         found, detail = start.why, moved if start.detailed is None else start.detailed
         here = edge_strain(group.levels[-1], detail)["p99"]
         low, high = (middle, high) if here < strain else (low, middle)
@@ -61,10 +68,10 @@ def test_detail_that_tears_the_cloth_is_not_carried(strain: float, squeeze: floa
 @pytest.mark.parametrize(("moved", "still"), [(0.5, True), (0.9, True), (1.1, False), (40.0, False)])
 def test_a_pose_is_held_while_its_cage_hardly_moves(moved: float, still: bool):
     group, points = group_of(MESH, REST, level=1), wave(REST)
-    state = group.solve(FrameInput(frame_of(points).garments), None).state
+    state = solve_frame(group, FrameInput(frame_of(points).garments), None).state
     edge = float(group.levels[0].spacing.mean())
-    cage = group._cage(frame_of(points + np.array([0.0, moved * STILL * edge, 0.0])).garments)
-    start = group._start(state, cage, moved=0.0)
+    cage = group.cage(frame_of(points + np.array([0.0, moved * STILL * edge, 0.0])).garments)
+    start = begun(group, state, cage)
     assert (start.why, start.held) == ("warm", int(still))
 
 
@@ -74,9 +81,9 @@ def test_what_rests_stays_until_it_is_moved_by_more_than_it_rested_with(contact:
     made = []
     for bend in np.linspace(0.0, 0.004, 30):
         group, points = group_of(MESH, REST, steps=400, tolerance=1e-3, contact=contact, temporal="warm"), wave(REST)
-        state = group.solve(FrameInput(frame_of(points).garments), None).state
+        state = solve_frame(group, FrameInput(frame_of(points).garments), None).state
         points = points + bend * np.sin(20.0 * REST[:, [0]]) * np.array([0.0, 1.0, 0.0])
-        levels = group.solve(FrameInput(frame_of(points).garments), state).telemetry["levels"]
+        levels = solve_frame(group, FrameInput(frame_of(points).garments), state).telemetry["levels"]
         made.append((sum(level["steps"] for level in levels), levels[-1]["remaining_move"]))
     stayed = [left for steps, left in made if not steps]
     assert max(stayed) > 1.5e-3, made

@@ -13,7 +13,7 @@ from sheets import garment_of
 
 from physgraph_usd.solver.colliders.pose import Collider, MeshPose, Pose
 from physgraph_usd.solver.contact.settings import ContactSettings
-from physgraph_usd.solver.frame.pipeline import Refiner
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene, State
 

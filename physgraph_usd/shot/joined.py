@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import LayerError
-from ..solver.frame.pipeline import Refiner
+from ..solver.frame.refiner import Refiner
+from ..solver.level import refine_garments
 from ..solver.mesh.threads import start_warp
 from ..solver.scene import Frame
 from ..usd.read.reader import Shot
@@ -215,7 +216,9 @@ def _looking(stack: ExitStack, shot: Path, options: Mapping[str, Any], meshes: M
 def _level_of(opened: Shot, index: int, count: int | None) -> int:
     """How often a garment was subdivided to have a number of vertices; 0 where it is in no chunk."""
     for level in range(_FINEST + 1) if count is not None else ():
-        chain = Refiner.subdivide(opened.scene, [level if k == index else 0 for k in range(len(opened.sources))])[index]
+        chain = refine_garments(
+            opened.scene.garments, [level if k == index else 0 for k in range(len(opened.sources))]
+        )[index]
         if (chain[-1].mesh if chain else opened.scene.garments[index].mesh).vertex_count == count:
             return level
     if count is None:

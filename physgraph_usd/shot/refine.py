@@ -18,8 +18,9 @@ from ..interrupts import SIGNALLED, exit_code_of, signals_raise
 from ..solver.contact.passed import told
 from ..solver.frame.history import told_broken, told_jumped
 from ..solver.frame.lead_in import cages_walked
-from ..solver.frame.pipeline import Refiner
+from ..solver.frame.refiner import Refiner
 from ..solver.integrate.metric import FACTOR
+from ..solver.level import refine_garments
 from ..solver.mesh.threads import kernels_are_kept, start_warp
 from ..solver.resolution import too_coarse
 from ..usd.files import check_targets, files_of
@@ -382,7 +383,7 @@ def _write_layer(
     began, provenance = clock.perf_counter(), made_from(opened, out, options)
     known = len(opened.warnings)  # What is said of the shot itself has been.
     made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite, "chunk": chunk}
-    refinements = Refiner.subdivide(opened.scene, solver.levels)
+    refinements = refine_garments(opened.scene.garments, solver.levels)
     with ExitStack() as stack:
         frames = None if out is None else stack.enter_context(_frames(solver, times, out, options, provenance))
         writer = stack.enter_context(LayerWriter(opened, refinements, out, provenance=provenance, **made))

@@ -10,7 +10,7 @@ from itertools import pairwise
 from ..shot.options import RefineOptions
 from ..shot.refine import MOST_THREADS, sampled_at
 from ..solver.frame.lead_in import cages_walked
-from ..solver.frame.pipeline import Refiner
+from ..solver.frame.refiner import Refiner
 from ..solver.frame.settings import SolveSettings
 from ..solver.scene import State
 from ..usd.read.reader import Shot
@@ -94,7 +94,7 @@ class FrameSolver:
         walked = self.run if self.run and self._follows(self.run[-1], time) else ()
         self.run = ()
         if walked:
-            self._exact = self._exact.beside(settings)
+            self._exact = self._exact.fork(settings)
         else:
             self._exact.use(settings)
             self._lead_in(shot, time)
@@ -102,7 +102,7 @@ class FrameSolver:
         if not cancelled():
             finer = FINER * self._settings.tolerance
             soon = replace(self._settings, temporal="warm", budget_ms=BUDGET_MS, tolerance=finer)
-            self._quick, self.run = (self._exact.beside(soon), time), (*walked, time)
+            self._quick, self.run = (self._exact.fork(soon), time), (*walked, time)
         return state
 
     def _lead_in(self, shot: Shot, time: float | None) -> None:

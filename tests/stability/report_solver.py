@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from cloth import FABRIC, GUIDE, base_of, frame_of, group_of, refiner_of, rms, sheet, solved, total, wave
+from cloth import FABRIC, GUIDE, Watched, base_of, frame_of, group_of, refiner_of, rms, sheet, solved, total, wave
 from meshes import mesh_of
 from sheets import garment_of, rotation
 from test_forces_needles import needle_sheet
@@ -17,6 +17,7 @@ from test_meshes import ALMOST_NOTHING, CORNERS, FAULTS, faulty, hung
 from test_starts import ball, squeezed
 
 from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import Carry
@@ -81,7 +82,7 @@ def s3_needles(method: str) -> Result:
         [GarmentFrame(points * [0.95, 1.0, 1.0] + 0.01 * np.sin(20 * points), FABRIC, GUIDE)]
     )
     seen: list[Carry] = []
-    solve_level(systems[-1], method_named(method).build(), coarse, level=0, budget=Budget(30), observe=seen.append)
+    solve_level(systems[-1], Watched(method_named(method).build(), seen.append), coarse, level=0, budget=Budget(30))
     moves = [float((b.x - a.x).norm(dim=1).max()) for a, b in pairwise(seen)]
     finite = all(bool(carry.x.isfinite().all()) for carry in seen)
     return under(max(moves, default=0.0) / 0.1 if finite else math.nan, 1.0, " edges")
@@ -268,7 +269,7 @@ def s36_drift(method: str) -> Result:
     group = group_of(mesh, rest, level=2, integrator=method, steps=12, tolerance=0.0)
     frame, state, outputs, energies = GarmentFrame(wave(rest), FABRIC, GUIDE), None, [], []
     for _ in range(11):
-        found = group.solve(FrameInput([frame]), state)
+        found = solve_frame(group, FrameInput([frame]), state)
         state = found.state
         outputs.append(found.points[0])
         energies.append(total(found.telemetry, "output"))
@@ -287,6 +288,6 @@ def s37_guard(method: str) -> Result:
     seen: list[Carry] = []
     base = group_of(mesh, rest, level=1, dtype=torch.float32).levels[-1].base.apply(coarse)
     guarded = Guard(method_named(method).build())
-    solve_level(systems[-1], guarded, base, level=0, budget=Budget(25), observe=seen.append)
+    solve_level(systems[-1], Watched(guarded, seen.append), base, level=0, budget=Budget(25))
     rises = sum(after.energy > before.energy for before, after in pairwise(seen))
     return Result(rises == 0, f"{rises} rises")

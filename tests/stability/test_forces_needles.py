@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from cloth import Watched
 from energies import apart, autograd_force, bending_energy, difference_force, evaluate, membrane_energy, stretch_energy
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -88,7 +89,7 @@ def test_s3_needle_sheet_is_solved_without_wild_steps(aspect: float, shear: floa
     visited: list[torch.Tensor] = []
     x = torch.as_tensor(start, dtype=dtype)
     out, report = solve_level(
-        system, QuasiNewton(), x, level=0, budget=Budget(30), observe=lambda carry: visited.append(carry.x)
+        system, Watched(QuasiNewton(), lambda carry: visited.append(carry.x)), x, level=0, budget=Budget(30)
     )
     moves = torch.stack([(b - a).norm(dim=1) for a, b in pairwise(visited)])
     assert bool(out.isfinite().all())

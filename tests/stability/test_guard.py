@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from cloth import finest_system, group_of, sheet, wave
+from cloth import Watched, finest_system, group_of, sheet, wave
 
 from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.guard import PATIENCE, Guard
@@ -68,7 +68,7 @@ def problem(dtype: torch.dtype = torch.float64) -> tuple[System, torch.Tensor]:
 
 def descent(system: System, x: torch.Tensor, propose: Proposal, *, seed: int = 0, steps: int = 15) -> list[Carry]:
     carries: list[Carry] = []
-    solve_level(system, Guard(Adversary(propose, seed=seed)), x, level=0, budget=Budget(steps), observe=carries.append)
+    solve_level(system, Watched(Guard(Adversary(propose, seed=seed)), carries.append), x, level=0, budget=Budget(steps))
     return carries
 
 
@@ -97,7 +97,7 @@ def test_s37_after_corrections_in_a_row_the_spare_makes_the_steps():
     system, x = problem()
     carries: list[Carry] = []
     guard = Guard(Adversary(PROPOSALS["huge"]), spare=QuasiNewton())
-    _, report = solve_level(system, guard, x, level=0, budget=Budget(12), observe=carries.append)
+    _, report = solve_level(system, Watched(guard, carries.append), x, level=0, budget=Budget(12))
     assert [carry.mover for carry in carries[1:]] == ["fallback"] * PATIENCE + ["quasi-newton"] * (12 - PATIENCE)
     assert all(after.energy < before.energy for before, after in pairwise(carries))
     again = guard.step(system, guard.resume(system, carries[-1]))
@@ -133,5 +133,5 @@ def test_s37_the_test_sees_a_missing_guard():
     system, x = problem()
     energies: list[float] = []
     integrator = Adversary(PROPOSALS["random"])
-    solve_level(system, integrator, x, level=0, budget=Budget(5), observe=lambda carry: energies.append(carry.energy))
+    solve_level(system, Watched(integrator, lambda carry: energies.append(carry.energy)), x, level=0, budget=Budget(5))
     assert any(after > before for before, after in pairwise(energies))

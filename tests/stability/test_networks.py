@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
+from cloth import FABRIC, GUIDE, Watched, finest_system, group_of, sheet, wave
 
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.integrate.base import Carry, System
@@ -46,7 +46,7 @@ def problem(
 
 def descent(integrator: Guard, system: System, x: torch.Tensor, *, steps: int = 10) -> list[Carry]:
     carries: list[Carry] = []
-    solve_level(system, integrator, x, level=0, budget=Budget(steps), observe=carries.append)
+    solve_level(system, Watched(integrator, carries.append), x, level=0, budget=Budget(steps))
     return carries
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cloth import Answer, finest_system, frame_of, group_of, refiner_of, sheet, solved, total, wave
+from cloth import Answer, Watched, finest_system, frame_of, group_of, refiner_of, sheet, solved, total, wave
 from sheets import garment_of, rotation
 
 from physgraph_usd.solver.fabric import Fabric
@@ -94,7 +94,7 @@ def test_s15_a_crumpled_ball_uncrumples(name: str, steps: int, dtype: torch.dtyp
     system, x = ball(dtype=dtype)
     seen: list[Carry] = []
     integrator = Guard(method_named(name).build())
-    solve_level(system, integrator, x, level=0, budget=Budget(steps), observe=seen.append)
+    solve_level(system, Watched(integrator, seen.append), x, level=0, budget=Budget(steps))
     assert all(bool(carry.x.isfinite().all()) for carry in seen)
     assert all(after.energy <= before.energy for before, after in pairwise(seen))
     assert seen[-1].energy < 0.1 * seen[0].energy, seen[-1].energy / seen[0].energy

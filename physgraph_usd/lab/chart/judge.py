@@ -12,7 +12,7 @@ import torch
 
 from ...solver.forces.base import ForceModule
 from ...solver.frame.group import Group
-from ...solver.frame.pipeline import Refiner
+from ...solver.frame.refiner import Refiner
 from ...solver.resolution import edge_strain
 from ...solver.scene import Frame
 

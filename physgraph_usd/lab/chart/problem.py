@@ -14,8 +14,9 @@ import torch
 
 from ...shot.options import RefineOptions
 from ...solver.contact.settings import ContactSettings
-from ...solver.frame.pipeline import Refiner
+from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
+from ...solver.frame.solve import solve_frame
 from ...solver.frame.values import FrameInput, State
 from ...solver.level import Level
 from ...solver.scene import Frame, Scene
@@ -123,7 +124,7 @@ class Problem:
         states = []
         for part, own in zip(self.refiner.parts_of(frame), kept, strict=True):
             frames, touching = [frame.garments[index] for index in part], self.refiner.touching(part, frame)
-            solved = self.refiner.group_of(part).solve(FrameInput(frames, frame.time, touching), own)
+            solved = solve_frame(self.refiner.group_of(part), FrameInput(frames, frame.time, touching), own)
             points.update(zip(part, solved.points, strict=True))
             states.append(solved.state)
         return tuple(points[index] for index in sorted(points)), states

@@ -40,7 +40,7 @@ class Bundle:
         garments, count = [patch.garment for patch in patches], patches[0].garment.level
         settings = SolveSettings(METHODS["quasi-newton"])
         chains = refine_garments(garments, [count] * len(garments))
-        group = Group(garments, chains, patches[0].gravity, settings, dtype=torch.float32, device=device)
+        group = Group.of(garments, chains, patches[0].gravity, settings, dtype=torch.float32, device=device)
         plain, coarse = group.systems([patch.frame for patch in patches])
         systems = with_bodies(plain, group.levels, coarse, [patch.body for patch in patches])
         self.systems = [JointSystem(system, through_forces=through_forces) for system in systems]

@@ -166,7 +166,9 @@ def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
 
 def _group(garment: Garment, gravity: np.ndarray, level: int) -> Group:
     chains = refine_garments([garment], [level])
-    return Group([garment], chains, gravity, SolveSettings(METHODS["quasi-newton"]), dtype=torch.float32, device="cpu")
+    return Group.of(
+        [garment], chains, gravity, SolveSettings(METHODS["quasi-newton"]), dtype=torch.float32, device="cpu"
+    )
 
 
 def _patch(config: PatchConfig, rng: np.random.Generator) -> Patch:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import LayerError, StageError
-from ...solver.frame.pipeline import Refiner
+from ...solver.level import refine_garments
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
 from ..report import RefineReport
@@ -92,7 +92,7 @@ def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: 
         layer: The layer that was written.
     """
     written = RefinedLayer(layer)
-    chains = Refiner.subdivide(shot.scene, [garment["level"] for garment in report.garments])
+    chains = refine_garments(shot.scene.garments, [garment["level"] for garment in report.garments])
     for index, own in enumerate(series):
         garment, steps = shot.scene.garments[index], chains[index]
         edge = 1e-3 * report.garments[index]["fine_edge_mm"]

@@ -1,4 +1,4 @@
-"""What is kept of a garment's last frames, and from which of them the next one starts.
+"""What is kept of a garment's last frames, and from which of them the next one starts: values, replaced frame by frame.
 
 A frame starts from the last one, unless that one was broken: where the input leaves its place for one frame and comes
 back, what was solved there is no start for what follows. Then the frame before it is.
@@ -7,13 +7,13 @@ back, what was solved there is no start for what follows. Then the frame before 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..colliders.pose import Pose
-from ..scene import GarmentFrame
-from .values import State
+from ..scene import Frame, GarmentFrame
+from .values import State, join
 
 BACK = 0.25
 """Part of the way that the input took into a broken frame by which it may miss its place before, to have come back.
@@ -45,6 +45,129 @@ class Known:
     state: State
     crossing: np.ndarray
     first: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What is kept of one garment.
+
+    Attributes:
+        last: The last frame that was solved.
+        before: The one that it started from.
+        solved: Whether the last result is a solution.
+    """
+
+    last: Known | None = None
+    before: Known | None = None
+    solved: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What a frame of garments that are solved together starts from.
+
+    Attributes:
+        frames: The frame of each garment that it starts from; None where there is none.
+        state: What they left, joined; None for a cold start.
+        broken: Time code of the last frame, where the input left its place in it alone; else None.
+        jumped: Time code of the first frame, where the input jumped from there to the second; else None.
+        gap: Whether the time between samples is too long.
+    """
+
+    frames: tuple[Known | None, ...]
+    state: State | None
+    broken: float | None
+    jumped: float | None
+    gap: bool
+
+    def moved(self, part: tuple[int, ...], frame: Frame, near: Sequence[int]) -> float:
+        """How far any body that garments may touch has moved since [m]; infinite if more than poses changed."""
+        known = [each for each in self.frames if each is not None]
+        farthest = 0.0 if len(known) == len(part) else np.inf
+        for index, last in zip(part, known, strict=False):
+            if last.part != part or not set_alike(frame.garments[index], last.frame) or set(near) != set(last.near):
+                return np.inf
+            farthest = max(farthest, bodies_moved(last, frame.colliders, near))
+        return farthest
+
+    def told(self, walked_from: float | None) -> dict[str, object]:
+        """What the report says of it, given the time code from which a cold frame's cage walked here, or None."""
+        found: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
+        if walked_from is not None:
+            found["start"] = f"cold: the cage walked here from time code {walked_from:g}"
+        if self.broken is not None:
+            found["broken_before"] = self.broken
+        if self.jumped is not None:
+            found |= {"jumped_from": self.jumped, "start": "cold: the first frame is unlike the others"}
+        return found
+
+
+def origin_of(
+    part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], *, near: Sequence[int], edge: float, gap: bool
+) -> Origin:
+    """From which frame garments start.
+
+    Args:
+        part: Numbers of the garments.
+        frame: The frame that is to be solved.
+        kept: What is kept of each of them.
+        near: The bodies that they may touch.
+        edge: Mean edge of their cages [m].
+        gap: Whether the time between samples is too long.
+    """
+    given = {"near": near, "edge": edge}
+    broken, jumped = _broken(part, frame, kept, **given), _jumped(part, frame, kept, **given)
+    frames = tuple(each.last if broken is None else each.before for each in kept)
+    frames = frames if jumped is None else (None,) * len(part)
+    known = [each for each in frames if each is not None]
+    state = None if gap or len(known) < len(part) else join([each.state for each in known])
+    if state is not None and any(each.part != part for each in known):
+        state = replace(state, clean=False)  # What was solved apart may cross.
+    return Origin(frames, state, broken, jumped, gap)
+
+
+def _broken(
+    part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], *, near: Sequence[int], edge: float
+) -> float | None:
+    """Time code of the last frame, if garments' input left its place in it alone."""
+    pairs = [(each.last, each.before) for each in kept if each.last is not None and each.before is not None]
+    if len(pairs) == len(part):
+        for index, (last, before) in zip(part, pairs, strict=True):
+            if came_back(last, before, frame.garments[index], frame.colliders, near=near, edge=edge):
+                return last.time
+    return None
+
+
+def _jumped(
+    part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], *, near: Sequence[int], edge: float
+) -> float | None:
+    """Time code of the first frame, if garments' input jumped from there to the second and stays there."""
+    for index, each in zip(part, kept, strict=True):
+        first, second = each.before, each.last
+        if first is None or second is None or not first.first:
+            return None
+        if jumped_in(first, second, frame.garments[index], frame.colliders, near=near, edge=edge):
+            return first.time
+    return None
+
+
+def is_same(part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], near: Sequence[int]) -> bool:
+    """Whether garments and the bodies that they may touch are what they were, and solved together."""
+    for index, each in zip(part, (each.last for each in kept), strict=True):
+        if each is None or each.part != part or near != each.near:
+            return False
+        now, then = frame.garments[index], each.frame
+        if not (set_alike(now, then) and np.array_equal(now.points, then.points)):
+            return False
+        poses = [(each.colliders[body], frame.colliders[body]) for body in near]
+        if not all(a is not None and b is not None and a.equals(b) for a, b in poses):
+            return False
+    return True
+
+
+def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
+    """Whether an artist's settings are the same in two frames."""
+    return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 
 def cage_moved(known: Known, now: GarmentFrame) -> float:

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ...errors import SolveError, StageError
-from ..scene import Frame, Scene
-from .pipeline import Refiner
+from ..scene import Frame, Scene, refuse_far
+from .refiner import Refiner
 from .settings import SolveSettings
 
 
@@ -61,7 +61,7 @@ def lead_in(
     """
     last = len(times) - 1
     try:
-        needed = last > 0 and cages.crosses(frame_at(times[last]))
+        needed = last > 0 and _crosses(cages, frame_at(times[last]))
     except StageError:  # It is told of where the frame is solved.
         needed = False
     if not needed or _is_clean(cages, frame_at, times[last]):
@@ -73,6 +73,16 @@ def lead_in(
     for time in times[begun + 1 :]:
         _solve(cages, frame_at, time)
     return cages, times[begun]
+
+
+def _crosses(cages: Refiner, frame: Frame) -> bool:
+    """Whether a cage that is to keep its sides crosses itself, or another one, in a frame."""
+    refuse_far(cages.scene, frame)
+    for part in cages.parts_of(frame):
+        contact = cages.group_of(part).potential([frame.garments[index] for index in part])[1]
+        if contact is not None and contact.crossed:
+            return True
+    return False
 
 
 def _is_clean(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> bool:

@@ -85,15 +85,22 @@ class LevelReport:
 
 
 def solve_level(
+    system: System, integrator: Integrator, x: Float[Tensor, "vertices 3"], *, level: int, budget: Budget
+) -> tuple[Float[Tensor, "vertices 3"], LevelReport]:
+    """Final positions [m] and report of `descend`."""
+    carry, report = descend(system, integrator, x, level=level, budget=budget)
+    return carry.x, report
+
+
+def descend(
     system: System,
     integrator: Integrator,
     x: Float[Tensor, "vertices 3"],
     *,
     level: int,
     budget: Budget,
-    observe: Callable[[Carry], None] | None = None,
     resume: Carry | None = None,
-) -> tuple[Float[Tensor, "vertices 3"], LevelReport]:
+) -> tuple[Carry, LevelReport]:
     """Step until the remaining move is under the tolerance or the budget is spent.
 
     Args:
@@ -102,29 +109,22 @@ def solve_level(
         x: Start positions [m].
         level: Index for the report.
         budget: When to stop.
-        observe: Called with the carry after the start and after each step.
         resume: The last carry of a solve under forces that differ a little, to go on from; None starts at x.
 
     Returns:
-        Final positions [m] and the report.
+        What the integrator carries at the end, the final positions among it, and the report.
 
     Raises:
         SolveError: The energy at the start or at the end is not finite.
     """
-    began = time.perf_counter()
+    began, before = time.perf_counter(), system.counted
     report = LevelReport(level, x.shape[0])
-    before = system.counted
     system.expected = budget.steps
     carry = integrator.start(system, x) if resume is None else resumed(integrator, system, resume)
     _require_finite(carry, level)
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()
-    while True:
-        if observe:
-            observe(carry)
-        stopped = _reason_to_stop(system, carry, report.steps, budget)
-        if stopped:
-            break
+    while not (stopped := _reason_to_stop(system, carry, report.steps, budget)):
         carry = integrator.step(system, carry)
         movers[carry.mover] += 1
         report.steps += 1
@@ -136,7 +136,7 @@ def solve_level(
         now - then for now, then in zip(system.counted, before, strict=True)
     )
     report.milliseconds = 1e3 * (time.perf_counter() - began)
-    return carry.x, report
+    return carry, report
 
 
 def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) -> str:

@@ -16,13 +16,9 @@ steps, and quasi-Newton makes them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
-from .base import Integrator
-from .learned import guarded
-from .weights import shipped_network
+from .problem import Problem
 
 LONGER, LONGER_CUDA = 4, 8
 """Steps of the finest level alone over those that it takes after coarse ones, on the CPU and on CUDA."""
@@ -52,50 +48,21 @@ class Choice:
     reason: str = ""
     learned: bool = False
 
-    def integrator(self, asked: Callable[[], Integrator]) -> Integrator:
-        """The integrator: the network's, or what the method builds."""
-        return guarded(shipped_network("physgraph")) if self.learned else asked()
 
-
-class Crowd(Protocol):
-    """What is asked of contact."""
-
-    @property
-    def crossed(self) -> bool:
-        """Whether the cage crosses itself."""
-        ...
-
-    @property
-    def crowding(self) -> float:
-        """Part of the vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
-        ...
-
-
-def choose(
-    nested: bool | None,
-    subdivisions: int,
-    contact: Crowd | None,
-    *,
-    remaining: Callable[[], float],
-    warm: bool = False,
-    device: str = "cpu",
-) -> Choice:
+def choose(problem: Problem, nested: bool | None) -> Choice:
     """Choose for one frame.
 
     Args:
+        problem: The frame; how crowded the cage is and how far from rest are found only where they matter.
         nested: What the method asks for; None leaves it open.
-        subdivisions: Number of levels above the cage.
-        contact: The frame's contact, or None when nothing can touch; asked only where it matters.
-        remaining: Gives the cage's remaining move, in its edge lengths; asked only where it matters.
-        warm: Whether the frame starts from the last one's detail.
-        device: Where the frame is solved.
     """
+    warm, subdivisions = problem.warm, problem.finest
     if nested is not None:
         return Choice(nested and not warm)
-    cuda = device != "cpu"
-    alone = not warm and subdivisions > 0 and (subdivisions == 1 or remaining() < (FAR if cuda else RESTING))
-    many = not warm and subdivisions >= DEEP and not (contact is not None and contact.crossed)
-    crowding = contact.crowding if contact is not None and (alone or (cuda and not many)) else 0.0
+    cuda = problem.device != "cpu"
+    alone = not warm and subdivisions > 0 and (subdivisions == 1 or problem.remaining < (FAR if cuda else RESTING))
+    many = not warm and subdivisions >= DEEP and not problem.crossed
+    crowding = problem.crowding if alone or (cuda and not many) else 0.0
     crowded = alone and crowding > CROWDED
     deep = many and (crowded or not alone)
     learned = deep or (cuda and (not crowding or (alone and not crowded)))

@@ -1,0 +1,102 @@
+"""What comes out of a frame's solve: the cloth shown, what it leaves to the next frame, and what the report says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import SolveError
+from ..forces.base import ForceModule
+from ..integrate.solve import LevelReport
+from ..level import Placed, unhindered
+from ..resolution import edge_strain, sharp_folds
+from ..scene import FARTHEST
+from .choice import Choice
+from .level_forces import named
+from .problem import Problem
+from .values import State
+
+
+def refuse_swallowed(problem: Problem) -> None:
+    """Refuse cloth wholly in a body, deeper than it is large: pushed out, it would be nowhere near its cage.
+
+    Raises:
+        SolveError: There is such cloth.
+    """
+    given, depths = problem.given, [] if problem.contact is None else problem.contact.depths
+    for garment, frame, (deep, body) in zip(problem.group.garments, given.garments, depths, strict=False):
+        size = float(np.linalg.norm(np.ptp(frame.points, axis=0))) if len(frame.points) else 0.0
+        if deep > size:
+            what = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
+            raise SolveError(f"{named([garment], given.at)}: {what}; mend the one or the other there")
+
+
+def scaled(problem: Problem, x: Placed) -> Placed:
+    """The cloth with its detail scaled as asked for [m], within bounds, as far as nothing newly crosses.
+
+    Raises:
+        SolveError: It is not finite or out of bounds.
+    """
+    group, given, view = problem.group, problem.given, problem.view(problem.finest)
+    pairs = zip(given.garments, group.garments, strict=True)
+    gain = np.concatenate([frame.detail * garment.detail_scale for frame, garment in pairs])
+    result = group.moving_frames.scaled(problem.aim, x, gain)
+    if not bool((result.abs() <= FARTHEST).all()):
+        what = f"the refined cloth is not finite or beyond {FARTHEST:g} m; lower physgraph:refine:detail"
+        raise SolveError(f"{named(group.garments, given.at)}: {what} or detailScale")
+    return x if result is x else unhindered(result) if view is None else view.moved(x, result)
+
+
+def state_left(problem: Problem, x: Placed) -> State:
+    """What the next frame starts from."""
+    view, cage = problem.view(problem.finest), problem.cage
+    stored = problem.group.moving_frames.store(cage.points, x)
+    fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
+    clean = view is not None and not view.crosses(x)
+    return replace(stored, coarse=torch.as_tensor(cage.world), held=problem.start.held, fine=fine, clean=clean)
+
+
+def telemetry_of(
+    problem: Problem, x: Tensor, module: ForceModule, *, reports: Sequence[LevelReport], choice: Choice
+) -> dict[str, Any]:
+    """How a frame was solved and how its result lies, as plain values.
+
+    Args:
+        problem: The frame.
+        x: The result [m].
+        module: The terms at the finest level.
+        reports: Those of the levels' rounds.
+        choice: How it was solved.
+    """
+    finest = problem.group.levels[-1]
+    base = finest.base.apply(problem.cage.points)
+    return {
+        "levels": [asdict(report) for report in reports],
+        "energy_joules": {"input": module.energies(base), "output": module.energies(x)},
+        "sharp_folds": sharp_folds(finest, x),
+        "strain": edge_strain(finest, x),
+        "start": problem.start.why,
+    } | ({"chosen": choice.reason} if choice.reason else {})
+
+
+def measured(problem: Problem, x: Tensor) -> tuple[dict[str, object], np.ndarray]:
+    """What is near and what crosses, of what the cloth may touch and of what is off but to be measured.
+
+    Args:
+        problem: The frame.
+        x: The result [m].
+
+    Returns:
+        Plain values, and which vertices belong to cloth that crosses, shape (V,), bool.
+    """
+    group, settings = problem.group, problem.group.settings.contact.to_measure()
+    judge = problem.contact if settings is None else group.contact(problem.given, problem.cage, settings=settings)
+    if judge is None:
+        return {}, np.zeros(len(x), bool)
+    values, crossing = judge.measure(x)
+    return values, crossing.cpu().numpy()

@@ -1,0 +1,223 @@
+"""One frame of a group, ready to be solved: its cage, what it may touch, where it starts, and each level of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from ..contact.frame import FrameContact, LevelContact, Touch
+from ..forces.base import ForceModule
+from ..forces.seam import SewnForces
+from ..integrate.base import Integrator, System
+from ..integrate.metric import Metric
+from ..integrate.solve import Budget
+from ..level import Level, Placed
+from .group import Group
+from .level_forces import LevelForces
+from .start import Start, start_of
+from .values import Cage, FrameInput, State
+
+
+@dataclass(frozen=True, eq=False)
+class LevelProblem:
+    """One level of a frame.
+
+    Attributes:
+        lasting: Its terms that last as long as the materials.
+        module: All of its terms where nothing touches.
+        alone: Its system where nothing touches, tied to its start in a warm frame.
+        view: What its cloth may touch, or None.
+        integrator: What makes the steps.
+        budget: When to stop.
+        outward: As `leave_saddle` takes it.
+    """
+
+    lasting: LevelForces
+    module: ForceModule
+    alone: System
+    view: LevelContact | None
+    integrator: Integrator
+    budget: Budget
+    outward: Float[Tensor, " garments"]
+
+    @property
+    def level(self) -> Level:
+        """The level itself."""
+        return self.lasting.level
+
+    def system(
+        self,
+        view: LevelContact,
+        touched: Sequence[Touch],
+        x: Float[Tensor, "vertices 3"],
+        *,
+        last: System | None = None,
+    ) -> System:
+        """The system with the terms of what is near.
+
+        Args:
+            view: What the cloth may touch, as seen from x.
+            touched: The terms of what is near.
+            x: Positions at which they are weighed [m].
+            last: The last round's system, whose metric may serve on.
+        """
+        if not touched and view.seam is None:
+            return self.alone
+        field, metric = self.alone.field, self.alone.metric
+        assert isinstance(field, ForceModule)
+        assert isinstance(metric, Metric)
+        joined = field.joined_by(touched)
+        held = view.metric(metric, touched, x, known=None if last is None else last.metric)
+        return self.lasting.system_in(joined if view.seam is None else SewnForces(joined, view.seam), held)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One frame, ready to be solved; all positions are about the cages' mean.
+
+    Attributes:
+        began: When the frame began [s].
+        group: The garments.
+        given: The frame.
+        cage: Where the cages are.
+        aim: The cage that the fine cloth follows [m].
+        forces: The lasting terms of each level, coarsest first.
+        contact: What the cloth may touch, or None.
+        start: Where the cloth starts.
+        walked: Where the cages walked to from an earlier frame [m], for a cold start; or None.
+        before: Where it was [m], float64; None where there is no last frame.
+        tether: How stiffly it is tied to its start [1/s^2]; None where it is not.
+    """
+
+    began: float
+    group: Group
+    given: FrameInput
+    cage: Cage
+    aim: Float[Tensor, "coarse 3"]
+    forces: Sequence[LevelForces]
+    contact: FrameContact | None
+    start: Start
+    walked: Float[Tensor, "coarse 3"] | None
+    before: Placed | None
+    tether: float | None
+
+    @property
+    def warm(self) -> bool:
+        """Whether the cloth starts with the last frame's detail."""
+        return self.start.detailed is not None
+
+    @property
+    def crossed(self) -> bool:
+        """Whether the cage crosses itself."""
+        return self.contact is not None and self.contact.crossed
+
+    @property
+    def crowding(self) -> float:
+        """Fraction of the vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
+        return 0.0 if self.contact is None else self.contact.crowding
+
+    @cached_property
+    def remaining(self) -> float:
+        """The cage's remaining move, in its edge lengths."""
+        return self.forces[0].remaining(self.aim)
+
+    @property
+    def device(self) -> str:
+        """Where the frame is solved."""
+        return self.forces[0].level.device
+
+    @property
+    def finest(self) -> int:
+        """Number of the finest level: that of the subdivisions."""
+        return len(self.forces) - 1
+
+    def view(self, index: int) -> LevelContact | None:
+        """What a level's cloth may touch."""
+        return None if self.contact is None else self.contact.at(self.forces[index].level)
+
+    def levels(self, *, nested: bool) -> range:
+        """Numbers of the levels that are solved; what crosses in a cold frame is untangled at the cage."""
+        return range(0 if nested or (not self.warm and self.crossed) else self.finest, self.finest + 1)
+
+    def level(self, index: int, *, steps: int, integrator: Integrator) -> LevelProblem:
+        """One level.
+
+        Args:
+            index: Its number.
+            steps: How many times the steps that were asked for the finest level takes.
+            integrator: What makes them.
+        """
+        lasting, settings = self.forces[index], self.group.settings
+        module = lasting.module(self.aim)
+        tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
+        # What is recorded of a level's steps on CUDA serves in the next frame too.
+        recorded = lasting.level.device != "cpu"
+        alone = lasting.lasting_system(self.aim, tie) if recorded else lasting.system(module, tie)
+        budget = settings.budget(self.finest - index, self.began, more=steps, warm=self.warm)
+        budget = replace(budget, steps=0) if self.start.rests else budget
+        return LevelProblem(lasting, module, alone, self.view(index), integrator, budget, self.group.outward)
+
+    def begun(
+        self, index: int, below: Float[Tensor, "below 3"] | None
+    ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"] | None]:
+        """Where a level begins [m], and the move that takes a coarser mesh's facets out of it; None in a warm frame.
+
+        Args:
+            index: Number of the level.
+            below: Positions of the next coarser level [m]; None where the level is the first.
+        """
+        level = self.forces[index].level
+        view, warm = self.view(index), self.start.detailed
+        if warm is not None:
+            return warm if view is None or self.before is None else view.moved(self.before, warm), None
+        linear, smooth = level.from_below, level.smooth_from_below
+        first = below is None
+        if below is None:  # Only the cage itself starts where the cages walked to.
+            below = self.aim if index or self.walked is None else self.walked
+        if first or linear is None or smooth is None:
+            linear, smooth = level.base, level.smooth_base
+        x = linear.apply(below)
+        smoothing = self.forces[index].without_facets(x, below, smooth)
+        if view is not None and not first and level.flat_from_below is not None and view.crosses(x):
+            flat = level.flat_from_below.apply(below)
+            x, smoothing = flat, x + smoothing - flat
+        return x, smoothing
+
+
+def begin(group: Group, given: FrameInput, last: State | None) -> Problem:
+    """Make a frame ready to be solved.
+
+    Args:
+        group: The garments.
+        given: The frame.
+        last: What the last frame left, or None for a cold start.
+    """
+    began = time.perf_counter()
+    forces, cage, settings = group.forces_for(given.garments), group.cage(given.garments), group.settings
+    moved = given.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
+    known = None if settings.temporal == "off" else last
+    reset = {"frames": group.moving_frames, "finest": group.levels[-1], "reset": settings.reset}
+    start = start_of(known, cage, **reset, moved=moved)
+    contact = group.contact(given, cage, target=start.detailed)
+    before = None if last is None else last.about(cage.origin)
+    if contact is not None and last is not None and last.clean and before is not None:
+        contact.at(group.levels[-1]).remember(before)
+    return Problem(
+        began,
+        group,
+        given,
+        cage,
+        aim=cage.points if contact is None else contact.aim,
+        forces=forces,
+        contact=contact,
+        start=start,
+        walked=None if given.walked is None else group.tensor(given.walked - cage.origin),
+        before=before,
+        tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
+    )

@@ -1,0 +1,229 @@
+"""Frames in, states out: the frames of a scene in order, each started from the last one where that helps."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..contact.bodies import Touching
+from ..contact.passed import Passed
+from ..deadline import ends_after
+from ..mesh.subdivide import Refinement
+from ..scene import Frame, Scene, State, refuse_far
+from .group import Group
+from .history import Kept
+from .scene_cloth import SceneCloth
+from .scene_frame import SceneFrame
+from .settings import SolveSettings
+
+LIMIT, LEAST_LIMIT, LIMIT_PER_VERTEX = 20.0, 120.0, 0.01
+"""A frame stops where it stands after so many times the median of the shot's frames, but never before so many seconds
+and so many a fine vertex: the slowest cold frames of the samples and shots take 0.6 ms a vertex on one core, and the
+first frame of a machine may compile kernels, some 15 s. No ordinary frame is to end by the clock."""
+
+
+class Refiner:
+    """Refines the frames of one scene in order.
+
+    Garments that cannot touch in a frame are solved apart, the others together.
+
+    Attributes:
+        scene: The scene.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: SolveSettings,
+        *,
+        levels: Sequence[int] | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
+        threads: int = 1,
+        heat_map: bool = False,
+    ) -> None:
+        """Subdivide the garments.
+
+        Args:
+            scene: The scene.
+            settings: How to solve.
+            levels: Subdivisions of each garment; the garments' own when None.
+            dtype: Scalar type of the solve.
+            device: "cpu" or a CUDA device.
+            threads: Most threads that a kernel uses on the CPU; the result does not depend on it.
+            heat_map: Whether states hold a heat map.
+
+        Raises:
+            GarmentError: A rest shape cannot be solved on.
+        """
+        chosen = levels if levels is not None else [garment.level for garment in scene.garments]
+        self._cloth = SceneCloth(scene, chosen, dtype=dtype, device=device, threads=threads)
+        self._passed = Passed(scene.garments, scene.colliders, device=device, threads=threads)
+        self.scene, self._settings, self._heat_map = scene, settings, heat_map
+        self._kept = (Kept(),) * len(scene.garments)
+        self._time: float | None = None
+        self._walked: tuple[Sequence[np.ndarray | None], float] | None = None
+        self._seconds: list[float] = []  # What frames took that came to their end.
+
+    @property
+    def refinements(self) -> list[tuple[Refinement, ...]]:
+        """The subdivisions of each garment, coarsest first."""
+        return self._cloth.refinements
+
+    @property
+    def groups(self) -> list[Group]:
+        """A group for each garment alone, in the order of the garments."""
+        return [self.group_of((index,)) for index in range(len(self.scene.garments))]
+
+    def group_of(self, part: tuple[int, ...]) -> Group:
+        """The group of garments solved together, built when first asked for."""
+        return self._cloth.group(part, self._settings)
+
+    def forget(self) -> None:
+        """Start the next frame cold, as if it were the first."""
+        self._passed.forget()
+        self._cloth.bodies.forget()
+        self._kept, self._time, self._walked = (Kept(),) * len(self._kept), None, None
+
+    def begin_at(self, cages: Refiner, *, since: float) -> None:
+        """Start the first frame, where it is cold, with the cage that another refiner walked to it.
+
+        Args:
+            cages: A refiner of the same scene that does not subdivide, and has solved that frame.
+            since: The time code from which it walked, for the report.
+        """
+        self._walked = [None if each.last is None else each.last.points for each in cages._kept], since
+
+    def use(self, settings: SolveSettings) -> None:
+        """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
+        self._settings = settings
+        self.forget()
+
+    def fork(self, settings: SolveSettings) -> Refiner:
+        """A refiner that goes on from this one's last frame in another way; levels, metrics and bodies are shared."""
+        other = copy(self)
+        other._settings = settings
+        return other
+
+    def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
+        """Numbers of the garments that are solved together in a frame."""
+        return self._cloth.parts_of(frame, self._settings)
+
+    def touching(self, part: tuple[int, ...], frame: Frame) -> tuple[Touching, ...]:
+        """The surfaces that garments solved together may touch in a frame."""
+        self._cloth.bodies.pose(frame.colliders)
+        frames = [frame.garments[index] for index in part]
+        return self._cloth.touching(part, frames, self._cloth.near(part, frames, self._settings))
+
+    def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
+        """Solve frames in order, one state a frame.
+
+        Raises:
+            SolveError: A term of the potential is not finite.
+        """
+        for frame in frames:
+            yield self.solve(frame)
+
+    def solve(self, frame: Frame, wanted: Sequence[bool] | None = None) -> State:
+        """Solve one frame, starting from the last one solved where that helps.
+
+        Args:
+            frame: The frame.
+            wanted: For each garment, whether it is asked for; all when None.
+
+        Garments that could not be solved follow their cages, where others could.
+
+        Raises:
+            GarmentError: A position is out of bounds.
+            SolveError: No garment could be solved: a term of the potential is not finite, or cloth left its cage.
+        """
+        began = clock.perf_counter()
+        with ends_after(self._limit):
+            state = self._solve(frame, wanted)
+        if not any("time_limit" in entry for entry in state.telemetry):
+            self._seconds.append(clock.perf_counter() - began)
+        return state
+
+    @property
+    def _limit(self) -> float:
+        """Seconds after which a frame stops where it stands."""
+        if self._settings.frame_limit is not None:
+            return self._settings.frame_limit
+        count = sum(chain[-1].mesh.vertex_count for chain in self.refinements if chain)
+        return max(LEAST_LIMIT + LIMIT_PER_VERTEX * count, LIMIT * median(self._seconds or [0.0]))
+
+    def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> State:
+        refuse_far(self.scene, frame)
+        gap = self._is_gap(frame.time)
+        if gap:
+            self._passed.forget()
+        if self._settings.temporal == "off":  # A frame by itself is a function of that frame alone, to the bit.
+            self._cloth.bodies.forget()
+        self._cloth.bodies.pose(frame.colliders)
+        count = len(frame.garments)
+        asked = [True] * count if wanted is None else list(wanted)
+        now = {"gap": gap, "walked": self._walked, "limit": self._limit}
+        answers, reused = SceneFrame(self._cloth, self._settings, frame, self._kept, **now).solve(asked)
+        self._kept = tuple(answers[index].kept if index in answers else self._kept[index] for index in range(count))
+        self._time, self._walked = frame.time, None
+        points = [answers[index].points if index in answers and asked[index] else None for index in range(count)]
+        absent: dict[str, object] = {"start": "left out: the garment has no sample here"}
+        telemetry = [absent if points[index] is None else answers[index].telemetry for index in range(count)]
+        for index, passed in enumerate(self._passed.look(frame)):
+            telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
+        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
+
+    def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
+        """Energy [J] of all garments at given world positions [m], what touches there found anew."""
+        refuse_far(self.scene, frame)
+        total = 0.0
+        for part in self.parts_of(frame):
+            frames, x = [frame.garments[index] for index in part], [points[index] for index in part]
+            total += sum(self.group_of(part).energies(frames, x, self.touching(part, frame)).values())
+        return total
+
+    def moved_safely(
+        self, frame: Frame, start: Sequence[np.ndarray | None], wanted: Sequence[np.ndarray | None]
+    ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
+        """Move cloth as near to wanted positions as nothing newly crosses on the way, and out of bodies; no solve.
+
+        Args:
+            frame: The frame.
+            start: Where each garment is, world positions [m], shape (V_fine, 3).
+            wanted: Where it is to go, the same; those that are solved together with one of None are taken as they are.
+
+        Returns:
+            For each garment its positions, and what touches and crosses there as telemetry has it: empty where nothing
+            may.
+        """
+        refuse_far(self.scene, frame)
+        found: list[tuple[np.ndarray | None, dict[str, Any]]] = [(each, {}) for each in wanted]
+        for part in self.parts_of(frame):
+            sides = [[each for each in (side[index] for index in part) if each is not None] for side in (start, wanted)]
+            if all(len(side) == len(part) for side in sides):
+                frames = [frame.garments[index] for index in part]
+                touching = self.touching(part, frame)
+                moved, contact = self.group_of(part).moved_safely(frames, *sides, touching=touching)
+                for index, each in zip(part, moved, strict=True):
+                    found[index] = each, contact
+        return found
+
+    def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
+        """A garment's heat map, where it has positions [m]."""
+        kept = self._kept[index]
+        crossing = kept.last.crossing if kept.solved and kept.last is not None else None
+        return None if points is None else self._cloth.heat(index, points, crossing)
+
+    def _is_gap(self, time: float | None) -> bool:
+        """Whether the time since the last frame is too long to start from it."""
+        times = self.scene.times
+        if time is None or self._time is None or len(times) < 2:
+            return False
+        return time - self._time > self._settings.reset.gap * median(np.diff(times).tolist())

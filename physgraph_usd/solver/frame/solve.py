@@ -1,0 +1,191 @@
+"""One frame, from a cage to fine cloth: begin, descend level by level with safe moves, scale the detail, report.
+
+`solve_frame` is the way of every frame, cold or warm. Each level begins at what the one below found, untangles what
+crosses there, and makes rounds: what is near is detected, the integrator steps, and cloth moves as far as nothing newly
+crosses.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from ...errors import SolveError
+from ..contact.frame import LevelContact
+from ..contact.metric import SMOOTH, HeldMetric
+from ..deadline import is_over
+from ..forces.base import ForceModule
+from ..integrate.base import Carry, System
+from ..integrate.saddle import leave_saddle
+from ..integrate.solve import Budget, LevelReport, descend, solve_level
+from ..level import Placed, unhindered
+from .choice import choose
+from .group import Group
+from .level_forces import blame
+from .outcome import measured, refuse_swallowed, scaled, state_left, telemetry_of
+from .problem import LevelProblem, begin
+from .values import FrameInput, Solved, State
+
+STEPS, LONGEST = 4, 16
+"""Steps of a round where something is near, and where nothing is: then pairs are found anew."""
+MOST, TOUCHING = 40, 3
+"""Steps of a level where something touches: so many times the budget's, but no more than the first, or the budget's."""
+NEAR = 10.0
+"""Tolerances of remaining move under which a warm frame makes no more steps than its budget has."""
+UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
+"""Most rounds that untangle what crosses: from cold at the cage, and in a warm frame."""
+HALVINGS = 4
+"""How often a step is halved on which cloth that is blocked raises the energy, before all of it stays."""
+
+
+def solve_frame(group: Group, given: FrameInput, last: State | None) -> Solved:
+    """Solve one frame.
+
+    Args:
+        group: Garments that are solved together.
+        given: The frame.
+        last: What the last frame left, or None for a cold start.
+
+    Raises:
+        SolveError: A term of the potential is not finite, or cloth lies wholly in a body.
+    """
+    problem = begin(group, given, last)
+    refuse_swallowed(problem)
+    prepared = time.perf_counter()
+    try:
+        choice = choose(problem, group.settings.method.nested)
+        x, reports, module = None, list[LevelReport](), ForceModule(())
+        for index in problem.levels(nested=choice.nested):
+            level = problem.level(index, steps=choice.steps, integrator=group.integrator(learned=choice.learned))
+            x, made, module = solve_one_level(level, *problem.begun(index, x))
+            if index < problem.finest:
+                made[-1].energies = module.energies(x)
+            reports += made
+    except SolveError as error:
+        broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=given.at)
+        raise SolveError(broken) from error
+    assert x is not None
+    shown, left, finish = scaled(problem, x), state_left(problem, x), dict[str, object]()
+    if problem.contact is not None:
+        shown, finish = problem.contact.finish(shown)
+    solved = time.perf_counter()
+    telemetry = telemetry_of(problem, shown, module, reports=reports, choice=choice)
+    contact, crossing = measured(problem, shown)
+    telemetry |= {"contact": contact | finish} if contact else {}
+    marks = (problem.began, prepared, solved, time.perf_counter())
+    pairs = zip(("prepare", "solve", "measure"), marks, marks[1:], strict=False)
+    telemetry["milliseconds"] = {name: round(1e3 * (end - start), 3) for name, start, end in pairs}
+    points, spans = group.followers.placed(shown, problem.cage.origin, problem.cage.world), group.levels[-1].spans
+    return Solved([points[span] for span in spans], left, telemetry, [crossing[span] for span in spans])
+
+
+def solve_one_level(
+    problem: LevelProblem, x: Tensor, smoothing: Tensor | None
+) -> tuple[Placed, list[LevelReport], ForceModule]:
+    """Solve a level, in rounds where something may touch.
+
+    Args:
+        problem: The level.
+        x: Where it begins [m], shape (V, 3).
+        smoothing: The move that takes a coarser mesh's facets out of a cold start [m]; None in a warm frame.
+
+    Returns:
+        Final positions [m], a report a round, and the terms at the end.
+    """
+    level, view, budget = problem.level, problem.view, problem.budget
+    if view is None:
+        x = x if smoothing is None else leave_saddle(problem.alone, level, x + smoothing, outward=problem.outward)
+        x, report = solve_level(problem.alone, problem.integrator, x, level=level.index, budget=budget)
+        return unhindered(x), [report], problem.module
+    x, reports = _untangle(problem, view, view.begun(x))
+    if smoothing is not None:
+        x = view.moved(x, x + smoothing) if level.index else x
+        view, terms = view.terms(x)
+        x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
+    carry, last, terms, pairs, made, touched = None, None, (), None, 0, False
+    while not made or made < _most_steps(budget, reports[-1], touched=touched):
+        pairs = view.listed(x, pairs)
+        view, terms = view.terms(x, listed=pairs)
+        touched |= bool(terms)
+        system = problem.system(view, terms, x, last=last)
+        resume = carry if last is not None and system.shares_metric(last) else None
+        of_round = _round_budget(budget, system, first=not made, steps=STEPS if terms else LONGEST)
+        carry, report = descend(system, problem.integrator, x, level=level.index, budget=of_round, resume=resume)
+        report.remaining_move = _smooth_move(system, carry, report)
+        reports.append(report)
+        made += report.steps
+        wanted = carry.x
+        x, last = _safe_step(partial(view.moved, listed=pairs), system, x, wanted), system
+        blocked = x is not wanted
+        if _is_last(report, blocked=blocked) or (smoothing is None and _is_near(report, budget, made)):
+            break
+        if blocked:  # Corrections of the guard were made for other positions.
+            carry = None if carry.setbacks else replace(carry, x=x)
+    return x, reports, ForceModule((*problem.module.forces, *terms))
+
+
+def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Placed, list[LevelReport]]:
+    """Rounds of few steps in which contours shorten, at the cage and where the last level or frame left any."""
+    level, budget = problem.level, problem.budget
+    cold, start = level.index == 0, x
+    x = view.laid_back(x) if cold else x
+    reports: list[LevelReport] = []
+    short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0)
+    while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
+        if is_over() or not view.comes_apart(x, order=cold):
+            break
+        view, terms = view.terms(x, order=cold)
+        system = problem.system(view, terms, x)
+        wanted, report = solve_level(system, problem.integrator, x, level=level.index, budget=short)
+        x = _safe_step(view.drawn if cold else view.moved, system, x, wanted)
+        reports.append(report)
+    return view.without_hope(x, start) if cold else x, reports
+
+
+def _safe_step(move: Callable[[Placed, Tensor], Placed], system: System, x: Placed, wanted: Tensor) -> Placed:
+    """Where a safe move towards what is wanted ends [m]; a shorter one where blocked cloth raises the energy."""
+    moved = move(x, wanted)
+    if moved is wanted:
+        return moved
+    energy = system.energy_and_force(x)[0]
+    most = energy + torch.finfo(x.dtype).eps * abs(energy)
+    for _ in range(HALVINGS):
+        if system.energy_and_force(moved)[0] <= most:
+            return moved
+        wanted = x + 0.5 * (wanted - x)
+        moved = move(x, wanted)
+    return moved if system.energy_and_force(moved)[0] <= most else x
+
+
+def _most_steps(budget: Budget, report: LevelReport, *, touched: bool) -> int:
+    """How many steps a level makes, by its last round's report: more where something touches or it is far from rest."""
+    most = budget.steps + budget.extra * budget.is_far(report.remaining_move)
+    return max(most, min(MOST, TOUCHING * budget.steps)) if touched else most
+
+
+def _is_last(report: LevelReport, *, blocked: bool) -> bool:
+    """Whether no round follows one of this report; it does where one that settled was blocked."""
+    return report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not blocked)
+
+
+def _is_near(report: LevelReport, budget: Budget, made: int) -> bool:
+    """Whether a warm frame has made its steps and is near enough to rest."""
+    return made >= budget.steps and report.remaining_move < NEAR * budget.tolerance
+
+
+def _round_budget(budget: Budget, system: System, *, first: bool, steps: int) -> Budget:
+    """The budget of a round: what a contact's metric calls a small move is that much smaller."""
+    shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
+    rest = budget.rest if first else 1.0
+    return replace(budget, steps=min(steps, budget.steps), extra=0, tolerance=shrunk * budget.tolerance, rest=rest)
+
+
+def _smooth_move(system: System, carry: Carry, report: LevelReport) -> float:
+    """The remaining move of the smooth part at the end of a round, in local edge lengths."""
+    held = system.metric.held(carry.force) if isinstance(system.metric, HeldMetric) else None
+    return report.remaining_move if held is None else system.remaining_move(held)
