@@ -22,10 +22,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from physgraph_usd import cli, errors
-from physgraph_usd.cli.options import INTEGRATORS
 from physgraph_usd.cli.printing import Saying
 from physgraph_usd.cli.refine import refine
 from physgraph_usd.errors import counted
+from physgraph_usd.shot.options import INTEGRATORS
 from physgraph_usd.shot.report import RefineReport
 
 pytest.importorskip("pxr", reason="the commands read stages with usd-core")

@@ -15,22 +15,21 @@ from ..errors import UsageError
 from ..shot.plain_json import to_json
 from ..solver.fabric import PRESETS
 from .options import (
-    asset_paths_option,
-    collider_option,
     config_option,
-    garment_option,
     json_option,
+    of_field,
     out_option,
     overwrite_option,
     scene_options,
     shot_argument,
-    tag_collider_option,
 )
 from .printing import outline, tell
 from .refine import refine
 from .show_file import values_for
 from .structure import DONE, FAILED, imports_uncollected
 from .types import FrameRange, PictureSize
+
+PRIMS = "Prim path, glob or collection; repeatable."
 
 
 @click.command()
@@ -90,12 +89,12 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 @click.command()
 @shot_argument
 @out_option("OUT", "Layer to write.")
-@garment_option
-@tag_collider_option
+@of_field("garments", help=PRIMS)
+@of_field("colliders", help=PRIMS, metavar="PATH")
 @click.option("--preset", metavar="FABRIC", help=f"Fabric of the garments: {', '.join(PRESETS)}.")
 @click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
 @click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
-@asset_paths_option
+@of_field("asset_paths")
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
     """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
@@ -108,8 +107,8 @@ def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str
 @click.command()
 @shot_argument
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Layer to save into.  [default: SHOT.tuned.usda]")
-@garment_option
-@collider_option
+@of_field("garments")
+@of_field("colliders")
 @click.option("--port", type=int, default=8080, help="Port on this machine; the next free one where it is taken.")
 @overwrite_option
 def tune(shot: str, *, port: int, **options: Any) -> None:

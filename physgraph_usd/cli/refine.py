@@ -14,16 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import LayerError, PhysGraphError, UsageError, counted
-from .options import (
-    farm_options,
-    file_options,
-    layer_options,
-    out_option,
-    run_options,
-    said_options,
-    scene_options,
-    solve_options,
-)
+from .options import HEADINGS, out_option, run_options, together, under
 from .printing import LOGGER, Saying, say
 from .show_file import values_for
 from .structure import FAILED, GroupedCommand, imports_uncollected
@@ -57,13 +48,8 @@ Job = tuple[str, Path, "RefineOptions"]
 @click.command(cls=GroupedCommand, context_settings={"token_normalize_func": lambda name: RENAMED.get(name, name)})
 @click.argument("shots", nargs=-1, required=True, metavar="SHOT...", type=click.Path(dir_okay=False))
 @out_option("OUT", "Layer to write, or a folder.")
-@file_options
-@scene_options
-@solve_options
-@layer_options
+@together(*map(under, HEADINGS))
 @run_options
-@farm_options
-@said_options
 @click.pass_context
 def refine(
     ctx: click.Context, shots: tuple[str, ...], out: Path, *, summary: Path | None, dry_run: bool, **options: object

@@ -69,7 +69,7 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
         return None
     if not is_result_of(out, wanted, settled=options.strict):
         return None
-    return taken_as_done(RefineReport(str(shot), None, options.plain(), options.told_sources()), out)
+    return taken_as_done(RefineReport(str(shot), None, options.plain(), options.value_sources()), out)
 
 
 def skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
@@ -77,7 +77,7 @@ def skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport
     if not options.skip_existing or not out.is_file():
         return None
     LOG.info("skipped: %s is there", out, extra={"shot": str(shot)})
-    return RefineReport(str(shot), out, options.plain(), options.told_sources(), skipped=True)
+    return RefineReport(str(shot), out, options.plain(), options.value_sources(), skipped=True)
 
 
 def may_be_done(out: Path, options: RefineOptions) -> bool:

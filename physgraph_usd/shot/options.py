@@ -1,4 +1,4 @@
-"""Everything that `refine_shot` can be told, and what it refuses.
+"""The options of a refine, each said once: `RefineOptions` is also what the command line and a show's file are made of.
 
 The solver is imported where it is needed: what a batch has finished before is passed over without it.
 """
@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,119 +21,161 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 """The integrator that is chosen frame by frame; always known."""
-TEMPORAL = ("tether", "warm", "off")
-POTENTIALS = ("continuum", "paper")
-MODES = ("over", "sibling")
+INTEGRATORS = (
+    AUTO, "quasi-newton", "quasi-newton-flat", "lbfgs", "adam", "gd", "newton", "physgraph", "physgraph-paper",
+)  # fmt: skip
+"""Names of `integrate.METHODS`, which imports torch."""
 CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
-"""Forms of contact by their names on the command line."""
+SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
+"""Forms of contact, with bodies and of cloth with cloth, by their names on the command line."""
 REPORT_NAME, PAGE_NAME = "report.json", "report.html"
 """Names of the report and its page in a folder of their own."""
-SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
-"""Forms of contact of cloth with cloth by their names on the command line."""
-_NOT_OF_THE_RESULT = {
-    "progress", "report", "overwrite", "dry_run", "workers", "root", "asset_paths", "resume", "keep_frames", "strict",
-    "skip_existing", "sources", "scheduler",
-}  # fmt: skip
+LIST = "; repeatable"
+
+
+@dataclass(frozen=True)
+class Option:
+    """What is known of one of the options beside its name, type and default.
+
+    Attributes:
+        heading: Under which the command line's help shows it; "" for one that Python alone has.
+        help: What it does; for the help and for `RefineOptions`.
+        flag: Its name on the command line where that is not the field's.
+        metavar: What the help shows for its value.
+        choices: All values that it may have; empty for any.
+        least: Its least value, or None.
+        above: What it must be above, or None.
+        result: Whether the layer depends on it.
+    """
+
+    heading: str
+    help: str
+    flag: str = ""
+    metavar: str | None = None
+    choices: Sequence[str] = ()
+    least: int | None = None
+    above: int | None = None
+    result: bool = True
+
+
+def _option(heading: str, default: Any, help_text: str, **known: Any) -> Any:
+    """A field of `RefineOptions`."""
+    return dataclasses.field(default=default, metadata={"option": Option(heading, help_text, **known)})
+
+
+_scene, _solver, _layer = (partial(_option, heading) for heading in ("Scene", "Solver", "Layer"))
+_files = partial(_option, "Files", result=False)
+_batch = partial(_option, "Several shots, and runs that were interrupted", result=False)
+_farm = partial(_option, "Many machines")
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Everything that `refine_shot` can be told.
+    """Everything that `refine_shot` can be told."""
 
-    Attributes:
-        frames: First and last time code, or None for all of the shot.
-        garments: Prim paths, globs or collections; empty finds applied schemas.
-        colliders: Prim paths, globs or collections; "auto" for what the shot names and closed meshes that garments
-            touch; empty finds applied schemas.
-        level: Subdivisions; -1 chooses, None takes the stage's.
-        integrator: A name of `integrate.METHODS`.
-        weights: Weights for a learned integrator in place of those that ship, or None.
-        steps: Most steps at the finest level.
-        tolerance: Stop when the cloth would move less than this, RMS, in local edge lengths.
-        budget_ms: Milliseconds a frame, or None.
-        frame_limit: Seconds after which a frame stops where it stands, as one that did not settle; None for 20 times
-            what the shot's frames take, never under two minutes.
-        device: "cpu" or "cuda".
-        overrides: "</Prim>.attribute=value" or "attribute=value", as ``--set`` takes them.
-        mode: "over" or "sibling".
-        temporal: "tether", "warm" or "off": how a frame uses the last one.
-        potential: "continuum" or "paper".
-        contact: Against bodies: "quadratic", "paper" (its linear form) or "off".
-        self_contact: Of cloth with cloth: "auto" (where parts come near one another), "paper" (its spheres) or "off".
-        workers: Processes that share the frames; with a scheduler, tasks.
-        preroll: Frames solved before ``frames`` and no samples: the layer is a chunk, which `stitch` joins to others.
-            None for a layer by itself.
-        scheduler: Address of a Dask scheduler whose workers solve the frames, or None.
-        report: JSON file to write, or a folder for it and a page, or None.
-        overwrite: Replace files that exist.
-        dry_run: Read and check everything, write nothing.
-        resume: Go on from the finished frames of a run that was interrupted, in ``<layer>.frames``; a layer that the
-            same run has finished is left as it is.
-        skip_existing: Leave a shot whose layer is there already as it is.
-        keep_frames: Leave finished frames there when the run is interrupted.
-        velocities: Also write point velocities of garments that have none in the shot.
-        heat_map: Also write how deep each vertex is in bodies, and what crosses, as primvars.
-        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
-        root: A .usda to write that lays the new layer over the shot, or None.
-        strict: Count a shot with frames that did not settle as done in part.
-        asset_paths: "relative" or "absolute": how the layer and the root name other files.
-        progress: Called with (frames done, frames in all), or None.
-        sources: Where values are from, by the option's name, for the report: "command line" or a file.
-    """
-
-    frames: tuple[float, float] | None = None
-    garments: Sequence[str] = ()
-    colliders: Sequence[str] = ()
-    level: int | None = None
-    integrator: str = AUTO
-    weights: Path | None = None
-    steps: int = 12
-    tolerance: float = 2e-3
-    budget_ms: float | None = None
-    frame_limit: float | None = None
-    device: str = "cpu"
-    overrides: Sequence[str] = ()
-    mode: str = "over"
-    temporal: str = "tether"
-    potential: str = "continuum"
-    contact: str = "quadratic"
-    self_contact: str = "auto"
-    workers: int = 1
-    preroll: int | None = None
-    scheduler: str | None = None
-    report: Path | None = None
-    overwrite: bool = False
-    dry_run: bool = False
-    resume: bool = False
-    skip_existing: bool = False
-    keep_frames: bool = True
-    velocities: bool = False
-    heat_map: bool = False
-    rest_frame: float | str | None = None
-    root: Path | None = None
-    strict: bool = False
-    asset_paths: str = "relative"
-    progress: Callable[[int, int], None] | None = None
-    sources: Mapping[str, str] = field(default_factory=dict)
+    frames: tuple[float, float] | None = _scene(None, "First and last time code to refine.  [default: all of the shot]")
+    garments: Sequence[str] = _scene(
+        (), f"Prim path, glob or collection{LIST}.  [default: what has the schema]", flag="garment", metavar="PATH"
+    )
+    colliders: Sequence[str] = _scene(
+        (),
+        f"Prim path, glob or collection; auto: what the shot names and closed meshes that garments touch{LIST}.",
+        flag="collider",
+        metavar="PATH|auto",
+    )
+    level: int | None = _scene(
+        None,
+        "Subdivisions; each makes four faces of one; auto (in Python -1) chooses.  [default: each garment's own]",
+        metavar="N|auto",
+    )
+    integrator: str = _solver(AUTO, f"How forces become displacements: {', '.join(INTEGRATORS)}.", metavar="NAME")
+    weights: Path | None = _solver(None, "Weights for a learned integrator.", metavar="FILE")
+    steps: int = _solver(12, "Most steps at the finest level.", metavar="N", least=0)
+    tolerance: float = _solver(
+        2e-3, "Stop when the cloth would move less, RMS, in local edge lengths.", metavar="T", least=0
+    )
+    budget_ms: float | None = _solver(None, "Stop after this time per frame.", metavar="MS", above=0)
+    frame_limit: float | None = _solver(
+        None,
+        "A frame that takes longer stops where it stands and counts as not settled.  [default: 20 times what the "
+        "shot's frames take, never under two minutes]",
+        metavar="SECONDS",
+        above=0,
+    )
+    device: str = _solver("cpu", "Where to compute.", metavar="cpu|cuda")
+    overrides: Sequence[str] = _scene(
+        (),
+        f"Override an attribute, such as bendStiffness=2e-4 for all garments{LIST}.",
+        flag="set",
+        metavar="PRIM.ATTR=VALUE",
+    )
+    mode: str = _layer("over", "Refine in place, or beside the coarse mesh.", choices=("over", "sibling"))
+    temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
+    potential: str = _solver("continuum", "Which form of the energy.", choices=("continuum", "paper"))
+    contact: str = _solver("quadratic", "How bodies push the cloth; paper: linearly.", choices=tuple(CONTACTS))
+    self_contact: str = _solver(
+        "auto", "How cloth pushes cloth; auto: by pairs; paper: by spheres.", choices=tuple(SELF_CONTACTS)
+    )
+    workers: int = _solver(
+        1,
+        "Processes, each beginning 6 frames early; of several shots, so many at a time; with --scheduler, chunks.",
+        metavar="N",
+        least=1,
+        result=False,
+    )
+    preroll: int | None = _farm(
+        None,
+        "Write --frames as a chunk for stitch, which joins it to the one before over the N frames before it.",
+        metavar="N",
+        least=0,
+    )
+    scheduler: str | None = _farm(
+        None, "Solve on the workers of this Dask scheduler (extra farm).", metavar="ADDRESS", result=False
+    )
+    report: Path | None = _files(
+        None, "Write what was done, or what failed; DIR: as a page too.", metavar="FILE.json|DIR"
+    )
+    overwrite: bool = _files(False, "Replace files that exist.")
+    dry_run: bool = _files(False, "Print what would be done; write nothing.")
+    resume: bool = _batch(False, "Go on from the frames and layers that an interrupted run finished.")
+    skip_existing: bool = _batch(False, "Leave a shot whose layer is there.")
+    keep_frames: bool = _batch(True, "Leave finished frames when interrupted.")
+    velocities: bool = _layer(False, "Write point velocities even where the shot has none.")
+    heat_map: bool = _layer(False, "Also write depth inside bodies and crossings as primvars.")
+    rest_frame: float | str | None = _scene(
+        None,
+        "Rest shape: this frame, or fitted to all.  [default: each garment's own]",
+        flag="rest",
+        metavar="FRAME|auto",
+    )
+    root: Path | None = _files(None, "Also write a .usda with the layer over the shot.")
+    strict: bool = _layer(
+        False, "Exit with 3 where a frame did not settle or over a tenth of what crossed is left.", result=False
+    )
+    asset_paths: str = _layer("relative", "How files written name other files.", choices=ASSET_PATHS, result=False)
+    progress: Callable[[int, int], None] | None = _option(
+        "", None, "Called with the number of frames done and of all frames.", result=False
+    )
+    sources: Mapping[str, str] = dataclasses.field(
+        default_factory=dict,
+        metadata={"option": Option("", "Where values are from, by name: command line or a file.", result=False)},
+    )
 
     def plain(self) -> dict[str, Any]:
         """The options that decide the result, ready for JSON."""
-        names = {f.name for f in dataclasses.fields(self)} - _NOT_OF_THE_RESULT
+        names = {name for name, option in OPTIONS.items() if option.result}
         # A layer without these is as it was before there were any.
-        names -= {
-            name
-            for name in ("heat_map", "weights", "preroll")
-            if getattr(self, name) is None or getattr(self, name) is False
-        }
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
+        later = ("heat_map", "weights", "preroll")
+        names -= {name for name in later if getattr(self, name) is None or getattr(self, name) is False}
+        values = {name: getattr(self, name) for name in OPTIONS if name in names}
         if self.weights:
             from ..solver.integrate.weights import weights_hash
 
             values["weights"] = {"file": str(self.weights), "sha256": weights_hash(self.weights)}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
-    def told_sources(self) -> dict[str, str]:
-        """Where the value of each option that decides the result is from: as told, "default", or "given" to Python."""
+    def value_sources(self) -> dict[str, str]:
+        """Where each option that decides the result is from: "command line", a file, "default", or "given" (Python)."""
         fields = {f.name: f for f in dataclasses.fields(self)}
         return {
             name: self.sources.get(name, "default" if getattr(self, name) == fields[name].default else "given")
@@ -173,26 +216,10 @@ class RefineOptions:
             from ..solver.integrate import method_named
 
             method_named(self.integrator, self.weights)
-        for name, value, known in (
-            ("temporal", self.temporal, TEMPORAL),
-            ("potential", self.potential, POTENTIALS),
-            ("mode", self.mode, MODES),
-            ("contact", self.contact, tuple(CONTACTS)),
-            ("self contact", self.self_contact, tuple(SELF_CONTACTS)),
-            ("asset paths", self.asset_paths, ASSET_PATHS),
-        ):
-            if value not in known:
-                raise UsageError(f"unknown {name} '{value}'; known: {', '.join(known)}")
+        for name, option in OPTIONS.items():
+            _check(name.replace("_", " "), getattr(self, name), option)
         if self.skip_existing and self.overwrite:
             raise UsageError("skip existing leaves layers that are there, overwrite replaces them; choose one")
-        if self.workers < 1 or self.steps < 0 or not self.tolerance >= 0:
-            raise UsageError("workers must be at least 1, steps and tolerance at least 0")
-        if self.preroll is not None and self.preroll < 0:
-            raise UsageError(f"pre-roll of {self.preroll} frames: give 0 or more")
-        if self.budget_ms is not None and not self.budget_ms > 0:
-            raise UsageError(f"budget of {self.budget_ms:g} ms: give a time above 0")
-        if self.frame_limit is not None and not self.frame_limit > 0:
-            raise UsageError(f"frame limit of {self.frame_limit:g} s: give a time above 0")
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
 
@@ -206,6 +233,22 @@ class RefineOptions:
             files.append(("the report", report))
             files += [("the report's page", report.with_name(PAGE_NAME))] if report != self.report else []
         return files
+
+
+OPTIONS: dict[str, Option] = {each.name: each.metadata["option"] for each in dataclasses.fields(RefineOptions)}
+"""What is known of each option, by its field."""
+RefineOptions.__doc__ = f"{RefineOptions.__doc__}\n\nAttributes:\n" + "\n".join(
+    f"    {name}: {option.help}" for name, option in OPTIONS.items()
+)
+
+
+def _check(name: str, value: Any, option: Option) -> None:
+    if option.choices and value not in option.choices:
+        raise UsageError(f"unknown {name} '{value}'; known: {', '.join(option.choices)}")
+    if option.least is not None and value is not None and not value >= option.least:
+        raise UsageError(f"{name} is {value:g}: give {option.least} or more")
+    if option.above is not None and value is not None and not value > option.above:
+        raise UsageError(f"{name} is {value:g}: give a value above {option.above}")
 
 
 def json_of(report: Path) -> Path:

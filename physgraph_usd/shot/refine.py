@@ -141,7 +141,7 @@ def _run(
     on_report: Callable[[RefineReport], None] | None = None,
 ) -> Iterator[tuple[Shot, RefineReport]]:
     """Open a shot and begin its report; a run that fails or is interrupted writes it where it was asked for."""
-    report = RefineReport(shot_name(shot), None, options.plain(), options.told_sources())
+    report = RefineReport(shot_name(shot), None, options.plain(), options.value_sources())
     began = clock.perf_counter()
     try:
         with signals_raise(), memory_is_named(), closing(_open(shot, options)) as opened:
