@@ -18,8 +18,7 @@ import torch
 
 from benchmarks.rows import Found, Row, run_alone, table
 from benchmarks.shots import CORES, frames_of, opened, problem_of
-from physgraph_usd.lab.chart.judge import Judgement
-from physgraph_usd.lab.chart.problem import COLD, Problem, with_garments
+from physgraph_usd.lab.chart.problem import COLD, Judgement, Problem, with_garments
 from physgraph_usd.usd.read.reader import Shot
 
 SAMPLE, TIME = "armpit", 15.0

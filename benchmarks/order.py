@@ -19,9 +19,10 @@ from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
+from physgraph_usd.lab.chart.measure import JUDGED
 from physgraph_usd.lab.chart.options import ChartOptions
 from physgraph_usd.lab.chart.run import chart_shot
-from physgraph_usd.lab.chart.table import JUDGED, TOLERANCE
+from physgraph_usd.lab.chart.table import TOLERANCE
 from physgraph_usd.lab.samples import write_sample
 
 from .rows import say, table

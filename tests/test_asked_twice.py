@@ -14,7 +14,7 @@ from bodies import ball
 from cloth import DOWN, FABRIC, settings_of
 from folds import crumpled, frame_with, named, square
 
-from physgraph_usd.lab.chart.judge import judge
+from physgraph_usd.lab.chart.problem import judge
 from physgraph_usd.solver.colliders.pose import Collider
 from physgraph_usd.solver.contact.bodies import Touching
 from physgraph_usd.solver.contact.frame import FrameContact, LevelContact

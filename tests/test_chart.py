@@ -27,11 +27,18 @@ from shots import cloth_shot, refine
 from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.chart.journal import Journal
-from physgraph_usd.lab.chart.measure import FURTHER, allowance, expected_ms, rungs
-from physgraph_usd.lab.chart.methods import DEFAULT, SMOOTH, UPSAMPLED, find_curves
-from physgraph_usd.lab.chart.options import LONG, SHORT, ChartOptions
+from physgraph_usd.lab.chart.measure import (
+    DEFAULT,
+    FURTHER,
+    SMOOTH,
+    UPSAMPLED,
+    allowance,
+    budgets_of,
+    expected_ms,
+    find_curves,
+)
+from physgraph_usd.lab.chart.options import LONG, SHORT, ChartOptions, make_plan
 from physgraph_usd.lab.chart.peers.run import PEERS, Peer, parse_peers
-from physgraph_usd.lab.chart.plan import make_plan
 from physgraph_usd.lab.chart.reference import Solutions
 from physgraph_usd.lab.chart.run import chart_shot
 from physgraph_usd.lab.chart.table import Chart, Point, typical
@@ -270,9 +277,9 @@ def test_every_integrator_is_found_when_the_chart_is_made(monkeypatch: pytest.Mo
 
 
 def test_budgets_grow_by_the_size_s_factor():
-    assert list(rungs(2.0))[:5] == [1, 2, 4, 8, 16]
-    assert list(rungs(4.0))[:4] == [1, 4, 16, 64]
-    assert list(rungs(1.5))[:8] == [1, 2, 3, 4, 6, 8, 12, 16]
+    assert list(budgets_of(2.0))[:5] == [1, 2, 4, 8, 16]
+    assert list(budgets_of(4.0))[:4] == [1, 4, 16, 64]
+    assert list(budgets_of(1.5))[:8] == [1, 2, 3, 4, 6, 8, 12, 16]
 
 
 @pytest.mark.parametrize(("gap", "times"), [(0.5, 1.0), (0.099, FURTHER), (0.031, FURTHER), (0.03, 1.0), (0.001, 1.0)])

@@ -13,7 +13,7 @@ pytest.importorskip("plotly", reason="charts are drawn with plotly")
 
 from shots import cloth_shot
 
-from physgraph_usd.lab.chart.methods import UPSAMPLED
+from physgraph_usd.lab.chart.measure import UPSAMPLED
 from physgraph_usd.lab.chart.options import ChartOptions
 from physgraph_usd.lab.chart.peers.run import PEERS
 from physgraph_usd.lab.chart.run import chart_shot

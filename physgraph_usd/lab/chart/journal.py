@@ -19,12 +19,7 @@ class Journal:
     """Rows of plain values, one a line, each written the moment it is known."""
 
     def __init__(self, folder: Path, problem: dict[str, Any], *, overwrite: bool) -> None:
-        """Open the rows of a folder.
-
-        Args:
-            folder: Where they lie.
-            problem: What was measured: rows of another problem are refused.
-            overwrite: Drop such rows instead.
+        """Open the rows of a folder; those of another problem are dropped where ``overwrite`` is set.
 
         Raises:
             UsageError: The folder holds the rows of another problem, or a row is damaged.

@@ -10,10 +10,9 @@ from plotly.io import to_html
 from plotly.subplots import make_subplots
 
 from ...shot.page.document import document, table
-from .methods import DEFAULT, SMOOTH, UPSAMPLED
-from .styles import Style, styles
-from .table import JUDGED, Chart
-from .words import FAR, changes, figures, percent, settings, title
+from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
+from .table import Chart
+from .words import FAR, Style, changes, figures, percent, settings, styles, title
 
 FLOOR = 1e-5
 TICKS = [1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001]
@@ -22,18 +21,13 @@ HOW = (
     "Every frame starts cold. Times are of preparing and solving a frame, the median of the faster half of {repeats} "
     "turns, in which all methods take one budget before any takes the next: what else a machine does only ever adds to "
     "a time. Reading and writing are left out. A budget is a number of steps at the finest level; a nested method may "
-    "take four times as many at each coarser one. Energies, strain and contact are judged in float64, by one ruler for "
+    "take four times as many at each coarser one. Energies, strain and contact are measured in float64, alike for "
     "all. Phi0 is plain upsampling's energy, Phi* the least that anybody found, from several starts."
 )
 
 
 def write_page(chart: Chart, file: Path) -> None:
-    """Write the page; it needs no network.
-
-    Args:
-        chart: The chart.
-        file: The file to write.
-    """
+    """Write the page of a chart; it needs no network."""
     figure = to_html(
         _figure(chart),
         full_html=False,
@@ -55,10 +49,10 @@ def _figure(chart: Chart) -> go.Figure:
         vertical_spacing=0.05,
         row_heights=[2.0, *[1.0] * (len(panels) - 1)],
     )
-    look = styles(chart)
+    style = styles(chart)
     for row, (field, words) in enumerate(panels.items(), start=1):
         for name in chart.methods:
-            figure.add_trace(_trace(chart, name, look[name], field=field, first=row == 1), row=row, col=1)
+            figure.add_trace(_trace(chart, name, style[name], field=field, first=row == 1), row=row, col=1)
         figure.update_yaxes(title_text=words, row=row, col=1)
     figure.update_xaxes(type="log", dtick=1, minor={"dtick": "D1", "showgrid": True})
     figure.update_xaxes(title_text="milliseconds a frame", row=len(panels), col=1)
@@ -75,7 +69,7 @@ def _figure(chart: Chart) -> go.Figure:
 
 def _trace(chart: Chart, name: str, style: Style, *, field: str, first: bool) -> go.Scatter:
     points = chart.curve(name)
-    said = ["<br>".join([settings(p), *figures(p, touches=bool(chart.panels))]) for p in points]
+    labels = ["<br>".join([settings(p), *figures(p, touches=bool(chart.panels))]) for p in points]
     values = [max(p.gap, FLOOR) if field == "gap" else getattr(p, field) for p in points]
     return go.Scatter(
         x=[max(p.ms, 1e-2) for p in points],
@@ -90,28 +84,28 @@ def _trace(chart: Chart, name: str, style: Style, *, field: str, first: bool) ->
             "size": 16 if name == DEFAULT else 8,
             "color": style.colour,
         },
-        customdata=said,
+        customdata=labels,
         hovertemplate=f"<b>{html.escape(name)}</b><br>%{{customdata}}<extra></extra>",
     )
 
 
 def _lead(chart: Chart) -> str:
-    """What a reader should know first."""
+    """The sentences that a reader should know first."""
     place = chart.default_place()
-    said = []
+    sentences = []
     if place is not None:
         where = "is on the front" if place["on_front"] else "is not on the front"
-        said.append(
+        sentences.append(
             f"refine's default leaves {percent(place['gap'])} in {place['ms']:.0f} ms a frame and {where}: the fastest "
             f"to that gap, {place['fastest']}, needs {place['fastest_ms']:.0f} ms."
         )
     times = chart.times_to(JUDGED)
     if times:
         order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in times.items())
-        said.append(f"To a gap of 3%: {order}.")
+        sentences.append(f"To a gap of 3%: {order}.")
     if chart.busy:
-        said.append(f"Warning: {chart.busy}.")
-    return f"<p>{html.escape(' '.join(said))}</p>"
+        sentences.append(f"Warning: {chart.busy}.")
+    return f"<p>{html.escape(' '.join(sentences))}</p>"
 
 
 def _terms(chart: Chart) -> str:
@@ -120,7 +114,13 @@ def _terms(chart: Chart) -> str:
     if not found:
         return ""
     rows = [
-        (each.name, f"{each.cost_ms:.1f}", percent(each.share), _millimetres(each.moved_mm), each.buys)
+        (
+            each.name,
+            f"{each.cost_ms:.1f}",
+            percent(each.fraction),
+            "-" if each.moved_mm > FAR else f"{each.moved_mm:.3f}",
+            each.buys,
+        )
         for each in found
     ]
     return (
@@ -129,10 +129,6 @@ def _terms(chart: Chart) -> str:
         + "<p class='note'>By refine's default, with the part less without it; a level less the one below it. The "
         "result moves by the RMS distance between the two; gaps are by the full potential at the finest level.</p>"
     )
-
-
-def _millimetres(moved: float) -> str:
-    return "-" if moved > FAR else f"{moved:.3f}"
 
 
 def _notes(chart: Chart) -> str:

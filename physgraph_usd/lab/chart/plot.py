@@ -11,10 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, SymmetricalLogLocator
 
-from .methods import DEFAULT, SMOOTH, UPSAMPLED
-from .styles import Style, styles
-from .table import JUDGED, Chart, Point
-from .words import FAR, Change, changes, percent, title
+from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
+from .table import Chart, Point
+from .words import FAR, Change, Style, changes, percent, styles, title
 
 FLOOR = 1e-4
 """Least gap that is drawn: Phi* itself is known no better."""
@@ -36,12 +35,7 @@ ONE_POINT = {DEFAULT: "*", UPSAMPLED: "s", SMOOTH: "D"}
 
 
 def draw_chart(chart: Chart, folder: Path) -> None:
-    """Write ``chart.png`` and ``chart.svg``.
-
-    Args:
-        chart: The chart.
-        folder: Where they go.
-    """
+    """Write ``chart.png`` and ``chart.svg`` of a chart into a folder."""
     with mpl.rc_context(RULES):
         figure = _figure(chart)
         figure.savefig(folder / "chart.png", dpi=160)
@@ -55,23 +49,23 @@ def _figure(chart: Chart) -> Figure:
     figure = Figure(figsize=(9.6, sum(heights) + 1.0), layout="constrained")
     figure.suptitle(title(chart), x=0.01, ha="left", fontsize=11)
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
-    look = styles(chart)
+    style = styles(chart)
     axes = parts[0].subplots()
-    _curves(axes, chart, look)
+    _curves(axes, chart, style)
     parts[0].legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
     for part, row in zip(parts[1:], rows, strict=False):
         panels = part.subplots(1, len(row), squeeze=False)[0]
         for axes, (name, words) in zip(panels, row.items(), strict=True):
-            _measure(axes, name, words, chart=chart, look=look)
+            _measure(axes, name, words, chart=chart, style=style)
     if steps:
         _terms(parts[-1].subplots(1, 3, sharey=True, width_ratios=[1.0, 1.0, 1.5]), steps)
     return figure
 
 
-def _curves(axes: Axes, chart: Chart, look: dict[str, Style]) -> None:
+def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
     """Gap against time."""
     for name in chart.methods:
-        _line(axes, name, chart.curve(name), look[name], [max(p.gap, FLOOR) for p in chart.curve(name)])
+        _line(axes, name, chart.curve(name), style[name], [max(p.gap, FLOOR) for p in chart.curve(name)])
     axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Energy gap (Phi - Phi*) / (Phi0 - Phi*)")
     least = min((p.gap for p in chart.points), default=FLOOR)
     axes.set_ylim(max(FLOOR, min(0.5 * least, 0.01)) if least > 0 else FLOOR, CEILING)
@@ -97,11 +91,11 @@ def _line(axes: Axes, name: str, points: Sequence[Point], style: Style, heights:
     )
 
 
-def _measure(axes: Axes, name: str, words: str, *, chart: Chart, look: dict[str, Style]) -> None:
+def _measure(axes: Axes, name: str, words: str, *, chart: Chart, style: dict[str, Style]) -> None:
     """One measure of contact or of likeness against time."""
     for method in chart.methods:
         points = [point for point in chart.curve(method) if getattr(point, name) is not None]
-        _line(axes, method, points, look[method], [float(getattr(p, name)) for p in points])
+        _line(axes, method, points, style[method], [float(getattr(p, name)) for p in points])
     axes.set(xscale="log", xlabel="milliseconds a frame", title=words[0].upper() + words[1:])
     if name in chart.likeness:
         alone = [getattr(point, name) or 0.0 for each in ONE_POINT for point in chart.curve(each)]
@@ -118,7 +112,7 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, look: dict[str,
 def _terms(panels: Any, steps: list[Change]) -> None:
     """What each part of the model costs and buys."""
     places = list(range(len(steps)))[::-1]
-    cost, buys, said = panels
+    cost, buys, words = panels
     for axes, values, colour, digits in (
         (cost, [each.cost_ms for each in steps], "#0072b2", 0),
         (buys, [min(each.moved_mm, FAR) for each in steps], "#009e73", 2),
@@ -127,8 +121,8 @@ def _terms(panels: Any, steps: list[Change]) -> None:
         axes.grid(visible=False, axis="y")
         axes.xaxis.set_major_locator(MaxNLocator(4) if axes is cost else SymmetricalLogLocator(base=10, linthresh=1))
         for place, value in zip(places, values, strict=True):
-            told = f" over {value:.0f}" if value == FAR else f" {value:.{digits}f}"
-            axes.text(max(value, 0.0), place, told, va="center", fontsize=7.5, color="#444444")
+            label = f" over {value:.0f}" if value == FAR else f" {value:.{digits}f}"
+            axes.text(max(value, 0.0), place, label, va="center", fontsize=7.5, color="#444444")
     cost.set(yticks=places, title="Costs [ms a frame]")
     cost.set_yticklabels([each.name for each in steps])
     cost.margins(x=0.25)
@@ -136,7 +130,7 @@ def _terms(panels: Any, steps: list[Change]) -> None:
     buys.set(title="Moves the result [mm]", xscale="symlog")
     buys.set_xlim(0, 8.0 * max(1.0, *(min(each.moved_mm, FAR) for each in steps)))
     buys.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    said.set(title="Buys")
-    said.axis("off")
+    words.set(title="Buys")
+    words.axis("off")
     for place, each in zip(places, steps, strict=True):
-        said.text(0.0, place, each.buys, va="center", fontsize=7.5, color="#444444", in_layout=False)
+        words.text(0.0, place, each.buys, va="center", fontsize=7.5, color="#444444", in_layout=False)

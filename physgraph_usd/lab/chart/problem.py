@@ -1,8 +1,9 @@
-"""Frames of a shot that can be solved by any method, as often as one likes, and judged by one ruler."""
+"""Frames of a shot that are solved by any method, as often as one likes, and judged by the same measures."""
 
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,20 +15,50 @@ import torch
 
 from ...shot.options import RefineOptions
 from ...solver.contact.settings import ContactSettings
+from ...solver.forces.base import ForceModule
+from ...solver.frame.group import Group
 from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.solve import solve_frame
 from ...solver.frame.values import FrameInput, State
 from ...solver.level import Level
+from ...solver.resolution import edge_strain
 from ...solver.scene import Frame, Scene
-from .judge import Judgement, judge
 
 DEFAULT = RefineOptions().solve_settings()
-"""What `refine` does by default."""
+"""How `refine` solves by default."""
 COLD = replace(DEFAULT, temporal="off")
-"""The same, each frame by itself."""
+"""By default, but each frame by itself."""
 ALONE = replace(COLD, contact=ContactSettings("off", cloth="off"))
-"""The same of cloth that touches nothing."""
+"""Each frame by itself, and cloth that touches nothing."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Energy, strain and contact of fine positions.
+
+    Attributes:
+        energies: Energy of each term [J].
+        strain: Largest over the garments of the edges' 99th percentile.
+        inside: Vertices inside closed bodies.
+        percent: Their fraction of all vertices [%].
+        deepest_mm: Depth of the deepest [mm].
+        crossings: Edges of cloth through faces of bodies and the other way round.
+        tangles: Edges of cloth through faces of cloth.
+    """
+
+    energies: dict[str, float]
+    strain: float
+    inside: int
+    percent: float
+    deepest_mm: float
+    crossings: int
+    tangles: int
+
+    @property
+    def energy(self) -> float:
+        """The potential [J]."""
+        return sum(self.energies.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,27 +138,27 @@ class Problem:
         last = max((each["level"] for each in reports), default=0)
         steps = sum(each["steps"] for each in reports if each["level"] == last)
         waited = None if before is None or after is None else after - before
-        share = worked / elapsed if self._clock == "cpu" else 1.0
+        busy = worked / elapsed if self._clock == "cpu" else 1.0
         points = tuple(p for p in state.points if p is not None)
-        return Solved(points, share * sum(spent), 1e3 * elapsed, steps, waited)
+        return Solved(points, busy * sum(spent), 1e3 * elapsed, steps, waited)
 
     def go_on(
-        self, frame: Frame, settings: SolveSettings, kept: Sequence[State | None]
+        self, frame: Frame, settings: SolveSettings, states: Sequence[State | None]
     ) -> tuple[tuple[np.ndarray, ...], list[State]]:
-        """Solve a frame from a kept result of its own; cold where that is None.
+        """Solve a frame on from the state of each part; cold where that is None.
 
         Returns:
-            Fine world positions [m] of each garment, and what to go on from, for each part.
+            Fine world positions [m] of each garment, and the new state of each part.
         """
         self.refiner.use(replace(settings, temporal="warm"))
         points: dict[int, np.ndarray] = {}
-        states = []
-        for part, own in zip(self.refiner.parts_of(frame), kept, strict=True):
+        after = []
+        for part, state in zip(self.refiner.parts_of(frame), states, strict=True):
             frames, touching = [frame.garments[index] for index in part], self.refiner.touching(part, frame)
-            solved = solve_frame(self.refiner.group_of(part), FrameInput(frames, frame.time, touching), own)
+            solved = solve_frame(self.refiner.group_of(part), FrameInput(frames, frame.time, touching), state)
             points.update(zip(part, solved.points, strict=True))
-            states.append(solved.state)
-        return tuple(points[index] for index in sorted(points)), states
+            after.append(solved.state)
+        return tuple(points[index] for index in sorted(points)), after
 
     def judge(self, frame: Frame, points: Sequence[np.ndarray], settings: SolveSettings = COLD) -> Judgement:
         """Energy, strain and contact of fine world positions [m], one array a garment, in a potential and a contact."""
@@ -153,6 +184,60 @@ class Problem:
             values = measure(finest, np.concatenate([frame.garments[index].points for index in part]))
             found.update((index, values[span]) for index, span in zip(part, finest.spans, strict=True))
         return tuple(found[index] for index in sorted(found))
+
+
+def judge(refiner: Refiner, frame: Frame, points: Sequence[np.ndarray]) -> Judgement:
+    """Fine world positions [m] of a frame, one array a garment, judged by the solver's full potential and contact."""
+    energies: defaultdict[str, float] = defaultdict(float)
+    strains, bodies, tangles, count = [0.0], list[dict[str, Any]](), 0, 0
+    for part in refiner.parts_of(frame):
+        group = refiner.group_of(part)
+        joined = np.concatenate([points[index] for index in part])
+        terms, strain, contact = _judge_part(group, refiner, frame, part=part, points=joined)
+        for name, value in terms.items():
+            energies[name] += value
+        strains.append(strain)
+        bodies += [body["after"] for body in contact.get("bodies", {}).values()]
+        tangles += contact.get("cloth", {}).get("after", {}).get("crossings", 0)
+        count += group.levels[-1].vertex_count
+    inside = sum(body["inside"] for body in bodies)
+    return Judgement(
+        energies=dict(energies),
+        strain=max(strains),
+        inside=inside,
+        percent=100.0 * inside / max(count, 1),
+        deepest_mm=max((body["deepest_mm"] for body in bodies), default=0.0),
+        crossings=sum(body["crossings"] for body in bodies),
+        tangles=tangles,
+    )
+
+
+def _judge_part(
+    group: Group, refiner: Refiner, frame: Frame, *, part: tuple[int, ...], points: np.ndarray
+) -> tuple[dict[str, float], float, dict[str, Any]]:
+    """Energies [J], strain and contact of garments that are solved together."""
+    frames = [frame.garments[index] for index in part]
+    module, contact, origin = group.potential(frames, refiner.touching(part, frame))
+    finest = group.levels[-1]
+    x = torch.as_tensor(points - origin, dtype=finest.dtype, device=finest.device)
+    touched = () if contact is None else contact.at(finest).terms(x)[1]
+    energies = ForceModule((*module.forces, *touched)).energies(x)
+    return energies, edge_strain(finest, x)["p99"], {} if contact is None else contact.measure(x)[0]
+
+
+OVER_FRAMES: dict[str, Callable[..., Any]] = {
+    "strain": max,
+    "inside": sum,
+    "deepest_mm": max,
+    "crossings": sum,
+    "tangles": sum,
+}
+"""How each measure of several frames is made one."""
+
+
+def over_frames(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The measures of `OVER_FRAMES` of several frames' judgements."""
+    return {name: join(each[name] for each in judged) for name, join in OVER_FRAMES.items()}
 
 
 def plain_detail(frame: Frame) -> Frame:

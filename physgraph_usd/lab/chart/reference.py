@@ -1,4 +1,4 @@
-"""Phi*: the least energy known for a frame (DESIGN 4.5). One function for all charts and benchmarks.
+"""Phi*: the least energy known for a frame. One function for all charts and benchmarks.
 
 Cloth buckles in many ways, and a descent ends in the one that its start lies nearest to. So several are begun, in
 float64: each integrator of `STARTS` with its steps, then quasi-Newton at the finest level, for as long as that lowers
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import counted
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.values import State
 from ...solver.integrate import METHODS
@@ -41,10 +42,10 @@ NEWTON, POLISHES = ("newton", 8), 6
 FINALISTS = 2
 """How many starts of a search, and of each beginning of it, Newton goes on from."""
 SETTLED = 2e-4
-"""Fall of the energy, over the whole fall, under which going on is not worth it: gaps are told to a thousandth."""
+"""Fall of the energy, over the whole fall, under which going on is not worth it: gaps are shown to a thousandth."""
 SOLUTION = "chart.solution.{}.npz"
 DESCENT = 0.6
-"""Part of the time after which no start is begun."""
+"""Fraction of the time after which no start is begun."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Reference:
     Attributes:
         start: Energy of the upsampled cage [J].
         least: The least energy [J].
-        energies: The same by term [J].
+        energies: The least energy by term [J].
         by: Who found it.
         apart: How far the least of the other starts lies above it, over the whole fall; None where there was no other.
         seconds: Time spent [s].
@@ -75,7 +76,7 @@ class Reference:
         return Reference(**{each.name: plain[each.name] for each in fields(Reference) if each.name in plain})
 
     def plain(self) -> dict[str, Any]:
-        """Ready for JSON, without the positions."""
+        """Values for JSON, without the positions."""
         return {name: value for name, value in vars(self).items() if name != "points"}
 
     def gap(self, energy: float) -> float:
@@ -83,7 +84,7 @@ class Reference:
         return (energy - self.least) / max(self.start - self.least, 1e-30)
 
     def lowered(self, energies: dict[str, float], by: str) -> Reference:
-        """What is known when a method came to energies by term [J]: itself, unless those are less."""
+        """The reference once a method came to energies by term [J]: itself, unless those are less."""
         energy = sum(energies.values())
         if not energy < self.least:
             return self
@@ -100,24 +101,19 @@ class Solutions:
     """The positions of each frame's reference, in files beside the chart's rows: a chart that goes on has them, too."""
 
     def __init__(self, folder: Path, *, fresh: bool) -> None:
-        """Take those of a folder.
-
-        Args:
-            folder: Where they lie.
-            fresh: Drop what is there.
-        """
+        """Take those of a folder, or drop them where ``fresh`` is set."""
         self._folder = folder
         self._known: dict[float | None, tuple[np.ndarray, ...]] = {}
         for file in folder.glob(SOLUTION.format("*")) if fresh else ():
             file.unlink()
 
     def keep(self, time: float | None, points: Sequence[np.ndarray]) -> None:
-        """Keep the fine world positions [m] of a frame, one array a garment."""
+        """Store the fine world positions [m] of a frame, one array a garment."""
         self._known.pop(time, None)
         np.savez(self._file(time), *points)
 
     def apart_mm(self, frame: Frame, points: Sequence[np.ndarray]) -> float | None:
-        """RMS distance of fine positions [m] from the frame's reference [mm]; None where none was kept."""
+        """RMS distance of fine positions [m] from the frame's reference [mm]; None where none is stored."""
         file = self._file(frame.time)
         if frame.time not in self._known and file.exists():
             with np.load(file) as data:
@@ -136,11 +132,11 @@ def rms_mm(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
 
 
 class _Descent:
-    """Ever longer runs from one start; the best is kept."""
+    """Ever longer runs from one start, of which the best is remembered."""
 
     def __init__(self, problem: Problem, frame: Frame, settings: SolveSettings, *, start: float) -> None:
         self._problem, self._frame, self._settings, self._start = problem, frame, settings, start
-        self._kept: Sequence[State | None] = [None] * len(problem.refiner.parts_of(frame))
+        self._states: Sequence[State | None] = [None] * len(problem.refiner.parts_of(frame))
         self.by, self.energy = "", math.inf
         self.energies: dict[str, float] = {}
         self.points: tuple[np.ndarray, ...] = ()
@@ -151,11 +147,11 @@ class _Descent:
             if time.perf_counter() > until:
                 break
             settings = replace(self._settings, method=METHODS[method[0]], steps=method[1], tolerance=0.0)
-            points, kept = self._problem.go_on(self._frame, settings, self._kept)
+            points, states = self._problem.go_on(self._frame, settings, self._states)
             found, before = self._problem.judge(self._frame, points, self._settings), self.energy
             if found.energy < before:
                 self.by += name if not self.by.endswith(name) else ""
-                self.energy, self.energies, self.points, self._kept = found.energy, found.energies, points, kept
+                self.energy, self.energies, self.points, self._states = found.energy, found.energies, points, states
             if not before - found.energy > SETTLED * (self._start - found.energy):
                 break
         return self
@@ -185,9 +181,8 @@ def find_reference(
     for method in STARTS[: SHORT if short else None]:
         if len(runs) >= LEAST and time.perf_counter() - began > DESCENT * seconds:
             break
-        descent = _Descent(problem, frame, settings, start=start).go_on(
-            f"{method[0]}, {method[1]} steps", method, most=1
-        )
+        descent = _Descent(problem, frame, settings, start=start)
+        descent.go_on(f"{method[0]}, {counted(method[1], 'step')}", method, most=1)
         runs.append(descent.go_on(", and on", ON, most=ROUNDS, until=began + DESCENT * seconds))
     for each in _finalists(runs):
         each.go_on(", and on", ON, most=MORE, until=began + seconds)

@@ -7,7 +7,7 @@ import platform
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +27,19 @@ from ...usd.write.atomic import check_place
 from ...version import __version__
 from .journal import NAME as JOURNAL
 from .journal import Journal
-from .measure import measure_curves, rungs
-from .methods import Curve, find_curves
-from .options import LONG, ChartOptions
+from .measure import Curve, CurveBench, budgets_of, find_curves
+from .options import LONG, ChartOptions, Clock, Plan, make_plan
 from .page import write_page
-from .peers.run import measure_peers, parse_peers
-from .plan import Clock, Plan, make_plan
+from .peers.run import measure_peer, parse_peers
 from .plot import draw_chart
 from .problem import COLD, Problem, plain_detail
 from .reference import Solutions, find_reference
 from .table import Chart, collate
-from .terms import RUN, Bench, measure_terms
+from .terms import RUN, TermBench, measure_terms
 
 DEFAULTS = ChartOptions()
 WRITTEN = ("chart.png", "chart.svg", "chart.html", "chart.csv", "chart.json")
-"""What a chart leaves beside its rows."""
+"""Files that a chart leaves beside its rows."""
 MOST_PEER_STEPS = 1024
 """Largest budget of a solver outside."""
 
@@ -124,14 +122,24 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
             found = find_reference(problems[1], frame, seconds=plan.reference_seconds)
             solutions.keep(frame.time, found.points)
             journal.add("reference", frame=frame.time, **found.plain())
-    place: dict[str, Any] = {"plan": plan, "clock": clock, "solutions": solutions}
-    measure_curves(journal, problems, frames, curves=curves, **place)
-    budgets = [steps for steps in rungs(plan.growth) if steps <= MOST_PEER_STEPS]
-    place |= {"peers": parse_peers(options.peers), "clock_name": options.clock, "steps": budgets}
-    measure_peers(journal, problems, frames, **place)
-    run = tuple(_frame(opened, time) for time in _run_up_to(opened, frames[-1].time))
-    bench = Bench(*problems, opened.scene, levels, frames=frames, run=run, build=build)
-    measure_terms(journal, bench, clock)
+    bench = CurveBench(journal, problems, frames, plan=plan, clock=clock, solutions=solutions)
+    bench.measure(curves)
+    budgets = [steps for steps in budgets_of(plan.growth) if steps <= MOST_PEER_STEPS]
+    for peer, python in parse_peers(options.peers):
+        clock.say(peer.name)
+        measure_peer(
+            journal,
+            peer,
+            python,
+            problem=problems[0],
+            frames=frames,
+            judged=bench.judged,
+            plan=plan,
+            clock_name=options.clock,
+            steps=budgets,
+        )
+    row = tuple(_frame(opened, time) for time in _row_up_to(opened, frames[-1].time))
+    measure_terms(journal, TermBench(*problems, opened.scene, levels, frames=frames, row=row, build=build), clock)
     return journal
 
 
@@ -159,12 +167,12 @@ def _plan(
         "least_ms": timed.solve(frame, replace(COLD, steps=1, tolerance=0.0)).elapsed,
     }
     plan = make_plan(options.size(), **costs)
-    journal.add("plan", plan=plan.plain(), long_minutes=make_plan(LONG, **costs).minutes)
+    journal.add("plan", plan=asdict(plan), long_minutes=make_plan(LONG, **costs).minutes)
     return plan
 
 
 def _about(opened: Shot, levels: Sequence[int], options: ChartOptions) -> dict[str, Any]:
-    """What is measured: rows of anything else do not belong to this chart."""
+    """The problem that is measured: rows of any other do not belong to this chart."""
     device = options.device
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.processor()
     return {
@@ -195,7 +203,7 @@ def _times(opened: Shot, count: int) -> list[float | None]:
     return [times[i] for i in picks]
 
 
-def _run_up_to(opened: Shot, time: float | None) -> list[float | None]:
+def _row_up_to(opened: Shot, time: float | None) -> list[float | None]:
     """Frames in a row that end at a time code."""
     times: list[float | None] = list(opened.scene.times)
     return times[max(0, times.index(time) + 1 - RUN) : times.index(time) + 1] if time in times else []

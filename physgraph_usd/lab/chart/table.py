@@ -11,20 +11,27 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from ...errors import counted
 from ...shot.plain_json import to_json
 from .journal import Journal
-from .methods import DEFAULT
+from .measure import DEFAULT
+from .problem import over_frames
 from .reference import Reference
 
 GAPS = (0.1, 0.03, 0.01)
-"""Gaps to which the time is told."""
-JUDGED = 0.03
-"""The one by which methods are put in order."""
+"""Gaps to which the time is given."""
 TOLERANCE = 1.1
 """Times that differ by less than this factor count as equal: medians of a few runs are no better."""
 BUSY = 0.1
-"""Time waited for a core, over the time measured, from which a reader is told."""
+"""Time waited for a core, over the time measured, from which there is a warning."""
 TINY = 1e-12
+CONTACT = {
+    "percent": "vertices inside bodies [%]",
+    "crossings": "edges through faces of bodies",
+    "tangles": "edges of cloth through cloth",
+}
+LIKENESS = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from Phi*'s shape [mm]"}
+"""Fields of points, and their titles."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +46,14 @@ class Point:
         made: Steps that it made there, mean over the frames.
         tolerance: Remaining move at which it was to stop [edge lengths]; 0 where it took all its steps.
         ms: Milliseconds a frame: `typical` over the repeats, mean over the frames.
-        ms_median: The same with the median of all repeats.
-        ms_least: The same of the fastest repeats.
+        ms_median: Milliseconds by the median of all repeats.
+        ms_least: Milliseconds of the fastest repeats.
         gap: (Phi - Phi*) / (Phi0 - Phi*), both summed over the frames.
         energy: Phi, mean over the frames [J].
-        energies: The same by term [J].
+        energies: Phi by term [J].
         strain: The edges' 99th percentile, the worst frame's.
         inside: Vertices inside bodies, summed over the frames.
-        percent: Their share.
+        percent: Their fraction of all vertices [%].
         deepest_mm: Depth of the deepest [mm].
         crossings: Edges through faces, of cloth and bodies, summed over the frames.
         tangles: Edges of cloth through faces of cloth, summed over the frames.
@@ -114,38 +121,30 @@ class Chart:
 
     @property
     def panels(self) -> dict[str, str]:
-        """What of contact there is to draw: fields of the points, and their titles."""
-        known = {
-            "percent": "vertices inside bodies [%]",
-            "crossings": "edges through faces of bodies",
-            "tangles": "edges of cloth through cloth",
-        }
+        """Measures of contact that there are to draw: fields of the points, and their titles."""
         touches = any("contact" in point.energies for point in self.points)
-        return {
-            name: words
-            for name, words in known.items()
-            if any(getattr(point, name) for point in self.points) or (touches and name != "tangles")
-        }
+        return {name: title for name, title in CONTACT.items() if self._has(name) or (touches and name != "tangles")}
 
     @property
     def likeness(self) -> dict[str, str]:
-        """What compares with solvers outside, too, where there are any: fields of the points, and their titles."""
-        if not self.notes:
-            return {}
-        known = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from Phi*'s shape [mm]"}
-        return {name: words for name, words in known.items() if any(getattr(p, name) for p in self.points)}
+        """Measures that compare with solvers outside, where there are any: fields of the points, and their titles."""
+        return {name: title for name, title in LIKENESS.items() if self.notes and self._has(name)}
 
     @property
     def notes(self) -> dict[str, str]:
-        """What each solver outside was given of the problem, by its name."""
+        """How much of the problem each solver outside was given, by its name."""
         return {point.integrator: point.note for point in self.points if point.note}
+
+    def _has(self, name: str) -> bool:
+        """Whether a field of any point is not zero."""
+        return any(getattr(point, name) for point in self.points)
 
     def curve(self, method: str) -> tuple[Point, ...]:
         """The points of one method, in the order of the budgets."""
         return tuple(sorted((p for p in self.points if p.method == method), key=lambda p: p.steps))
 
     def time_to(self, method: str, gap: float) -> float | None:
-        """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there."""
+        """`quickest` of a method."""
         return quickest([(point.ms, point.gap) for point in self.curve(method)], gap)
 
     def times_to(self, gap: float) -> dict[str, float]:
@@ -158,16 +157,10 @@ class Chart:
         default = next(iter(self.curve(DEFAULT)), None)
         if default is None:
             return None
-        fastest = next(iter(self.times_to(default.gap).items()), (DEFAULT, default.ms))
-        ratio = default.ms / fastest[1]
-        return {
-            "gap": default.gap,
-            "ms": default.ms,
-            "fastest": fastest[0],
-            "fastest_ms": fastest[1],
-            "ratio": ratio,
-            "on_front": ratio <= TOLERANCE,
-        }
+        fastest, least = next(iter(self.times_to(default.gap).items()), (DEFAULT, default.ms))
+        ratio = default.ms / least
+        place = {"gap": default.gap, "ms": default.ms, "fastest": fastest, "fastest_ms": least, "ratio": ratio}
+        return place | {"on_front": ratio <= TOLERANCE}
 
     def to_dict(self) -> dict[str, Any]:
         """The chart as plain values."""
@@ -217,7 +210,7 @@ def quickest(points: Sequence[tuple[float, float]], gap: float) -> float | None:
 
     Args:
         points: Milliseconds and gap of its budgets, the smallest first.
-        gap: The gap.
+        gap: The gap to come to.
     """
     best: list[tuple[float, float]] = []
     for point in points:
@@ -243,20 +236,19 @@ def collate(journal: Journal) -> Chart:
     found = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
     for row in rows:
         if row["frame"] in found and "energies" in row:
-            by = f"{row['method']}, {row['steps']} steps"
+            by = f"{row['method']}, {counted(row['steps'], 'step')}"
             found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
     keys = dict.fromkeys((row["method"], row["steps"]) for row in rows)
     points = [_point([r for r in rows if (r["method"], r["steps"]) == key], found) for key in keys]
     plan = journal.one("plan") or {}
     about = journal.rows("problem")[0]["problem"] | {name: plan.get(name) for name in ("plan", "long_minutes")}
     about["waited"] = sum(r.get("waited") or 0.0 for r in rows) / max(sum(r.get("elapsed", 0.0) for r in rows), TINY)
-    return Chart(
-        about,
-        tuple(point for point in points if point is not None),
-        tuple({"frame": frame, **each.plain()} for frame, each in found.items()),
-        tuple(_without_kind(each) for each in journal.rows("term")),
-        tuple(_without_kind(each) for each in journal.rows("failed")),
+    terms, failed = (
+        tuple({name: value for name, value in row.items() if name != "row"} for row in journal.rows(kind))
+        for kind in ("term", "failed")
     )
+    references = tuple({"frame": frame, **each.plain()} for frame, each in found.items())
+    return Chart(about, tuple(point for point in points if point is not None), references, terms, failed)
 
 
 def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point | None:
@@ -283,12 +275,8 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         gap=(len(values) * energy - least) / max(start - least, TINY),
         energy=energy,
         energies=energies,
-        strain=max(v["strain"] for v in values),
-        inside=sum(v["inside"] for v in values),
         percent=statistics.fmean(v["percent"] for v in values),
-        deepest_mm=max(v["deepest_mm"] for v in values),
-        crossings=sum(v["crossings"] for v in values),
-        tangles=sum(v["tangles"] for v in values),
+        **over_frames(values),
         frames=len(values),
         repeats=min(len(each) for each in times),
         note=first.get("note", ""),
@@ -301,7 +289,3 @@ def _flat(point: Point, terms: Sequence[str]) -> dict[str, Any]:
     values = asdict(point)
     energies = values.pop("energies")
     return values | {f"{name}_joules": energies.get(name, "") for name in terms}
-
-
-def _without_kind(row: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in row.items() if name != "row"}

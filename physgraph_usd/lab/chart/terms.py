@@ -1,13 +1,14 @@
-"""What each modelling term, the last frame's detail and each level cost and buy: the picture of no more than needed.
+"""Cost and benefit of each modelling term, of the last frame's detail and of each level.
 
-A term's price is the time of a frame with it less that without; what it buys is how far the result moves, and what the
-other result is worth by the full potential. Solves are refine's default ones.
+A term's cost is the time of a frame with it less that without; its benefit is how far the result moves, and the gap of
+the other result by the full potential. Solves are refine's default ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -16,14 +17,16 @@ from ...errors import SolveError
 from ...solver.frame.settings import SolveSettings
 from ...solver.scene import Frame, GarmentFrame, Scene
 from .journal import Journal
-from .plan import Clock
-from .problem import COLD, Problem, Solved, with_garments
+from .options import Clock
+from .problem import COLD, Problem, over_frames, with_garments
 from .reference import rms_mm
 from .table import typical
 
 REPEATS = 5
 RUN = 8
 """Frames in a row on which what frames owe to one another is measured."""
+Points = tuple[np.ndarray, ...]
+"""Fine world positions [m] of each garment, shape (V, 3)."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +56,14 @@ TERMS = (
     Without("bending", garment=lambda each: replace(each, fabric=replace(each.fabric, bend=0.0))),
     Without("membrane", garment=lambda each: replace(each, fabric=replace(each.fabric, shear=None))),
     Without("guide", garment=lambda each: replace(each, guide=0.0)),
-    Without("contact", settings=lambda given: replace(given, contact=replace(given.contact, form="off"))),
-    Without("self contact", settings=lambda given: replace(given, contact=replace(given.contact, cloth="off"))),
+    Without("contact", settings=lambda solve: replace(solve, contact=replace(solve.contact, form="off"))),
+    Without("self contact", settings=lambda solve: replace(solve, contact=replace(solve.contact, cloth="off"))),
 )
 """A new term of the potential is one line here."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class TermBench:
     """What the terms are measured on.
 
     Attributes:
@@ -69,7 +72,7 @@ class Bench:
         scene: The scene.
         levels: Subdivisions of each garment.
         frames: Frames that stand alone.
-        run: Frames in a row, oldest first.
+        row: Frames in a row, oldest first.
         build: Makes a problem in float32 from a scene and levels.
     """
 
@@ -78,7 +81,7 @@ class Bench:
     scene: Scene
     levels: tuple[int, ...]
     frames: tuple[Frame, ...]
-    run: tuple[Frame, ...]
+    row: tuple[Frame, ...]
     build: Callable[[Scene, Sequence[int]], Problem]
 
     @property
@@ -89,126 +92,103 @@ class Bench:
         absent["gravity"] = not self.scene.gravity.any()
         return tuple(each for each in TERMS if not absent.get(each.term))
 
+    def judged(self, points: Sequence[Points], frames: Sequence[Frame]) -> dict[str, Any]:
+        """Results of frames judged by the full potential; energies are summed."""
+        each = [self.judge.judge(frame, result) for frame, result in zip(frames, points, strict=True)]
+        return {"energy": sum(one.energy for one in each), **over_frames([asdict(one) for one in each])}
 
-def measure_terms(journal: Journal, bench: Bench, clock: Clock) -> None:
+    def compared(
+        self, points: dict[str, Sequence[Points]], frames: Sequence[Frame], values: dict[str, dict[str, float]]
+    ) -> dict[str, Any]:
+        """A row of the results with and without something, each with more values, and how far they are apart [mm]."""
+        row = {name: self.judged(each, frames) | values[name] for name, each in points.items()}
+        return row | {"moved_mm": _moved(points["with"], points["without"])}
+
+
+def measure_terms(journal: Journal, bench: TermBench, clock: Clock) -> None:
     """Measure every term, the last frame's detail and every level into the journal."""
     tasks: list[tuple[str, str, Callable[[], dict[str, Any]]]] = [
-        (each.term, "term", lambda each=each: _one_term(bench, each)) for each in bench.terms
+        (each.term, "term", partial(_one_term, bench, each)) for each in bench.terms
     ]
-    tasks += [
-        (f"level {level}", "level", lambda level=level: _one_level(bench, level))
-        for level in range(max(bench.levels) + 1)
-    ]
-    if len(bench.run) >= 4:
-        tasks += [(name, "time", lambda name=name: _one_run(bench, name)) for name in ("tether", "warm")]
+    levels = range(max(bench.levels) + 1)
+    tasks += [(f"level {level}", "level", partial(_one_level, bench, level)) for level in levels]
+    if len(bench.row) >= 4:
+        tasks += [(name, "time", partial(_one_row, bench, name)) for name in ("tether", "warm")]
     for name, kind, measured in tasks:
         if clock.over:
             return
-        if not journal.one("term", term=name):
-            clock.say(f"what {name} costs and buys")
-            _record(journal, name, kind, measured)
+        if journal.one("term", term=name):
+            continue
+        clock.say(f"what {name} costs and buys")
+        try:
+            journal.add("term", term=name, kind=kind, **measured())
+        except SolveError as error:
+            journal.add("term", term=name, kind=kind, failed=str(error))
 
 
-def _record(journal: Journal, term: str, kind: str, measured: Callable[[], dict[str, Any]]) -> None:
-    try:
-        journal.add("term", term=term, kind=kind, **measured())
-    except SolveError as error:
-        journal.add("term", term=term, kind=kind, failed=str(error))
-
-
-def _one_term(bench: Bench, without: Without) -> dict[str, Any]:
+def _one_term(bench: TermBench, without: Without) -> dict[str, Any]:
     """Solve with and without a term, turn by turn."""
     scene = without.scene(bench.scene) if without.scene else bench.scene
     other = bench.timed if without.same_problem else bench.build(scene, bench.levels)
     settings = without.settings(COLD) if without.settings else COLD
     frames = [with_garments(f, without.garment) if without.garment else f for f in bench.frames]
-    return _compare(
-        bench,
-        [lambda f=f: bench.timed.solve(f, COLD) for f in bench.frames],
-        [lambda f=f: other.solve(f, settings) for f in frames],
-        bench.frames,
-    )
+    sides = {"with": (bench.timed, bench.frames, COLD), "without": (other, frames, settings)}
+    spent: dict[str, list[float]] = {name: [] for name in sides}
+    points: dict[str, Sequence[Points]] = {}
+    for _ in range(REPEATS + 1):
+        for name, side in sides.items():
+            ms, points[name] = _solved(*side)
+            spent[name].append(ms)
+    return bench.compared(points, bench.frames, {name: {"ms": typical(each[1:])} for name, each in spent.items()})
 
 
-def _one_level(bench: Bench, level: int) -> dict[str, Any]:
+def _one_level(bench: TermBench, level: int) -> dict[str, Any]:
     """Solve no finer than a level, and carry the result to the finest one."""
     levels = [min(level, each) for each in bench.levels]
     other = bench.timed if tuple(levels) == bench.levels else bench.build(bench.scene, levels)
-    spent: list[float] = []
-    solved: list[Solved] = []
-    for _ in range(REPEATS + 1):
-        solved = [other.solve(frame, COLD) for frame in bench.frames]
-        spent.append(sum(each.milliseconds for each in solved) / len(solved))
-    fine = [_carried_up(bench, each.points, levels) for each in solved]
-    full = [bench.timed.solve(frame, COLD).points for frame in bench.frames]
-    values = _worth(bench, fine, bench.frames) | {"ms": typical(spent[1:]), "vertices": other.vertex_count}
-    return {"without": values, "moved_mm": _moved(full, fine)}
+    turns = [_solved(other, bench.frames, COLD) for _ in range(REPEATS + 1)]
+    fine = [_carried_up(bench, each, levels) for each in turns[-1][1]]
+    full = _solved(bench.timed, bench.frames, COLD)[1]
+    values = {"ms": typical([ms for ms, _ in turns[1:]]), "vertices": other.vertex_count}
+    return {"without": bench.judged(fine, bench.frames) | values, "moved_mm": _moved(full, fine)}
 
 
-def _one_run(bench: Bench, temporal: str) -> dict[str, Any]:
+def _one_row(bench: TermBench, temporal: str) -> dict[str, Any]:
     """Solve frames in a row with what a frame takes over from the last one, and each alone."""
-    settings = {"with": replace(COLD, temporal=temporal), "without": COLD}
-    found: dict[str, Any] = {}
-    points: dict[str, list[tuple[np.ndarray, ...]]] = {}
-    for name, each in settings.items():
-        bench.timed.refiner.use(each)
-        solved = [bench.timed.next(frame) for frame in bench.run]
-        points[name] = [one.points for one in solved]
-        spent = typical([one.milliseconds for one in solved[1:]])
-        found[name] = _worth(bench, points[name], bench.run) | {"ms": spent, "jerk": _jerk(bench, points[name])}
-    return found | {"moved_mm": _moved(points["with"], points["without"])}
+    points: dict[str, Sequence[Points]] = {}
+    values: dict[str, dict[str, float]] = {}
+    for name, settings in (("with", replace(COLD, temporal=temporal)), ("without", COLD)):
+        bench.timed.refiner.use(settings)
+        solved = [bench.timed.next(frame) for frame in bench.row]
+        points[name] = [each.points for each in solved]
+        spent = typical([each.milliseconds for each in solved[1:]])
+        values[name] = {"ms": spent, "jerk": _jerk(bench, points[name])}
+    return bench.compared(points, bench.row, values)
 
 
-def _compare(
-    bench: Bench, full: Sequence[Callable[[], Any]], other: Sequence[Callable[[], Any]], frames: Sequence[Frame]
-) -> dict[str, Any]:
-    spent: dict[str, list[float]] = {"with": [], "without": []}
-    points: dict[str, list[tuple[np.ndarray, ...]]] = {}
-    for _ in range(REPEATS + 1):
-        for name, solves in (("with", full), ("without", other)):
-            solved = [solve() for solve in solves]
-            spent[name].append(sum(each.milliseconds for each in solved) / len(solved))
-            points[name] = [each.points for each in solved]
-    found = {
-        name: _worth(bench, points[name], frames) | {"ms": typical(spent[name][1:])} for name in ("with", "without")
-    }
-    return found | {"moved_mm": _moved(points["with"], points["without"])}
+def _solved(problem: Problem, frames: Sequence[Frame], settings: SolveSettings) -> tuple[float, list[Points]]:
+    """Mean time of frames solved cold [ms], and their positions [m]."""
+    solved = [problem.solve(frame, settings) for frame in frames]
+    return sum(each.milliseconds for each in solved) / len(solved), [each.points for each in solved]
 
 
-def _worth(bench: Bench, points: Sequence[tuple[np.ndarray, ...]], frames: Sequence[Frame]) -> dict[str, Any]:
-    """Judge results by the full potential; energies are summed over the frames."""
-    judged = [bench.judge.judge(frame, each) for frame, each in zip(frames, points, strict=True)]
-    values = [asdict(each) for each in judged]
-    return {
-        "energy": sum(each.energy for each in judged),
-        "strain": max(each["strain"] for each in values),
-        "inside": sum(each["inside"] for each in values),
-        "deepest_mm": max(each["deepest_mm"] for each in values),
-        "crossings": sum(each["crossings"] for each in values),
-        "tangles": sum(each["tangles"] for each in values),
-    }
+def _carried_up(bench: TermBench, points: Points, levels: Sequence[int]) -> Points:
+    """Positions at a level taken to the finest one by the linear map [m]."""
+    chains = zip(bench.timed.refiner.refinements, points, levels, strict=True)
+    return tuple(reduce(lambda x, step: np.asarray(step.linear @ x), chain[level:], x) for chain, x, level in chains)
 
 
-def _carried_up(bench: Bench, points: Sequence[np.ndarray], levels: Sequence[int]) -> tuple[np.ndarray, ...]:
-    fine = []
-    for chain, own, level in zip(bench.timed.refiner.refinements, points, levels, strict=True):
-        for refinement in chain[level:]:
-            own = np.asarray(refinement.linear @ own)  # noqa: PLW2901
-        fine.append(own)
-    return tuple(fine)
-
-
-def _moved(a: Sequence[tuple[np.ndarray, ...]], b: Sequence[tuple[np.ndarray, ...]]) -> float:
+def _moved(a: Sequence[Points], b: Sequence[Points]) -> float:
     """RMS distance between two results [mm]."""
     return rms_mm([points for each in a for points in each], [points for each in b for points in each])
 
 
-def _jerk(bench: Bench, points: Sequence[tuple[np.ndarray, ...]]) -> float:
-    """RMS third difference of the detail over a run, in fine edge lengths (DESIGN 4.5)."""
+def _jerk(bench: TermBench, points: Sequence[Points]) -> float:
+    """RMS third difference of the detail over frames in a row, in fine edge lengths."""
     detail = [
         np.concatenate([p - q for p, q in zip(each, bench.timed.upsampled(frame, smooth=False), strict=True)])
-        for each, frame in zip(points, bench.run, strict=True)
+        for each, frame in zip(points, bench.row, strict=True)
     ]
-    spacing = np.concatenate(bench.timed.spacing(bench.run[0]))
+    spacing = np.concatenate(bench.timed.spacing(bench.row[0]))
     third = np.diff(np.stack(detail), n=3, axis=0) / spacing[:, None]
     return float(np.sqrt(np.square(third).sum(axis=2).mean()))

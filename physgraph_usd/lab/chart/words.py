@@ -1,15 +1,21 @@
-"""What the picture and the page say: titles, settings, and each term's change in words."""
+"""Words and colours that the picture and the page share: titles, settings, each term's change, a style a curve."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from .methods import DEFAULT
+from ...errors import counted
+from .measure import DEFAULT, SMOOTH, UPSAMPLED
 from .table import Chart, Point
 
 FAR = 1e4
 """Distance beyond which cloth that nothing holds has fallen away [mm]."""
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c6d31")
+"""Okabe and Ito's colours, which colour-blind readers tell apart, and two more."""
+OUTSIDE = ("#e6007e", "#7fa800", "#5a2d0c")
+"""Colours of solvers outside."""
+BASELINE = "#6e6e6e"
 
 
 @dataclass(frozen=True)
@@ -19,16 +25,46 @@ class Change:
     Attributes:
         name: The part.
         cost_ms: Time of a frame with it less that without [ms].
-        share: The same over the time with it.
+        fraction: That cost over the time with it.
         moved_mm: RMS distance between the results [mm].
         buys: What is worse without it, in words.
     """
 
     name: str
     cost_ms: float
-    share: float
+    fraction: float
     moved_mm: float
     buys: str
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a curve is drawn.
+
+    Attributes:
+        colour: As "#rrggbb".
+        dashed: Whether the curve is broken: the method as it is not used by default.
+        outside: Whether a solver outside drew it.
+    """
+
+    colour: str
+    dashed: bool
+    outside: bool = False
+
+
+def styles(chart: Chart) -> dict[str, Style]:
+    """A style for each curve: the colour is the integrator's, a broken line is flat."""
+    nested = {point.method: point.nested for point in chart.points}
+    family = {point.method: (point.integrator or point.method).removesuffix("-flat") for point in chart.points}
+    names = {family[name] for name in chart.methods if name not in {DEFAULT, SMOOTH, UPSAMPLED}}
+    outside = names & set(chart.notes)
+    colours = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(names - outside))}
+    colours |= {name: OUTSIDE[i % len(OUTSIDE)] for i, name in enumerate(sorted(outside))}
+    found = {
+        name: Style(colours.get(family[name], BASELINE), nested[name] is False, family[name] in outside)
+        for name in chart.methods
+    }
+    return found | {DEFAULT: Style("#111111", False)}
 
 
 def title(chart: Chart) -> str:
@@ -38,60 +74,57 @@ def title(chart: Chart) -> str:
     levels = ", ".join(map(str, sorted(set(about["levels"]))))
     where = about["device"] if about["device"] == "cpu" else about["processor"]
     where += ", processor time of one core" if about.get("clock") == "cpu" else ""
-    plural = "s" if frames > 1 else ""
-    return f"{about['shot']}: {about['vertices']:,} fine vertices, level {levels}, {frames} cold frame{plural}, {where}"
+    cold = counted(frames, "cold frame")
+    return f"{about['shot']}: {about['vertices']:,} fine vertices, level {levels}, {cold}, {where}"
 
 
 def percent(value: float) -> str:
-    """A share with as many digits as it needs; a large one as a factor."""
+    """A fraction with as many digits as it needs; a large one as a factor."""
     if abs(value) >= 10.0:
         return f"{value:,.0f}x"
     return f"{100.0 * value:.3g}%"
 
 
 def settings(point: Point) -> str:
-    """What a point was solved with."""
+    """Settings that a point was solved with."""
     if point.method == DEFAULT:
-        return f"at most {point.steps} steps at the finest level, tolerance {point.tolerance:g} edge lengths"
+        return f"at most {counted(point.steps, 'step')} at the finest level, tolerance {point.tolerance:g} edge lengths"
     if not point.integrator:
         return "no physics"
     where = "nested" if point.nested else "finest level only"
-    return f"{point.integrator}, {where}, {point.steps} steps there" + (f" ({point.note})" if point.note else "")
+    return f"{point.integrator}, {where}, {counted(point.steps, 'step')} there" + (
+        f" ({point.note})" if point.note else ""
+    )
 
 
 def figures(point: Point, *, touches: bool) -> list[str]:
-    """What a point reached."""
-    said = [
+    """Figures that a point reached."""
+    lines = [
         f"gap {percent(point.gap)}, energy {point.energy:.4g} J",
         f"{point.ms:.1f} ms a frame (median {point.ms_median:.1f}, least {point.ms_least:.1f}; "
-        f"{point.repeats} turns of {_frames(point)})",
+        f"{counted(point.repeats, 'turn')} of {counted(point.frames, 'frame')})",
         ", ".join(f"{name} {1e3 * value:.3g}" for name, value in sorted(point.energies.items())) + " mJ",
         f"strain p99 {percent(point.strain)}"
         + (f", {point.apart_mm:.3g} mm from Phi*'s shape" if point.apart_mm is not None else ""),
     ]
     if touches:
-        said.append(
+        lines.append(
             f"{point.inside} vertices inside ({point.percent:.3g}%), deepest {point.deepest_mm:.3g} mm, "
             f"{point.crossings} edges through faces of bodies, {point.tangles} through cloth"
         )
-    return said
-
-
-def _frames(point: Point) -> str:
-    return "one frame" if point.frames == 1 else f"{point.frames} frames"
+    return lines
 
 
 def changes(chart: Chart) -> list[Change]:
     """Every part of the model that was measured, levels one by one."""
     fall = sum(each["start"] - each["least"] for each in chart.references)
     least = sum(each["least"] for each in chart.references)
-    found = [_term(each, fall, least) for each in chart.terms if each["kind"] != "level"]
-    return [each for each in found if each is not None] + _levels(chart, fall, least)
+    rows = [each for each in chart.terms if "failed" not in each]
+    terms = [_term(each, fall, least) for each in rows if each["kind"] != "level"]
+    return terms + _levels([each for each in rows if each["kind"] == "level"], fall, least)
 
 
-def _term(row: dict[str, Any], fall: float, least: float) -> Change | None:
-    if "failed" in row:
-        return None
+def _term(row: dict[str, Any], fall: float, least: float) -> Change:
     full, other = row["with"], row["without"]
     if row["kind"] == "time":
         name = {"tether": "tether to the last frame", "warm": "start from the last frame"}[row["term"]]
@@ -108,15 +141,14 @@ def _term(row: dict[str, Any], fall: float, least: float) -> Change | None:
     return Change(name, cost, cost / max(full["ms"], 1e-9), row["moved_mm"], "without it " + ", ".join(worse))
 
 
-def _levels(chart: Chart, fall: float, least: float) -> list[Change]:
-    rows = [each for each in chart.terms if each["kind"] == "level" and "failed" not in each]
+def _levels(rows: list[dict[str, Any]], fall: float, least: float) -> list[Change]:
     found, before, apart = [], 0.0, None
     for row in rows:
-        own = row["without"]
-        gap = percent((own["energy"] - least) / max(fall, 1e-12))
-        cost = own["ms"] - before
+        last = row["without"]
+        gap = percent((last["energy"] - least) / max(fall, 1e-12))
+        cost = last["ms"] - before
         moved = 0.0 if apart is None else max(apart - row["moved_mm"], 0.0)
-        name = f"{row['term']} ({own['vertices']:,} vertices)"
-        found.append(Change(name, cost, cost / max(own["ms"], 1e-9), moved, f"as the last one gap {gap}"))
-        before, apart = own["ms"], row["moved_mm"]
+        name = f"{row['term']} ({last['vertices']:,} vertices)"
+        found.append(Change(name, cost, cost / max(last["ms"], 1e-9), moved, f"as the last one gap {gap}"))
+        before, apart = last["ms"], row["moved_mm"]
     return found

@@ -1,11 +1,11 @@
-"""Hands a frame's problem to a peer's own Python and takes its results as rows of the chart."""
+"""Solvers outside: a frame's problem goes to a peer's own Python, and its results become rows of the chart."""
 
 from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,8 @@ from ....solver.frame.group import Group
 from ....solver.level import Level
 from ....solver.scene import Frame
 from ..journal import Journal
-from ..plan import Clock, Plan
+from ..options import Plan
 from ..problem import Problem
-from ..reference import Solutions
 
 HERE = Path(__file__).parent
 
@@ -36,8 +35,8 @@ class Peer:
     Attributes:
         name: Its name in the chart.
         adapter: The script that its Python runs.
-        note: What of the problem it was given, in words.
-        options: What its script is told beside the problem.
+        note: How much of the problem it is given, in words.
+        options: Further arguments of its script.
         follows: Whether it computes where we do; otherwise on the CPU.
     """
 
@@ -63,14 +62,14 @@ PEERS = {
 """Peers by the name that ``--peer`` takes."""
 
 
-def parse_peers(given: Sequence[str]) -> list[tuple[Peer, str]]:
+def parse_peers(values: Sequence[str]) -> list[tuple[Peer, str]]:
     """Peers with the Python of each, from ``NAME=PYTHON``.
 
     Raises:
         UsageError: A name is unknown or there is no such Python.
     """
     found = []
-    for each in given:
+    for each in values:
         name, _, python = each.partition("=")
         if name not in PEERS or not python:
             raise UsageError(f"peer '{each}': write NAME=PYTHON; known names: {', '.join(PEERS)}")
@@ -80,52 +79,47 @@ def parse_peers(given: Sequence[str]) -> list[tuple[Peer, str]]:
     return found
 
 
-def measure_peers(
+def measure_peer(
     journal: Journal,
-    problems: tuple[Problem, Problem],
-    frames: Sequence[Frame],
+    peer: Peer,
+    python: str,
     *,
-    peers: Sequence[tuple[Peer, str]],
+    problem: Problem,
+    frames: Sequence[Frame],
+    judged: Callable[[Frame, Sequence[np.ndarray]], dict[str, Any]],
     plan: Plan,
-    clock: Clock,
     clock_name: str,
     steps: Sequence[int],
-    solutions: Solutions,
 ) -> None:
-    """Measure peers into the journal, frame by frame.
+    """Measure a peer into the journal, frame by frame.
 
     Args:
         journal: Where rows go.
-        problems: The problem in float32, whose terms are handed over, and in float64, which judges.
+        peer: The peer.
+        python: The Python that has it.
+        problem: The problem in float32, whose terms are handed over.
         frames: The frames.
-        peers: The peers and their Pythons.
+        judged: Judges fine positions [m] of a frame, as values of a row.
         plan: Repeats and the longest time.
-        clock: Says what is going on.
         clock_name: "wall" or "cpu".
         steps: Budgets.
-        solutions: What the results are compared to.
     """
-    timed, judge = problems
-    for peer, python in peers:
-        for frame in frames:
-            key = {"method": peer.name, "frame": frame.time}
-            if journal.one("point", **key) or journal.one("failed", **key):
-                continue
-            clock.say(peer.name)
-            try:
-                found = _run(peer, python, timed, frame, plan=plan, clock_name=clock_name, steps=steps)
-            except SolveError as error:
-                journal.add("failed", steps=0, error=str(error), **key)
-                continue
-            for nested, count, points, times in found:
-                name = f"{peer.name}, nested" if nested else peer.name
-                judged = asdict(judge.judge(frame, points)) | {"apart_mm": solutions.apart_mm(frame, points)}
-                about = {"integrator": peer.name, "nested": nested, "note": peer.note, "made": count}
-                for repeat, ms in enumerate(times):
-                    more = judged if not repeat else {}
-                    journal.add(
-                        "point", method=name, frame=frame.time, steps=count, repeat=repeat, ms=ms, **about, **more
-                    )
+    for frame in frames:
+        key = {"method": peer.name, "frame": frame.time}
+        if journal.one("point", **key) or journal.one("failed", **key):
+            continue
+        try:
+            results = _run(peer, python, problem, frame, plan=plan, clock_name=clock_name, steps=steps)
+        except SolveError as error:
+            journal.add("failed", steps=0, error=str(error), **key)
+            continue
+        for nested, made, points, times in results:
+            key["method"] = f"{peer.name}, nested" if nested else peer.name
+            values = judged(frame, points)
+            about = {"integrator": peer.name, "nested": nested, "note": peer.note, "made": made}
+            for repeat, ms in enumerate(times):
+                first = {} if repeat else values
+                journal.add("point", **key, steps=made, repeat=repeat, ms=ms, **about, **first)
 
 
 def _run(
@@ -138,9 +132,9 @@ def _run(
     [part] = parts
     group = problem.refiner.group_of(part)
     with tempfile.TemporaryDirectory() as folder:
-        given, result = Path(folder) / "problem.npz", Path(folder) / "result.npz"
-        np.savez(given, **dict(_problem(problem, frame, part)))
-        line = [python, str(HERE / peer.adapter), str(given), str(result)]
+        handed, result = Path(folder) / "problem.npz", Path(folder) / "result.npz"
+        np.savez(handed, **dict(_problem(problem, frame, part)))
+        line = [python, str(HERE / peer.adapter), str(handed), str(result)]
         line += ["--steps", ",".join(map(str, steps)), "--repeats", str(plan.repeats)]
         line += ["--most-ms", str(plan.most_ms), "--clock", clock_name, *peer.options]
         if peer.follows:
