@@ -82,7 +82,15 @@ def budgets_of(growth: float) -> Iterator[int]:
 
 
 class CurveBench:
-    """Runs methods by budgets on frames; rows that are in the journal are not measured again."""
+    """Runs methods by budgets on frames; rows that are in the journal are not measured again.
+
+    Attributes:
+        journal: Where rows go.
+        timed: The problem in float32.
+        frames: The frames.
+        plan: Repeats, budgets and the longest time.
+        clock: Says when to stop.
+    """
 
     def __init__(
         self,
@@ -94,23 +102,14 @@ class CurveBench:
         clock: Clock,
         solutions: Solutions,
     ) -> None:
-        """Set up.
-
-        Args:
-            journal: Where rows go.
-            problems: The problem in float32, which is timed, and in float64, which judges.
-            frames: The frames.
-            plan: Repeats, budgets and the longest time.
-            clock: Says when to stop.
-            solutions: What the results are compared to.
-        """
-        self._journal, self._frames, self._plan, self._clock = journal, frames, plan, clock
+        """Set up with the problem in float32, which is timed, and in float64, which judges; and each frame's solution."""
+        self.journal, self.frames, self.plan, self.clock = journal, frames, plan, clock
         self._solutions = solutions
-        self._timed, self._judge = problems
+        self.timed, self._judge = problems
 
     def measure(self, curves: Sequence[Curve]) -> None:
         """Measure every curve."""
-        plan, clock = self._plan, self._clock
+        plan, clock = self.plan, self.clock
         self._without_physics()
         first_above = next(steps for steps in budgets_of(plan.growth) if steps >= COLD.steps)
         for repeat in range(plan.repeats):
@@ -134,11 +133,11 @@ class CurveBench:
     def _without_physics(self) -> None:
         """The two rows that no solver makes."""
         for name, smooth in ((UPSAMPLED, False), (SMOOTH, True)):
-            for frame in self._frames:
-                if self._journal.one("point", method=name, frame=frame.time):
+            for frame in self.frames:
+                if self.journal.one("point", method=name, frame=frame.time):
                     continue
                 began = time.perf_counter()
-                points = self._timed.upsampled(frame, smooth=smooth)
+                points = self.timed.upsampled(frame, smooth=smooth)
                 spent = 1e3 * (time.perf_counter() - began)
                 self._add(name, frame, spent, steps=0, repeat=0, made=0, **self.judged(frame, points))
 
@@ -149,15 +148,15 @@ class CurveBench:
         if curve is not None:
             settings = replace(settings, method=curve.method, steps=steps, tolerance=0.0)
             about = {"integrator": curve.integrator, "nested": curve.method.nested}
-        for frame in self._frames:
+        for frame in self.frames:
             key = {"method": name, "steps": steps, "frame": frame.time}
-            if self._journal.one("point", repeat=repeat, **key) or self._journal.one("failed", **key):
+            if self.journal.one("point", repeat=repeat, **key) or self.journal.one("failed", **key):
                 continue
-            self._clock.say(f"{name}, {counted(steps, 'step')}, turn {repeat + 1} of {self._plan.repeats}")
+            self.clock.say(f"{name}, {counted(steps, 'step')}, turn {repeat + 1} of {self.plan.repeats}")
             try:
-                solved = self._timed.solve(frame, settings)
+                solved = self.timed.solve(frame, settings)
             except SolveError as error:
-                self._journal.add("failed", error=str(error), **key)
+                self.journal.add("failed", error=str(error), **key)
                 continue
             values = {} if repeat else self.judged(frame, solved.points)
             values |= {"made": solved.steps, "elapsed": solved.elapsed, "waited": solved.waited}
@@ -165,17 +164,17 @@ class CurveBench:
 
     def _is_done(self, name: str, steps: int) -> bool:
         """Whether a method's next budget would take too long, or gets nowhere."""
-        rows = self._journal.rows("point", method=name, repeat=0)
+        rows = self.journal.rows("point", method=name, repeat=0)
         last = [row for row in rows if row["steps"] == steps]
-        if len(last) < len(self._frames):
+        if len(last) < len(self.frames):
             return True
-        if expected_ms(rows, steps, self._plan.growth) > self._plan.most_ms * allowance(self._gap(last)):
+        if expected_ms(rows, steps, self.plan.growth) > self.plan.most_ms * allowance(self._gap(last)):
             return True
         return self._is_flat(rows, steps)
 
     def _gap(self, rows: list[dict[str, Any]]) -> float:
         """The gap that a row of each frame leaves over all frames."""
-        start, least = (sum(row[name] for row in self._journal.rows("reference")) for name in ("start", "least"))
+        start, least = (sum(row[name] for row in self.journal.rows("reference")) for name in ("start", "least"))
         return (_energy(rows) - least) / max(start - least, 1e-30)
 
     def _is_flat(self, rows: list[dict[str, Any]], steps: int) -> bool:
@@ -184,11 +183,11 @@ class CurveBench:
         if len(budgets) < 3:
             return False
         totals = [_energy([row for row in rows if row["steps"] == each]) for each in budgets]
-        fall = max(_energy(self._journal.rows("point", method=UPSAMPLED)) - totals[-1], 1e-30)
+        fall = max(_energy(self.journal.rows("point", method=UPSAMPLED)) - totals[-1], 1e-30)
         return all(math.isfinite(total) and abs(total - totals[-1]) < FLAT * fall for total in totals)
 
     def _add(self, name: str, frame: Frame, spent: float, **values: Any) -> None:
-        self._journal.add("point", method=name, frame=frame.time, ms=round(spent, 3), **values)
+        self.journal.add("point", method=name, frame=frame.time, ms=round(spent, 3), **values)
 
 
 def _energy(rows: list[dict[str, Any]]) -> float:

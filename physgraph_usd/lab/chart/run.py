@@ -27,10 +27,10 @@ from ...usd.write.atomic import check_place
 from ...version import __version__
 from .journal import NAME as JOURNAL
 from .journal import Journal
-from .measure import Curve, CurveBench, budgets_of, find_curves
+from .measure import Curve, CurveBench, find_curves
 from .options import LONG, ChartOptions, Clock, Plan, make_plan
 from .page import write_page
-from .peers.run import measure_peer, parse_peers
+from .peers.run import measure_peers, parse_peers
 from .plot import draw_chart
 from .problem import COLD, Problem, plain_detail
 from .reference import Solutions, find_reference
@@ -40,8 +40,6 @@ from .terms import RUN, TermBench, measure_terms
 DEFAULTS = ChartOptions()
 WRITTEN = ("chart.png", "chart.svg", "chart.html", "chart.csv", "chart.json")
 """Files that a chart leaves beside its rows."""
-MOST_PEER_STEPS = 1024
-"""Largest budget of a solver outside."""
 
 
 def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEFAULTS) -> Chart:
@@ -124,20 +122,7 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
             journal.add("reference", frame=frame.time, **found.plain())
     bench = CurveBench(journal, problems, frames, plan=plan, clock=clock, solutions=solutions)
     bench.measure(curves)
-    budgets = [steps for steps in budgets_of(plan.growth) if steps <= MOST_PEER_STEPS]
-    for peer, python in parse_peers(options.peers):
-        clock.say(peer.name)
-        measure_peer(
-            journal,
-            peer,
-            python,
-            problem=problems[0],
-            frames=frames,
-            judged=bench.judged,
-            plan=plan,
-            clock_name=options.clock,
-            steps=budgets,
-        )
+    measure_peers(bench, parse_peers(options.peers), clock_name=options.clock)
     row = tuple(_frame(opened, time) for time in _row_up_to(opened, frames[-1].time))
     measure_terms(journal, TermBench(*problems, opened.scene, levels, frames=frames, row=row, build=build), clock)
     return journal

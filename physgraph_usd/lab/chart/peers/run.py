@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,13 @@ from ....solver.forces.stretch import Stretch
 from ....solver.frame.group import Group
 from ....solver.level import Level
 from ....solver.scene import Frame
-from ..journal import Journal
+from ..measure import CurveBench, budgets_of
 from ..options import Plan
 from ..problem import Problem
 
 HERE = Path(__file__).parent
+MOST_STEPS = 1024
+"""Largest budget of a solver outside."""
 
 
 @dataclass(frozen=True)
@@ -79,57 +82,36 @@ def parse_peers(values: Sequence[str]) -> list[tuple[Peer, str]]:
     return found
 
 
-def measure_peer(
-    journal: Journal,
-    peer: Peer,
-    python: str,
-    *,
-    problem: Problem,
-    frames: Sequence[Frame],
-    judged: Callable[[Frame, Sequence[np.ndarray]], dict[str, Any]],
-    plan: Plan,
-    clock_name: str,
-    steps: Sequence[int],
-) -> None:
-    """Measure a peer into the journal, frame by frame.
-
-    Args:
-        journal: Where rows go.
-        peer: The peer.
-        python: The Python that has it.
-        problem: The problem in float32, whose terms are handed over.
-        frames: The frames.
-        judged: Judges fine positions [m] of a frame, as values of a row.
-        plan: Repeats and the longest time.
-        clock_name: "wall" or "cpu".
-        steps: Budgets.
-    """
-    for frame in frames:
+def measure_peers(bench: CurveBench, peers: Sequence[tuple[Peer, str]], *, clock_name: str) -> None:
+    """Measure peers, each with its Python, on the frames of a bench by a clock that is "wall" or "cpu"."""
+    for (peer, python), frame in product(peers, bench.frames):
         key = {"method": peer.name, "frame": frame.time}
-        if journal.one("point", **key) or journal.one("failed", **key):
+        if bench.journal.one("point", **key) or bench.journal.one("failed", **key):
             continue
+        bench.clock.say(peer.name)
         try:
-            results = _run(peer, python, problem, frame, plan=plan, clock_name=clock_name, steps=steps)
+            results = _run(peer, python, bench.timed, frame, plan=bench.plan, clock_name=clock_name)
         except SolveError as error:
-            journal.add("failed", steps=0, error=str(error), **key)
+            bench.journal.add("failed", steps=0, error=str(error), **key)
             continue
-        for nested, made, points, times in results:
+        for nested, steps, points, times in results:
             key["method"] = f"{peer.name}, nested" if nested else peer.name
-            values = judged(frame, points)
-            about = {"integrator": peer.name, "nested": nested, "note": peer.note, "made": made}
+            judged = bench.judged(frame, points)
+            about = {"integrator": peer.name, "nested": nested, "note": peer.note, "made": steps}
             for repeat, ms in enumerate(times):
-                first = {} if repeat else values
-                journal.add("point", **key, steps=made, repeat=repeat, ms=ms, **about, **first)
+                first = {} if repeat else judged
+                bench.journal.add("point", **key, steps=steps, repeat=repeat, ms=ms, **about, **first)
 
 
 def _run(
-    peer: Peer, python: str, problem: Problem, frame: Frame, *, plan: Plan, clock_name: str, steps: Sequence[int]
+    peer: Peer, python: str, problem: Problem, frame: Frame, *, plan: Plan, clock_name: str
 ) -> list[tuple[bool, int, tuple[np.ndarray, ...], list[float]]]:
     """Results of one frame: nested or flat, steps, positions [m] and times [ms]."""
     parts = problem.refiner.parts_of(frame)
     if len(parts) != 1:
         raise SolveError(f"{peer.name} is given one problem a frame, and here are {len(parts)} that do not touch")
     [part] = parts
+    steps = [count for count in budgets_of(plan.growth) if count <= MOST_STEPS]
     group = problem.refiner.group_of(part)
     with tempfile.TemporaryDirectory() as folder:
         handed, result = Path(folder) / "problem.npz", Path(folder) / "result.npz"
