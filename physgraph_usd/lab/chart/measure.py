@@ -102,7 +102,7 @@ class CurveBench:
         clock: Clock,
         solutions: Solutions,
     ) -> None:
-        """Set up with the problem in float32, which is timed, and in float64, which judges; and each frame's solution."""
+        """Take the problem in float32, which is timed, and in float64, which judges, and each frame's solution."""
         self.journal, self.frames, self.plan, self.clock = journal, frames, plan, clock
         self._solutions = solutions
         self.timed, self._judge = problems

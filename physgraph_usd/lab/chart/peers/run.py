@@ -109,7 +109,7 @@ def _run(
     """Results of one frame: nested or flat, steps, positions [m] and times [ms]."""
     parts = problem.refiner.parts_of(frame)
     if len(parts) != 1:
-        raise SolveError(f"{peer.name} is given one problem a frame, and here are {len(parts)} that do not touch")
+        raise SolveError(f"{peer.name} solves garments that touch as one; the frame has {len(parts)} groups apart")
     [part] = parts
     steps = [count for count in budgets_of(plan.growth) if count <= MOST_STEPS]
     group = problem.refiner.group_of(part)
