@@ -18,9 +18,9 @@ from bodies import Soup, ball, together, tube
 from cloth import DOWN, Answer, Solver, settings_of
 from folds import EDGE, Cloth, folded, frame_with, named, square, strip
 from meshes import mesh_of
+from physgraph_usd.solver.frame.pipeline import Refiner
 
 from physgraph_usd.solver.colliders.pose import Collider, MeshPose
-from physgraph_usd.solver.frame.pipeline import Refiner
 from physgraph_usd.solver.scene import Frame, Garment, Scene
 
 
