@@ -18,9 +18,11 @@ from bodies import Soup, ball, together, tube
 from cloth import DOWN, Answer, Solver, settings_of
 from folds import EDGE, Cloth, folded, frame_with, named, square, strip
 from meshes import mesh_of
-from physgraph_usd.solver.frame.pipeline import Refiner
 
 from physgraph_usd.solver.colliders.pose import Collider, MeshPose
+from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.mesh.subdivide import Refinement
 from physgraph_usd.solver.scene import Frame, Garment, Scene
 
 
@@ -186,17 +188,19 @@ def refined(name: str) -> tuple[Answer, ...]:
 
 def upsampled(name: str, frame: int, level: int = 1) -> list[np.ndarray]:
     """The cages of a frame, placed linearly at a level [m]."""
-    made = shot_of(name)
-    chains = Refiner.subdivide(made.scene, [level] * len(made.scene.garments))
-    cages = made.frames[frame].garments
-    return [chain[-1].linear @ cage.points for chain, cage in zip(chains, cages, strict=True)]
+    cages = shot_of(name).frames[frame].garments
+    return [steps[-1].linear @ cage.points for steps, cage in zip(_steps(name, level), cages, strict=True)]
 
 
 def triangles(name: str, level: int = 1) -> list[np.ndarray]:
     """The triangles of each garment at a level."""
-    made = shot_of(name)
-    chains = Refiner.subdivide(made.scene, [level] * len(made.scene.garments))
-    return [chain[-1].mesh.triangulate().triangles.astype(np.int64) for chain in chains]
+    return [steps[-1].mesh.triangulate().triangles.astype(np.int64) for steps in _steps(name, level)]
+
+
+@cache
+def _steps(name: str, level: int) -> list[tuple[Refinement, ...]]:
+    garments = shot_of(name).scene.garments
+    return refine_garments(garments, [level] * len(garments))
 
 
 def soup_of(points: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
