@@ -1,4 +1,4 @@
-"""What is authored in our names and never read: misspelt attributes, values in the wrong place, connections."""
+"""Faults of authored attributes: beyond limits, misspelt, in the wrong place, connected to no value."""
 
 from __future__ import annotations
 
@@ -21,13 +21,9 @@ _BLENDERS = {name.replace("physgraph:", "physgraph_") for name in _NAMES if name
 
 
 def unread(prims: Iterable[Usd.Prim]) -> list[Notice]:
-    """Tell of what is authored for garments and colliders, on them, above them or on their materials, and not read.
+    """Notices of properties on garments or colliders, above them or on their materials, that are not read.
 
-    Args:
-        prims: Garments and colliders.
-
-    Returns:
-        One notice per property, with the name that is spelt most like it.
+    Each has the name that is spelt most like it.
     """
     notices: dict[Notice, None] = {}
     for prim in prims:
@@ -49,16 +45,16 @@ def _unread_on(prim: Usd.Prim, *, material: bool) -> Iterator[Notice]:
 
 
 def _fault(name: str, *, material: bool) -> str:
-    """Why a property of our namespace is not read, or ""."""
+    """The reason why a property of our namespace is not read, or ""."""
     if name in _NAMES:
         return "is not read on a material; author it on the garment" if material and MATERIAL not in name else ""
     near = nearest_property(name, PROPERTIES)
-    message = f"did you mean {near.name}?" if near else "docs/attributes.md lists all"
-    return "" if name in _WRITTEN | _BLENDERS else f"is no attribute that refining reads; {message}"
+    hint = f"did you mean {near.name}?" if near else "docs/attributes.md lists all"
+    return "" if name in _WRITTEN | _BLENDERS else f"is no attribute that refining reads; {hint}"
 
 
 def _connection_fault(attribute: Usd.Attribute) -> str:
-    """Why the connection of an attribute is not followed, or ""."""
+    """The reason why the connection of an attribute is not followed, or ""."""
     painted = attribute and attribute.GetName().startswith(PREFIX)
     if not attribute or not attribute.HasAuthoredConnections() or (connected(attribute) and not painted):
         return ""
@@ -67,37 +63,33 @@ def _connection_fault(attribute: Usd.Attribute) -> str:
 
 
 def beyond_limits(prim: Usd.Prim, schema: str = GARMENT_API) -> Iterator[tuple[Usd.Attribute, str, bool]]:
-    """Iterate over what a prim, its ancestors or its material author for it beyond limits.
-
-    Args:
-        prim: A garment or a collider.
-        schema: `GARMENT_API` or `COLLIDER_API`.
+    """Values that a garment or collider, its ancestors or its material author beyond limits.
 
     Yields:
-        The attribute, what is wrong with value and limits, and whether the limits are hard.
+        The attribute, the fault with value and limits, and whether the limits are hard.
     """
     for row in PROPERTIES:
         if row.schema != schema or row.soft is None:
             continue
-        attribute = _giver(prim, row)
+        attribute = _source(prim, row)
         values = [] if attribute is None else _extremes(attribute)
         hard = next((value for value in values if not is_within(value, row.minimum, row.maximum)), None)
         soft = next((value for value in values if not is_within(value, *row.soft)), None)
         if attribute is not None and hard is not None:
-            yield attribute, _said(row, hard, "hard", (row.minimum, row.maximum)), True
+            yield attribute, _fault_of(row, hard, "hard", (row.minimum, row.maximum)), True
         elif attribute is not None and soft is not None:
-            yield attribute, _said(row, soft, "soft", row.soft), False
+            yield attribute, _fault_of(row, soft, "soft", row.soft), False
 
 
 def beyond_limits_of_all(garments: list[Usd.Prim], colliders: list[Usd.Prim]) -> Iterator[tuple[str, str]]:
-    """Iterate over paths and faults of what is authored beyond limits for garments and colliders."""
+    """Paths and faults of values beyond limits, of garments and colliders."""
     for schema, prims in ((GARMENT_API, garments), (COLLIDER_API, colliders)):
         for prim in prims:
             for attribute, message, _ in beyond_limits(prim, schema):
                 yield str(attribute.GetPrim().GetPath()), f"{attribute.GetName()} {message}"
 
 
-def _giver(prim: Usd.Prim, row: Property) -> Usd.Attribute | None:
+def _source(prim: Usd.Prim, row: Property) -> Usd.Attribute | None:
     """The attribute that gives a value; None where none is authored."""
     if not row.interpolation:
         return find_value(prim, row).attribute
@@ -113,7 +105,7 @@ def _extremes(attribute: Usd.Attribute) -> list[float]:
     return [float(pick(each)) for pick in (np.min, np.max) for each in numbers]
 
 
-def _said(row: Property, value: float, kind: str, ends: tuple[float | None, float | None]) -> str:
+def _fault_of(row: Property, value: float, kind: str, ends: tuple[float | None, float | None]) -> str:
     low, high = ("" if end is None else f"{end:g}" for end in ends)
     unit = f" {row.unit}" if row.unit else ""
     return f"is {value:.7g}{unit}, beyond its {kind} limits {low} .. {high}".rstrip()

@@ -1,6 +1,7 @@
 """Colliders, read from meshes and primitives and posed in world metres.
 
-A collider never stops the work: a pose that cannot be used at some time is left out there, with a notice.
+A pose that cannot be used at some time is left out there, with a notice. A primitive that its transform makes into a
+shape without a name, such as an ellipsoid, becomes a mesh.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import COLLIDER_OFFSET, COLLIDER_SIDE, find_token, find_value
-from ..stage import Notice, timecode
+from ..stage import Notice, timecode, value_at
 from .placement import is_flipped, place
 
 _EVEN = 1e-4
 """Relative difference under which two scales count as the same."""
 _PLANE_START = ("plane", "start")
 _KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
-AROUND, ALONG = 64, 24
-"""Segments around the axis and along a half circle."""
+_TURNS, _RISES = 64, 24
+"""Segments about the axis and along a half circle."""
 
 UPRIGHT = {
     "X": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
@@ -62,14 +63,7 @@ class ColliderReader:
     _topology: _Topology | None = None
 
     def pose(self, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
-        """Pose the collider at a time code, between its own samples as USD interpolates them.
-
-        Args:
-            time: Time code, or None for the default.
-
-        Returns:
-            The pose, or None where there is none, and why.
-        """
+        """Pose at a time code, interpolated as USD does; None, with a notice why, where there is none."""
         matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(self.prim), dtype=np.float64).T
         matrix[:3] *= self.metres
         if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
@@ -97,12 +91,12 @@ class ColliderReader:
 
         Quads are split as they lie in the collider's first sample, whichever frame is read first.
         """
-        known = self._topology
-        if known is None or not known.equals(counts, indices, flip):
+        cached = self._topology
+        if cached is None or not cached.equals(counts, indices, flip):
             triangles = PolygonMesh(counts, indices, len(points)).triangulate(np.nan_to_num(points)).triangles
-            known = _Topology(counts, indices, flip, np.ascontiguousarray(triangles[:, ::-1]) if flip else triangles)
-            self._topology = known
-        return known.triangles
+            cached = _Topology(counts, indices, flip, np.ascontiguousarray(triangles[:, ::-1]) if flip else triangles)
+            self._topology = cached
+        return cached.triangles
 
     def _shape(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         kind, size, axes = _measures(self.prim, time)
@@ -142,14 +136,11 @@ class ColliderReader:
 
 
 def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None, tuple[Notice, ...]]:
-    """Read a collider's identity.
+    """Reader of a gprim as a collider, or None for a kind of prim that cloth cannot touch, and notices.
 
     Args:
         prim: A gprim.
         metres: Length of one stage unit [m].
-
-    Returns:
-        Its reader, or None for a kind of prim that cloth cannot touch, and notices.
 
     Raises:
         SchemaError: When its offset or its side cannot be used.
@@ -165,10 +156,8 @@ def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None,
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
-    """An array at a time code; what has samples only gives its first for the default."""
-    value = attribute.Get(timecode(time))
-    if value is None:
-        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    """An attribute's array at a time code, or its first."""
+    value = value_at(attribute, time)
     return np.zeros(0, np.int32) if value is None else np.asarray(value)
 
 
@@ -204,24 +193,21 @@ def _frame_about(normal: np.ndarray) -> np.ndarray:
 
 
 def tessellated(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of a primitive about its third axis.
+    """Points, shape (V, 3), and outward triangles, shape (T, 3), int32, of a primitive about its third axis.
 
     Args:
         kind: "sphere", "capsule", "cylinder", "cone" or "cube".
         size: Half sizes, the capsule's without its caps, shape (3,).
-
-    Returns:
-        Points, shape (V, 3), and triangles wound outward, shape (T, 3), int32.
     """
     if kind == "cube":
         return _box(size)
-    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, ALONG + 1)
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _RISES + 1)
     arc = size[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     height = size[2]
     shift = np.array([0.0, height])
     profiles = {
         "sphere": arc,
-        "capsule": np.concatenate([arc[: ALONG // 2 + 1] - shift, arc[ALONG // 2 :] + shift]),
+        "capsule": np.concatenate([arc[: _RISES // 2 + 1] - shift, arc[_RISES // 2 :] + shift]),
         "cylinder": np.array([[0.0, -height], [size[0], -height], [size[0], height], [0.0, height]]),
         "cone": np.array([[0.0, -height], [size[0], -height], [0.0, height]]),
     }
@@ -231,15 +217,15 @@ def tessellated(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _revolved(profile: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Turn a profile of (radius, height) rows, upwards, about the third axis and close it at two heights."""
     rows = len(profile)
-    a = 2.0 * np.pi * np.arange(AROUND) / AROUND
+    a = 2.0 * np.pi * np.arange(_TURNS) / _TURNS
     ring = np.stack([profile[:, :1] * np.cos(a), profile[:, :1] * np.sin(a), profile[:, 1:] + 0.0 * a], axis=2)
     ends = np.array([[0.0, 0.0, poles[0]], [0.0, 0.0, poles[1]]])
-    ids = np.arange(rows * AROUND).reshape(rows, AROUND)
+    ids = np.arange(rows * _TURNS).reshape(rows, _TURNS)
     here, there = ids, np.roll(ids, -1, axis=1)
     quads = np.stack([here[:-1], there[:-1], there[1:], here[1:]], axis=-1).reshape(-1, 4)
-    south, north = rows * AROUND, rows * AROUND + 1
-    bottom = np.stack([np.full(AROUND, south), there[0], here[0]], axis=1)
-    top = np.stack([np.full(AROUND, north), here[-1], there[-1]], axis=1)
+    south, north = rows * _TURNS, rows * _TURNS + 1
+    bottom = np.stack([np.full(_TURNS, south), there[0], here[0]], axis=1)
+    top = np.stack([np.full(_TURNS, north), here[-1], there[-1]], axis=1)
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], bottom, top])
     return np.concatenate([ring.reshape(-1, 3), ends]), triangles.astype(np.int32)
 

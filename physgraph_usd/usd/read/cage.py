@@ -1,7 +1,11 @@
-"""The coarse cage: a mesh prim's topology, checked.
+"""The coarse cage: a mesh prim's topology, checked, and its points at a time, with broken ones repaired.
 
-Faces that are holes or have fewer than three corners are left out. What no solver could use is refused, with the prim,
-the time code and the index.
+Faces that are holes or have fewer than three corners are left out. A topology that no solver could use is refused.
+
+Repair: a point that is not finite is put where its finite neighbours moved it since the last good sample: its position
+there plus the neighbours' mean displacement. Without finite neighbours it is held there; without an earlier good sample
+the next good one is used; without either it is the mean of its neighbours. It reads only the stage, never what was read
+before, so the order in which frames are read does not matter.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ from pxr import Usd, UsdGeom
 
 from ...errors import GarmentError, counted
 from ...solver.mesh.topology import PolygonMesh
-from ..stage import Notice, timecode
+from ..stage import Notice, value_at
 
 _CONTROLS = {
     "subdivisionScheme": ("catmullClark", "loop", "bilinear", "none"),
@@ -34,9 +38,9 @@ class Cage:
     """A garment's topology.
 
     Attributes:
-        mesh: Kept faces, in authored order and winding.
-        kept_faces: Which authored faces these are, int32.
-        notices: What was left out.
+        mesh: Faces that are kept, in authored order and winding.
+        kept_faces: Numbers of these among the authored faces, int32.
+        notices: Faces and features that were left out.
     """
 
     mesh: PolygonMesh
@@ -45,15 +49,10 @@ class Cage:
 
 
 def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage:
-    """Read and check the topology.
-
-    Args:
-        prim: Mesh prim.
-        vertex_count: Number of points.
-        times: The garment's time codes; empty for a still one.
+    """Read the topology of a mesh with some number of points and some time codes (none for a still one).
 
     Raises:
-        GarmentError: When the topology is empty, broken or varies in time.
+        GarmentError: When it is empty, broken or varies in time.
     """
     path, usd = str(prim.GetPath()), UsdGeom.Mesh(prim)
     counts_attr, indices_attr = usd.GetFaceVertexCountsAttr(), usd.GetFaceVertexIndicesAttr()
@@ -64,10 +63,10 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
     counts, indices = (read_integers(attribute, time) for attribute in (counts_attr, indices_attr))
     check_topology(path, counts, indices, vertex_count=vertex_count, time=time)
     holes = read_integers(holes_attr, time)
-    known = np.unique(holes[(holes >= 0) & (holes < len(counts))])
+    valid_holes = np.unique(holes[(holes >= 0) & (holes < len(counts))])
     keep = counts >= 3
-    notices = _left_out(path, keep, len(holes) - np.isin(holes, known).sum())
-    keep[known] = False
+    notices = _left_out(path, keep, len(holes) - np.isin(holes, valid_holes).sum())
+    keep[valid_holes] = False
     if not keep.any():
         raise GarmentError(path, f"every one of its {len(counts)} faces is a hole", remedy="clear holeIndices")
     _refuse_large_faces(path, counts, indices, keep)
@@ -78,9 +77,7 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
 
 def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
     """Integer array at a time code, or at the first sample where there is no default; empty when unauthored."""
-    value = attribute.Get(timecode(time))
-    if value is None:
-        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    value = value_at(attribute, time)
     array = np.zeros(0) if value is None else np.asarray(value)
     if array.ndim != 1 or (len(array) and not np.issubdtype(array.dtype, np.integer)):
         message = f"{attribute.GetName()} is {type(value).__name__}, not an array of integers"
@@ -89,11 +86,7 @@ def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
 
 
 def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
-    """Refuse an attribute whose samples differ between the first and last time code; equal samples pass.
-
-    Raises:
-        GarmentError: With the first time code at which it changes.
-    """
+    """Refuse (GarmentError) an attribute whose samples differ between the first and last time code."""
     samples = attribute.GetTimeSamples()
     if len(samples) < 2 or not times:
         return
@@ -107,11 +100,7 @@ def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
 def check_topology(
     path: str, counts: np.ndarray, indices: np.ndarray, *, vertex_count: int, time: float | None
 ) -> None:
-    """Refuse a topology that no reader could use.
-
-    Raises:
-        GarmentError: With the faulty index or sum.
-    """
+    """Refuse a topology that no reader could use; GarmentError gives the faulty index or sum."""
     remedy = "export the mesh again or repair it in its host program"
     if len(counts) == 0 or vertex_count == 0 or not (counts >= 3).any():
         message = f"the mesh is empty: {vertex_count} points, {len(counts)} faces"
@@ -131,13 +120,13 @@ def check_topology(
 
 def _refuse_large_faces(path: str, counts: np.ndarray, indices: np.ndarray, keep: np.ndarray) -> None:
     """Refuse faces of so many corners that no solve ends, or fewer where one lies on another."""
-    starts, known = np.cumsum(counts) - counts, dict[bytes, int]()
+    starts, faces = np.cumsum(counts) - counts, dict[bytes, int]()
     for face in np.flatnonzero(keep & (counts > MOST_TWICE)).tolist():
         count = int(counts[face])
         remedy = "remesh it, or triangulate it"
         if count > MOST_CORNERS:
             raise GarmentError(path, f"face {face} has {count:,} corners; {MOST_CORNERS:,} are the most", remedy=remedy)
-        first = known.setdefault(np.sort(indices[starts[face] :][:count]).tobytes(), face)
+        first = faces.setdefault(np.sort(indices[starts[face] :][:count]).tobytes(), face)
         if first != face:
             raise GarmentError(path, f"faces {first} and {face} have the same {count} corners", remedy="remove one")
 
@@ -156,7 +145,7 @@ def _left_out(path: str, keep: np.ndarray, unknown_holes: int) -> list[Notice]:
 
 
 def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
-    """Say which subdivision features of the cage refining does not honour."""
+    """Notices of subdivision features of the cage that refining does not honour."""
     authored = [
         attribute.GetName()
         for attribute in (usd.GetCreaseIndicesAttr(), usd.GetCornerIndicesAttr())
@@ -169,13 +158,14 @@ def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
 
 
 def _odd_controls(usd: UsdGeom.Mesh) -> list[Notice]:
-    """Tell of topology controls that USD does not define or that vary in time, which it forbids."""
+    """Notices of topology controls that USD does not define or that vary in time, which it forbids."""
     path, notices = str(usd.GetPath()), []
-    for name, known in _CONTROLS.items():
+    for name, tokens in _CONTROLS.items():
         attribute = usd.GetPrim().GetAttribute(name)
         value = attribute.Get(Usd.TimeCode.EarliestTime())
-        if value not in known:
-            notices.append(Notice(path, None, f"{name} is {value!r}; USD knows {', '.join(known)}; {known[0]} assumed"))
+        if value not in tokens:
+            message = f"{name} is {value!r}; USD knows {', '.join(tokens)}; {tokens[0]} assumed"
+            notices.append(Notice(path, None, message))
         if attribute.GetNumTimeSamples() > 1:
             notices.append(Notice(path, None, f"{name} has time samples, which USD does not allow; the first is used"))
     return notices
@@ -190,21 +180,18 @@ class PointReader:
     """
 
     def __init__(self, prim: Usd.Prim, first: float | None) -> None:
-        """Take the points of a mesh prim; ``first`` is the time code whose number of points counts."""
+        """Read the number of points of a mesh prim at a time code."""
         self.path = str(prim.GetPath())
         self._attribute = UsdGeom.Mesh(prim).GetPointsAttr()
         self._times = self._attribute.GetTimeSamples()
         self.count = len(self._raw(first))
 
     def read(self, time: float | None, edges: np.ndarray) -> tuple[np.ndarray, tuple[Notice, ...]]:
-        """Read the points at a time code.
+        """Local positions [stage units] at a time code, shape (V, 3), float64, all finite, and notices of repairs.
 
         Args:
             time: Time code, or None for the default.
             edges: Edges of the mesh, shape (E, 2).
-
-        Returns:
-            Local positions [stage units], shape (V, 3), float64, all finite, and what was repaired.
 
         Raises:
             GarmentError: When the number of points changes or too many are broken.
@@ -236,10 +223,7 @@ class PointReader:
         return repaired, (Notice(self.path, time, message),)
 
     def _raw(self, time: float | None) -> np.ndarray:
-        value = self._attribute.Get(timecode(time))
-        if value is None:
-            value = self._attribute.Get(Usd.TimeCode.EarliestTime())
-        return as_points(value, self.path, "points", time=time)
+        return as_points(value_at(self._attribute, time), self.path, "points", time=time)
 
     def _good_sample(self, time: float | None) -> np.ndarray | None:
         """The nearest earlier sample whose points are all finite, else the nearest later one."""
@@ -253,11 +237,7 @@ class PointReader:
 
 
 def as_points(value: object, path: str, name: str, *, time: float | None = None) -> np.ndarray:
-    """Turn any USD array of three-vectors into positions, shape (V, 3), float64.
-
-    Raises:
-        GarmentError: When there is no value or it is of another kind.
-    """
+    """Turn a USD array of three-vectors into positions, shape (V, 3), float64; GarmentError where it is none."""
     if value is None:
         raise GarmentError(path, f"has no {name}", time=time, remedy="author point3f[] points, or leave the prim out")
     array = np.asarray(value)
@@ -270,7 +250,7 @@ def as_points(value: object, path: str, name: str, *, time: float | None = None)
 
 
 def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
-    """Replace points that are not finite, ring by ring inwards.
+    """Replace points that are not finite, ring by ring inwards; others keep their bits.
 
     Args:
         points: Positions, shape (V, 3).
@@ -278,7 +258,7 @@ def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) 
         reference: Positions at a sample where all are finite, shape (V, 3), or None.
 
     Returns:
-        Repaired positions, shape (V, 3); what could not be repaired is left as it was. Others keep their bits.
+        Positions, shape (V, 3), not finite where there is nothing to repair from.
     """
     base = np.zeros_like(points) if reference is None else reference
     out = points.copy()

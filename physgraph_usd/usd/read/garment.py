@@ -14,7 +14,7 @@ from ...errors import GarmentError, SchemaError
 from ...solver.mesh.fit import median_shape
 from ...solver.mesh.topology import PolygonMesh, edges_of
 from ...solver.scene import Garment, GarmentFrame
-from ..lookup import Override, check_limits, find_value
+from ..lookup import Found, Override, check_limits, find_value
 from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
 from ..times import garment_times, merge, transform_times, within
@@ -28,21 +28,21 @@ _SMALL, _LARGE = 0.01, 100.0
 _MEDIAN_FRAMES = 9
 """Time codes that `--rest auto` takes medians of: an edge that is odd in four of them does not count."""
 _THICK = 10.0
-"""Part of its size beyond which cloth keeps no distance: where all of it is near all of it, a query asks for V^2 pairs,
-and what is pushed out by more than it measures is no shape that the shot had."""
+"""Fraction (one over it) of its size beyond which cloth keeps no distance: where all of it is near all of it, there are
+V^2 pairs, and cloth that is pushed out by more than it measures has no shape of the shot."""
 _PER_VERTEX = {UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying}
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What was asked for, and what the garments of one stage share.
+    """The options of a run, and the units and skinning that the garments of a stage have in common.
 
     Attributes:
-        units: What the stage's numbers mean.
+        units: The stage's units.
         bake: Baked skinning.
         frames: First and last time code, or None.
         level: Number of subdivisions for all, -1 for auto, or None.
-        overrides: What ``--set`` gave.
+        overrides: Values of ``--set``.
         rest_frame: Time code whose points are the rest shape, "auto" for one fitted to all, or None.
         assumed_units: Whether metersPerUnit is not authored.
     """
@@ -58,15 +58,15 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class GarmentReader:
-    """A garment with what is needed to read its frames.
+    """A garment with everything that is needed to read its frames.
 
     Attributes:
         garment: Its constant data.
-        source: How it sits on the stage.
+        source: Its place on the stage.
         values: Sources of its animated values.
         points: Its points.
         edges: Its edges, shape (E, 2).
-        notices: What was found while reading.
+        notices: What is odd about it.
     """
 
     garment: Garment
@@ -77,15 +77,7 @@ class GarmentReader:
     notices: list[Notice] = field(default_factory=list)
 
     def frame(self, matrix: np.ndarray, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
-        """Read one time code.
-
-        Args:
-            matrix: From local space to world metres, shape (4, 4).
-            time: Time code, or None for the default.
-
-        Returns:
-            The frame, and what was repaired in it.
-        """
+        """The garment at a time code, and notices of repairs; ``matrix`` is local to world metres, shape (4, 4)."""
         local, notices = self.points.read(time, self.edges)
         names = ("guide:stiffness", "refine:detail", "contact:offset")
         guide, detail, offset = (self.values.number(name, time) for name in names)
@@ -105,12 +97,7 @@ def all_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
 
 
 def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) -> GarmentReader:
-    """Read a garment.
-
-    Args:
-        prim: Its mesh prim.
-        roots: The instances that hold it on the stage as opened.
-        request: What was asked for.
+    """Read a garment from its mesh prim; ``roots`` are the instances that hold it on the stage as opened.
 
     Raises:
         GarmentError: When the garment is broken.
@@ -129,26 +116,24 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     else:
         rest = checked(prim, edges, _rest_asked(prim, points, request, mesh=cage.mesh, every=every), first=start)
     values = find_values(prim, request.units, request.overrides)
-    level, level_source = _level(prim, request)
-    (own, own_source), (layer, layer_source) = _feels_itself(prim, request), _layer(prim, request)
+    self_contact, layer, level = _constants(prim, request)
+    order = layer.at(None)
     garment = Garment(
         path=str(prim.GetPath()),
         mesh=cage.mesh,
         rest=rest.points,
-        level=level,
+        level=round(level.at(None) or 0.0),
         flipped=is_flipped(prim, matrix),
         bent_rest=rests_bent(prim),
-        self_contact=own,
-        layer=layer,
+        self_contact=bool(self_contact.at(None)),
+        layer=None if order is None else round(order),
         **_painted(prim, points.count, notices, values=values),
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
-    named = {"contact:selfCollision": own_source, "contact:layer": layer_source, "rest": rest.source}
-    named |= values.sources | {"refine:level": level_source}
-    place_on_stage = (prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times)
+    sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
     source = GarmentSource(
-        *place_on_stage,
-        named,
+        *(prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times),
+        sources | values.sources | {"refine:level": level.source},
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
@@ -157,10 +142,19 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices])
 
 
+def _constants(prim: Usd.Prim, request: Request) -> list[Found]:
+    """Self-collision, layer and level, which never change over a shot."""
+    names = ("contact:selfCollision", "contact:layer", "refine:level")
+    *others, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
+    if request.level is not None and level.source != "--set":
+        level = Found(level.row, "--level", None, request.level)
+    return [*others, level]
+
+
 def _rest_asked(
     prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
 ) -> Rest:
-    """Rest shape that the user asked for: the points at a time code, or one fitted to all."""
+    """Rest shape of ``--rest``: the points at a time code, or one fitted to all."""
     if request.rest_frame == AUTO:
         return _rest_auto(prim, points, request, mesh=mesh, every=every)
     time = float(request.rest_frame or 0.0)
@@ -172,11 +166,11 @@ def _rest_asked(
 def _rest_auto(
     prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
 ) -> Rest:
-    """Rest shape: fitted to the median lengths that the edges have over the whole shot, whatever part is refined."""
+    """Rest shape fitted to the median lengths of the edges over the whole shot, whatever part is refined."""
     poses: dict[float | None, np.ndarray] = {}
     picks = np.linspace(0, len(every) - 1, min(_MEDIAN_FRAMES, len(every))).round().astype(int)
     for time in [every[pick] for pick in picks] or [None]:
-        with contextlib.suppress(GarmentError):  # The frame's own turn to be refined names what is wrong with it.
+        with contextlib.suppress(GarmentError):  # Refining a broken frame names its fault.
             local = points.read(time, mesh.half_edges.edges)[0]
             poses[time] = place(local, to_metres(prim, request.units.metres, time))
     found = list(poses.values())
@@ -186,19 +180,20 @@ def _rest_auto(
     return Rest(shape, f"auto: {message} (--rest)")
 
 
-def _subsets(prim: Usd.Prim, kept: np.ndarray) -> dict[str, np.ndarray]:
+def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
     """Faces of the cage in each of the mesh's subsets of faces, by name."""
-    named = {}
+    subsets = {}
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
         faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
-        named[subset.GetPrim().GetName()] = np.flatnonzero(np.isin(kept, [] if faces is None else np.asarray(faces)))
-    return named
+        members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
+        subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
+    return subsets
 
 
 def _rest_on_stage(
     prim: Usd.Prim, matrix: np.ndarray, request: Request, *, edges: np.ndarray, start: np.ndarray, first: float | None
 ) -> Rest:
-    """Rest shape that the stage gives; a skinned one is placed by its bind transform, not by the mesh's own."""
+    """Rest shape on the stage; a skinned one is placed by its bind transform in place of the mesh's."""
     bound = matrix
     if prim.GetPath() in request.bake.skinned:
         rows = request.bake.rest_transform(prim.GetPath(), first)
@@ -206,26 +201,8 @@ def _rest_on_stage(
     return read_rest(prim, edges, start, place=lambda local: place(local, bound), baked=request.bake.layer)
 
 
-def _level(prim: Usd.Prim, request: Request) -> tuple[int, str]:
-    found = find_value(prim, GARMENT["refine:level"], request.overrides)
-    if request.level is not None and found.source != "--set":
-        return request.level, "--level"
-    return round(found.at(None) or 0.0), found.source
-
-
-def _layer(prim: Usd.Prim, request: Request) -> tuple[int | None, str]:
-    found = find_value(prim, GARMENT["contact:layer"], request.overrides)
-    place = found.at(None)
-    return None if place is None else round(place), found.source
-
-
-def _feels_itself(prim: Usd.Prim, request: Request) -> tuple[bool, str]:
-    found = find_value(prim, GARMENT["contact:selfCollision"], request.overrides)
-    return bool(found.at(None)), found.source
-
-
 def _painted(prim: Usd.Prim, count: int, notices: list[Notice], *, values: Values) -> dict[str, Any]:
-    """The painted arrays of a garment by field name, with the thickness's share; adds to the notices."""
+    """The painted arrays of a garment by field name, times the relative thickness; adds to the notices."""
     names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
     names |= {"detail_scale": "detailScale", "pin": "pin"}
     arrays = {}
@@ -238,7 +215,7 @@ def _painted(prim: Usd.Prim, count: int, notices: list[Notice], *, values: Value
 
 
 def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:
-    """Tell the garment's size in metres when units were assumed or the size is no garment's."""
+    """A notice of the size in metres when units were assumed or it is no garment's."""
     size = np.ptp(points, axis=0)
     largest = float(size.max())
     if not request.assumed_units and _SMALL <= largest <= _LARGE:
@@ -248,13 +225,13 @@ def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notic
 
 
 def _unit_notices(prim: Usd.Prim, matrix: np.ndarray, request: Request) -> list[Notice]:
-    """Tell of a layer in other units whose points no scale corrects; USD itself never converts."""
+    """A notice of each layer in other units whose points no scale corrects; USD never converts."""
     scale, metres = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3])))), request.units.metres
     notices = []
     for layer in dict.fromkeys(spec.layer for spec in UsdGeom.Mesh(prim).GetPointsAttr().GetPropertyStack()):
-        own = layer.pseudoRoot.GetInfo("metersPerUnit") if layer.pseudoRoot.HasInfo("metersPerUnit") else None
-        if isinstance(own, int | float) and not np.isclose(own, metres) and not np.isclose(own, scale, rtol=0.01):
-            message = f"its layer @{layer.GetDisplayName()}@ has {own:g} m per unit, the stage has {metres:g}"
+        unit = layer.pseudoRoot.GetInfo("metersPerUnit") if layer.pseudoRoot.HasInfo("metersPerUnit") else None
+        if isinstance(unit, int | float) and not np.isclose(unit, metres) and not np.isclose(unit, scale, rtol=0.01):
+            message = f"its layer @{layer.GetDisplayName()}@ has {unit:g} m per unit, the stage has {metres:g}"
             notices.append(Notice(str(prim.GetPath()), None, f"{message}; USD does not convert, check its size"))
     return notices
 
@@ -267,21 +244,20 @@ def is_visible(prim: Usd.Prim, times: Sequence[float]) -> bool:
 
 
 def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tuple[Notice, ...]]:
-    """Read one of the ``primvars:physgraph:*`` values; constant ones are inherited from ancestors as USD does.
+    """A painted multiplier or pin of a mesh at each point, shape (count,), float64, and notices.
+
+    Constant ones are inherited from ancestors as USD does.
 
     Args:
         prim: Mesh prim.
-        short: Short name of the row, such as ``bendScale``.
+        short: Short name of the schema's row, such as ``bendScale``.
         count: Number of points.
 
-    Returns:
-        Values, shape (count,), float64, and what was odd about them.
-
     Raises:
-        SchemaError: When the interpolation, type, number or limits of the values do not let them be used.
+        SchemaError: When the interpolation, type, number or limits of the values are wrong.
     """
     row = GARMENT[short]
-    primvar = _find(prim, row.name.removeprefix("primvars:"))
+    primvar = _primvar(prim, row.name.removeprefix("primvars:"))
     flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()) if primvar else None
     if primvar is None or flat is None:
         return np.full(count, float(row.fallback or 0.0)), ()
@@ -305,7 +281,7 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
     return values, notices
 
 
-def _find(prim: Usd.Prim, name: str) -> UsdGeom.Primvar | None:
+def _primvar(prim: Usd.Prim, name: str) -> UsdGeom.Primvar | None:
     """The authored primvar of a name, or of the name that Blender's exporter makes of it: no colons."""
     for spelled in (name, name.replace(":", "_")):
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(spelled)

@@ -1,7 +1,21 @@
-"""A garment's fabric at a time, and who gave each value.
+"""A garment's fabric at a time, and the source of each value.
 
 After ``--set``, the garment, its ancestors and the ``physgraph:material:`` values of the bound materials come those of
-the deformable-body proposal for UsdPhysics, which `deformable` reads; the table's fallbacks come last.
+the deformable-body proposal for UsdPhysics (AOUSD PR #111, commit 63c74d79); the schema's fallbacks come last.
+
+In the proposal a stiffness is the material's own (``physics:surfaceStretchStiffness`` and its relatives), or follows
+from Young's modulus E, Poisson's ratio nu and the thickness h of the mesh:
+
+    stretch = E h,   shear = E h / (2 (1 + nu)),   bend = E h^3 / (12 (1 - nu^2))
+
+The proposal writes stretch = E h / (1 - nu^2), of a strip whose width is held; ours is that of a free one.
+
+It follows from them where the material authors E or nu, or has ``PhysicsSurfaceDeformableMaterialAPI``; missing ones
+are then the proposal's fallbacks: 1e6 Pa, 0.3, 1 mm, 1000 kg/m^3. -inf means that a value is not given, and so does a
+density of 0.
+
+All are in stage units. With m = metersPerUnit and M = kilogramsPerUnit, their SI values are: stretch and shear
+M v [N/m], bending M m^2 v [N m], E M/m v [Pa], volumetric density M/m^3 v [kg/m^3], thickness m v [m].
 """
 
 from __future__ import annotations
@@ -11,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import SchemaError
 from ...solver.fabric import Fabric
@@ -56,7 +70,7 @@ class Values:
         found: Source of each value, by short name.
         volumetric: Whether the density is per volume, to be multiplied by the thickness.
         thickness: Thickness at each point over the mean, shape (V,), where stiffnesses follow it; else None.
-        notices: What was odd.
+        notices: What is odd about the values.
     """
 
     found: dict[str, Found | Derived]
@@ -66,7 +80,7 @@ class Values:
 
     @property
     def sources(self) -> dict[str, str]:
-        """Who gives each value, by short name."""
+        """The source of each value in words, by short name."""
         return {name: found.source for name, found in self.found.items()}
 
     @property
@@ -75,11 +89,7 @@ class Values:
         return frozenset(name for name, found in self.found.items() if found.animated)
 
     def fabric(self, time: float | None) -> Fabric:
-        """Fabric at a time code, SI.
-
-        Raises:
-            SchemaError: When a value cannot be used.
-        """
+        """Fabric at a time code, SI; SchemaError when a value cannot be used."""
         stretch, bend, thickness, density = (
             self.number(name, time) for name in ("stretchStiffness", "bendStiffness", "thickness", "density")
         )
@@ -110,8 +120,8 @@ def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> 
     if thick is not None:
         found["thickness"] = thick.found
     for name in STIFFNESSES:
-        given = stiffness(materials, GARMENT[name], found["thickness"], units=units) if name in open_rows else None
-        found[name] = given or found[name]
+        if name in open_rows:
+            found[name] = stiffness(materials, GARMENT[name], found["thickness"], units=units) or found[name]
     volume = density(materials, GARMENT["density"], units) if "density" in open_rows else None
     if volume is not None:
         found["density"] = volume
@@ -123,19 +133,13 @@ def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> 
     )
 
 
-def is_collision_prim(prim: Usd.Prim) -> bool:
-    """Whether UsdPhysics makes a prim collide."""
-    collision = UsdPhysics.CollisionAPI(prim)
-    return bool(collision) and bool(UsdGeom.Imageable(prim)) and collision.GetCollisionEnabledAttr().Get() is not False
-
-
 @dataclass(frozen=True, eq=False)
 class Derived:
-    """A value computed from others; has the interface of `Found`.
+    """A value computed from others, with the interface of `Found`.
 
     Attributes:
         row: The attribute of ours that it stands for.
-        source: Who gives it, for the report.
+        source: Its source in words, for the report.
         compute: SI value at a time code.
         animated: Whether one of the others is animated.
     """
@@ -146,11 +150,7 @@ class Derived:
     animated: bool = False
 
     def at(self, time: float | None) -> float:
-        """Value in SI at a time code.
-
-        Raises:
-            SchemaError: When it cannot be used.
-        """
+        """Value in SI at a time code; SchemaError when it cannot be used."""
         return check_limits(self.row, self.compute(time), self.source)
 
 
@@ -161,7 +161,7 @@ class Thickness:
     Attributes:
         found: The mean.
         relative: Thickness at each point over the mean, shape (V,); None when it is the same everywhere.
-        notices: What was odd.
+        notices: What is odd about it.
     """
 
     found: Found
@@ -169,7 +169,7 @@ class Thickness:
     notices: tuple[Notice, ...] = ()
 
 
-def given(attribute: Usd.Attribute | None) -> bool:
+def has_value(attribute: Usd.Attribute | None) -> bool:
     """Whether an attribute gives a value: -inf is the proposal's word for none."""
     return attribute is not None and read_number(attribute, None) != -math.inf
 
@@ -180,9 +180,9 @@ def stiffness(
     """A stiffness that a material authors, or that follows from its Young's modulus; None when there is neither."""
     scale = units.kilograms * (units.metres**2 if row.short == "bendStiffness" else 1.0)
     for material in materials:
-        own = authored(material, STIFFNESSES[row.short])
-        if own is not None and given(own):
-            return Found(row, source_name(own), own, None, scale)
+        attribute = authored(material, STIFFNESSES[row.short])
+        if attribute is not None and has_value(attribute):
+            return Found(row, source_name(attribute), attribute, None, scale)
         if is_elastic(material):
             return _from_youngs(material, row, thickness, units=units)
     return None
@@ -191,20 +191,16 @@ def stiffness(
 def density(materials: Sequence[Usd.Prim], row: Property, units: Units) -> Found | None:
     """Density per volume that a material gives [kg/m^3], or None."""
     for material in materials:
-        own = authored(material, DENSITY)
-        if own is not None and given(own) and read_number(own, None) != 0:
-            return Found(row, source_name(own), own, None, units.kilograms / units.metres**3)
+        attribute = authored(material, DENSITY)
+        if attribute is not None and has_value(attribute) and read_number(attribute, None) != 0:
+            return Found(row, source_name(attribute), attribute, None, units.kilograms / units.metres**3)
     elastic = next(filter(is_elastic, materials), None)
     source = f"<{elastic.GetPath()}>: fallback of {DENSITY}, {_DENSITY_FALLBACK:g} kg/m^3" if elastic else ""
     return Found(row, source, None, _DENSITY_FALLBACK) if elastic else None
 
 
 def read_thickness(prim: Usd.Prim, materials: Sequence[Usd.Prim], row: Property, *, units: Units) -> Thickness | None:
-    """Thickness on the mesh, or by its older name on the material; None when there is neither.
-
-    Raises:
-        SchemaError: When the array does not fit its elementType, or holds what is no thickness.
-    """
+    """Thickness on the mesh, or by its older name on the material; None when there is neither, SchemaError when bad."""
     on_mesh = authored(prim, THICKNESSES)
     if on_mesh is not None and np.size(on_mesh.Get(Usd.TimeCode.EarliestTime())):
         return _on_mesh(prim, on_mesh, row, units=units)
@@ -221,16 +217,17 @@ def is_elastic(material: Usd.Prim) -> bool:
     """Whether stiffnesses that a material does not author follow from its Young's modulus, authored or not."""
     schemas = material.GetMetadata("apiSchemas")
     named = schemas.GetAddedOrExplicitItems() if isinstance(schemas, Sdf.TokenListOp) else []
-    return _API in named or any(given(authored(material, name)) for name in (YOUNGS, POISSONS))
+    return _API in named or any(has_value(authored(material, name)) for name in (YOUNGS, POISSONS))
 
 
 def _from_youngs(material: Usd.Prim, row: Property, thickness: Found | Derived, *, units: Units) -> Derived:
     """A stiffness by the formulas at the top of this file."""
-    own, ratio = (each if given(each) else None for each in (authored(material, YOUNGS), authored(material, POISSONS)))
+    attributes = (authored(material, YOUNGS), authored(material, POISSONS))
+    modulus, ratio = (each if has_value(each) else None for each in attributes)
     per_pascal = units.kilograms / units.metres
 
     def compute(time: float | None) -> float:
-        youngs = read_number(own, time) * per_pascal if own is not None else _YOUNGS_FALLBACK
+        youngs = read_number(modulus, time) * per_pascal if modulus is not None else _YOUNGS_FALLBACK
         nu = read_number(ratio, time) if ratio is not None else _POISSONS_FALLBACK
         if not (0.0 <= youngs < math.inf and -1.0 < nu <= 0.5):
             message = f"{YOUNGS} is {youngs:g} Pa and {POISSONS} {nu:g}; they must be in [0, inf) and (-1, 0.5]"
@@ -242,8 +239,8 @@ def _from_youngs(material: Usd.Prim, row: Property, thickness: Found | Derived, 
             return sheet * float(thickness.at(time) or 0.0) ** 2 / (12 * (1 - nu**2))
         return sheet
 
-    source = source_name(own) if own is not None else f"<{material.GetPath()}>: fallback of {YOUNGS}, 1e6 Pa"
-    animated = thickness.animated or any(each.ValueMightBeTimeVarying() for each in (own, ratio) if each is not None)
+    source = source_name(modulus) if modulus is not None else f"<{material.GetPath()}>: fallback of {YOUNGS}, 1e6 Pa"
+    animated = thickness.animated or any(each.ValueMightBeTimeVarying() for each in (modulus, ratio) if each)
     return Derived(row, f"{source}, with the thickness", compute, animated)
 
 
@@ -254,15 +251,16 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     if values.ndim != 1 or not np.issubdtype(values.dtype, np.number):
         raise SchemaError(f"{where} is {attribute.GetTypeName()}; author float[]")
     values = values.astype(np.float64)
-    counts, indices = (np.asarray(a.Get(code)) for a in _topology(prim))
-    count = len(UsdGeom.Mesh(prim).GetPointsAttr().Get(code) or ())
+    mesh = UsdGeom.Mesh(prim)
+    topology = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    counts, indices = (np.asarray(each.Get(code)) for each in topology)
+    count = len(mesh.GetPointsAttr().Get(code) or ())
     element = prim.GetAttribute(f"{THICKNESSES}:elementType").Get()
     expected = {"constant": 1, "face": len(counts), "point": count}.get(str(element))
     if len(values) != expected:
-        message = (
-            f"{len(values)} values, and {THICKNESSES}:elementType is {element!r}, which takes {expected or 'none'}"
-        )
-        raise SchemaError(f"{where} has {message}; author constant (one), face or point")
+        message = f"{len(values)} values, and {THICKNESSES}:elementType is {element!r}"
+        message += f", which takes {expected or 'none'}; author constant (one), face or point"
+        raise SchemaError(f"{where} has {message}")
     for index in (int(values.argmin()), int(values.argmax())):
         check_limits(row, float(values[index]) * units.metres, f"{where}[{index}]")
     mean = float(values.mean())
@@ -279,13 +277,8 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     return Thickness(found, values / mean, (notice,))
 
 
-def _topology(prim: Usd.Prim) -> tuple[Usd.Attribute, Usd.Attribute]:
-    mesh = UsdGeom.Mesh(prim)
-    return mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr()
-
-
 def rest_angle_notices(prim: Usd.Prim) -> list[Notice]:
-    """Tell of older words in ``physics:restBendAnglesDefault``."""
+    """A notice of an older word in ``physics:restBendAnglesDefault``."""
     attribute = nearest(prim, "physics:restBendAnglesDefault")
     value = str(attribute.Get()) if attribute is not None else ""
     new = {"restShapeDefault": "restShape", "flatDefault": "flat"}.get(value)

@@ -1,8 +1,8 @@
-"""Reads meshes for drawing: world positions, triangles and colours at a time, from any stage."""
+"""Meshes of any stage as they are drawn: world positions, triangles and colours at a time; points of refined layers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +18,7 @@ from .placement import place
 from .reader import Shot
 
 NEUTRAL = (0.55, 0.54, 0.52)
-"""Linear colour of a mesh that says nothing of its own."""
-
-
+"""Linear colour of a mesh without one."""
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns Z up into Y up."""
 
@@ -105,14 +103,7 @@ class DrawnStage:
         return tuple(str(prim.GetPath()) for prim in applied if UsdGeom.Mesh(prim))
 
     def meshes(self, time: float | None) -> list[DrawnMesh]:
-        """Read every visible mesh of purpose default or render.
-
-        Args:
-            time: Time code, or None for the default values.
-
-        Returns:
-            The meshes in stage order; those without usable faces are left out.
-        """
+        """Every visible mesh of purpose default or render at a time code, in stage order, but those without faces."""
         code = timecode(time)
         transforms = UsdGeom.XformCache(code)
         drawn = []
@@ -124,19 +115,12 @@ class DrawnStage:
             read = _read(mesh, code, matrix)
             if read is not None:
                 points = self._scale * (read.points @ matrix[:3, :3] + matrix[3, :3]) @ self._turn.T
-                drawn.append(DrawnMesh(read.path, points, read.triangles, read.edges, read.colors, read.faces))
+                drawn.append(replace(read, points=points))
         return drawn
 
 
 def shot_of(layer: Path) -> Path | None:
-    """Find the shot that a refined layer was made from.
-
-    Args:
-        layer: A layer with ``customLayerData["physgraph"]["shot"]``, or any other.
-
-    Returns:
-        The shot's file, or None when the layer does not name one.
-    """
+    """The shot that a refined layer was made from; None when a layer does not name one."""
     shot = recorded_shot(open_layer(layer, StageError))
     return Path(shot) if shot else None
 
@@ -160,7 +144,7 @@ def _is_seen(mesh: UsdGeom.Mesh, code: Usd.TimeCode) -> bool:
 
 
 def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMesh | None:
-    """Read one mesh in its own space and units, or None when it cannot be drawn."""
+    """One mesh in local space and units, or None when it cannot be drawn."""
     points, counts, indices = (
         attribute.Get(code)
         for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
@@ -205,10 +189,10 @@ def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
     if whole is not None:
         colors[:] = whole
     for subset in UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets():
-        own = _material_color(subset.GetPrim())
+        color = _material_color(subset.GetPrim())
         members = np.asarray(subset.GetIndicesAttr().Get(code) or [], dtype=int)
-        if own is not None:
-            colors[members[members < faces]] = own
+        if color is not None:
+            colors[members[members < faces]] = color
     return colors
 
 
@@ -226,18 +210,14 @@ def _material_color(prim: Usd.Prim) -> np.ndarray | None:
 
 
 class RefinedLayer:
-    """A refined layer, for looking at what was written.
+    """A refined layer, read back.
 
     Attributes:
         targets: Path of each garment's fine mesh, in the scene's order.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the layer.
-
-        Raises:
-            LayerError: It is no refined layer.
-        """
+        """Open the layer; LayerError when it is no refined one."""
         layer = Sdf.Layer.FindOrOpen(str(path))
         record = None if layer is None else read_record(layer)
         if layer is None or record is None:
@@ -246,13 +226,7 @@ class RefinedLayer:
         self.targets = tuple(str(each) for each in record.get("garments", ()))
 
     def points(self, shot: Shot, index: int, time: float | None) -> np.ndarray | None:
-        """World positions [m] of a garment's fine mesh, shape (V, 3), or None where it has no sample.
-
-        Args:
-            shot: The shot that was refined.
-            index: Which garment.
-            time: Time code, or None for the default.
-        """
+        """World positions [m] of a garment's fine mesh by number, shape (V, 3), or None where it has no sample."""
         coarse = str(shot.sources[index].path)
         target = next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
         if target is None:  # a chunk without a sample of it

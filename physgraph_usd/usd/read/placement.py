@@ -1,4 +1,4 @@
-"""How a prim is placed in the world, in metres."""
+"""The placement of a prim in the world, in metres."""
 
 from __future__ import annotations
 
@@ -17,15 +17,12 @@ _REMEDY = "give the prim and its ancestors a scale other than zero there, or lea
 
 
 def to_metres(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
-    """Matrix from a prim's local space to world metres.
+    """Matrix for column vectors from a prim's local space to world metres, shape (4, 4), float64.
 
     Args:
         prim: Any prim.
         metres: Length of one stage unit [m].
         time: Time code, or None for the default.
-
-    Returns:
-        Matrix for column vectors, shape (4, 4), float64.
 
     Raises:
         GarmentError: When it cannot be inverted.
@@ -34,7 +31,7 @@ def to_metres(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
 
 
 def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: float | None) -> np.ndarray:
-    """Turn USD's row-vector matrix into a column-vector matrix to metres, refusing what cannot be inverted.
+    """Turn USD's row-vector matrix into a column-vector matrix to metres.
 
     Raises:
         GarmentError: When it is singular, not finite, projective or of a scale that is no length.
@@ -51,15 +48,14 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
         message = f"its transform to the world scales by {stretches[0]:.3g}"
         raise GarmentError(path, message, time=time, remedy=f"give a scale of {1 / _EXTREME:g} to {_EXTREME:g}")
     if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-        raise GarmentError(
-            path, "its transform to the world is projective", time=time, remedy="author affine transforms"
-        )
+        message = "its transform to the world is projective"
+        raise GarmentError(path, message, time=time, remedy="author affine transforms")
     matrix[:3] *= metres
     return matrix
 
 
 def place(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Apply a (4, 4) column-vector matrix to points, shape (V, 3); what is not finite stays so, for who reads it."""
+    """Apply a (4, 4) column-vector matrix to points, shape (V, 3); those that are not finite stay so."""
     with np.errstate(invalid="ignore", over="ignore"):
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
@@ -72,11 +68,7 @@ def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
 
 
 def check_placement(prim: Usd.Prim, metres: float, times: Sequence[float]) -> tuple[Notice, ...]:
-    """See that a prim can be placed at every time code; say when mirroring switches on or off.
-
-    Raises:
-        GarmentError: At the first time code where it cannot.
-    """
+    """A notice where mirroring switches on or off; GarmentError where a prim cannot be placed."""
     mirrored = [bool(np.linalg.det(to_metres(prim, metres, time)[:3, :3]) < 0) for time in times]
     switches = [time for time, now, then in zip(times[1:], mirrored[1:], mirrored, strict=False) if now != then]
     message = "its transform starts or stops mirroring here; the winding of its first time code is used throughout"

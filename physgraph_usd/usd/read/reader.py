@@ -1,4 +1,4 @@
-"""A shot, opened for reading: its scene, its frames, and how its garments sit on the stage.
+"""A shot, opened for reading: its scene, its frames, and the places of its garments on the stage.
 
     with contextlib.closing(open_shot("shot.usda")) as shot:
         for time in shot.scene.times:
@@ -55,10 +55,10 @@ class Shot:
     Attributes:
         stage: The composed stage, with skinning baked in an anonymous session layer; never edited on disk.
         path: The shot file, or the name of a stage that has none.
-        view: What the stage showed before anything was baked into it or muted on it.
+        view: The stage's view before anything was baked into it or muted on it.
         unsaved: Names of its layers whose content is in no file.
-        scene: What stays the same over the shot.
-        sources: How each garment sits on the stage, in the scene's order.
+        scene: Everything that stays the same over the shot.
+        sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
         selections: Variant selections in force on what the garments depend on, as paths `/World/coat{fit=loose}`.
         warnings: What the user should know; grows as frames are read.
@@ -68,7 +68,7 @@ class Shot:
     def __init__(
         self, path: str, stage: Usd.Stage, view: StageView, *, request: Request, readers: Sequence[GarmentReader]
     ) -> None:
-        """Put together what ``open_shot`` read."""
+        """Put together the parts that ``open_shot`` read."""
         self.path, self.stage, self.view = path, stage, view
         self.colliders: tuple[str, ...] = ()
         self.selections: tuple[str, ...] = ()
@@ -91,27 +91,24 @@ class Shot:
         Args:
             bodies: The colliders.
             felt: For each garment, the numbers of those that it feels.
-            apart: For each garment, the paths of colliders and garments that it never touches, and what says so.
+            apart: For each garment, the colliders and garments that it never touches, and what excludes each.
         """
         self._bodies = tuple(bodies)
         paths = {garment.path for garment in self.scene.garments}
         garments = (
-            replace(garment, colliders=own, apart_from=tuple(path for path in excluded if path in paths))
-            for garment, own, excluded in zip(self.scene.garments, felt, apart, strict=True)
+            replace(garment, colliders=numbers, apart_from=tuple(path for path in excluded if path in paths))
+            for garment, numbers, excluded in zip(self.scene.garments, felt, apart, strict=True)
         )
         colliders = tuple(body.collider for body in bodies)
         self.scene = replace(self.scene, garments=tuple(garments), colliders=colliders)
         self.sources = tuple(replace(s, apart_from=excluded) for s, excluded in zip(self.sources, apart, strict=True))
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
-        """Matrix from a garment's local space to world metres.
+        """Matrix from a garment's local space to world metres, shape (4, 4), float64: ``world = M @ [local; 1]``.
 
         Args:
-            index: Which garment.
+            index: Number of the garment.
             time: Time code, or None for the default.
-
-        Returns:
-            Matrix for column vectors, shape (4, 4), float64: ``world = M @ [local; 1]``.
 
         Raises:
             GarmentError: When it cannot be inverted.
@@ -131,28 +128,26 @@ class Shot:
             SchemaError: When an animated value cannot be used.
             StageError: When USD cannot read the files any more.
         """
-        garments, told = [], []
+        garments, notices = [], []
         with pxr_errors(f"cannot read {self.path}" + at_time(time)):
             for index, reader in enumerate(self._readers):
-                garment, notices = reader.frame(self.to_metres(index, time), time)
+                garment, odd = reader.frame(self.to_metres(index, time), time)
                 garments.append(garment)
-                told += notices
+                notices += odd
             poses = []
             for body in self._bodies:
-                pose, notices = body.pose(time)
+                pose, odd = body.pose(time)
                 poses.append(pose)
-                told += notices
-        self._tell(told)
+                notices += odd
+        earlier = set(self.warnings) if notices else set()
+        self.warnings.extend(notice for notice in dict.fromkeys(notices) if notice not in earlier)
         frame = Frame(time, tuple(garments), tuple(poses))
         refuse_far(self.scene, frame)
         refuse_falling(self.scene, frame)
         return frame
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
-        """The same shot, its frames read with other ``--set`` values; what only opening reads stays as it is.
-
-        Args:
-            overrides: As `open_shot` takes them, in place of those that it was given.
+        """A copy of the shot whose frames have other ``--set`` values; values that only opening reads stay.
 
         Raises:
             UsageError: When one cannot be read, or is for no garment.
@@ -171,11 +166,6 @@ class Shot:
             for source, values in zip(self.sources, found, strict=True)
         )
         return other
-
-    def _tell(self, notices: Sequence[Notice]) -> None:
-        """Add what was not said before to the warnings."""
-        known = set(self.warnings) if notices else set()
-        self.warnings.extend(notice for notice in dict.fromkeys(notices) if notice not in known)
 
     def close(self) -> None:
         """Let go of the stage; nothing can be read afterwards."""
@@ -203,14 +193,14 @@ def open_shot(
         colliders: The same for colliders; empty: what the garments name, else every prim with PhysGraphColliderAPI
             or UsdPhysics' CollisionAPI.
         frames: First and last time code in composed stage time; None: every authored one.
-        level: Number of subdivisions, -1 for auto; None: what each garment's schema says.
+        level: Number of subdivisions, -1 for auto; None: each garment's own.
         overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
         rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to all of
             the shot; it goes before authored rest shapes.
         skip_invisible: Leave out garments that are invisible at all their time codes.
 
     Returns:
-        The shot; its ``warnings`` tell what was assumed, left out or repaired.
+        The shot; its ``warnings`` name everything that was assumed, left out or repaired.
 
     Raises:
         UsageError: When an option cannot be used.
@@ -272,7 +262,7 @@ def _check_options(frames: tuple[float, float] | None, level: int | None, rest_f
 
 
 def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) -> list[Usd.Prim]:
-    """Find the garments; when that fails, also tell what is missing from the stage."""
+    """Find the garments; an error also names the files that are missing from the stage."""
     try:
         return find_garments(stage, garments)
     except StageError as error:
@@ -283,16 +273,17 @@ def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) 
 
 
 def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str], *, notices: list[Notice]) -> None:
-    """Read the colliders and which garment feels which; those that all are kept apart from are not read."""
+    """Read the colliders and which garment feels which, but those that every garment is kept apart from."""
     prims = [shot.stage.GetPrimAtPath(source.path) for source in shot.sources]
-    named = felt_by(shot.stage, prims, wanted)
+    reachable = felt_by(shot.stage, prims, wanted)
     excluded, odd = read_apart(shot.stage, prims)
     notices += odd
     cloth = {prim.GetPath() for prim in prims}
     apart = [
-        {p: message for p, message in off.items() if p in own | cloth} for own, off in zip(named, excluded, strict=True)
+        {path: target for path, target in targets.items() if path in paths | cloth}
+        for paths, targets in zip(reachable, excluded, strict=True)
     ]
-    felt = [{str(path) for path in own - set(off)} for own, off in zip(named, apart, strict=True)]
+    felt = [{str(path) for path in paths - set(targets)} for paths, targets in zip(reachable, apart, strict=True)]
     bodies, anywhere = [], set[str]().union(*felt)
     for path in paths:
         if str(path) not in anywhere:
@@ -301,8 +292,8 @@ def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str],
         notices += odd
         bodies += [body] if body is not None else []
     order = {body.collider.path: number for number, body in enumerate(bodies)}
-    numbers = [tuple(sorted(order[path] for path in own & order.keys())) for own in felt]
-    shot.add_colliders(bodies, numbers, [{str(path): message for path, message in off.items()} for off in apart])
+    numbers = [tuple(sorted(order[path] for path in names & order.keys())) for names in felt]
+    shot.add_colliders(bodies, numbers, [{str(path): by for path, by in targets.items()} for targets in apart])
 
 
 def _read(
@@ -320,7 +311,7 @@ def _read(
     frames = None if request.frames is None or request.rest_frame is not None else (-math.inf, request.frames[1])
     notices += request.bake.add([*roots], frames, bodies=bodies)
     readers, every = [], []
-    for path, held in roots.items():
+    for path, instances in roots.items():
         prim = stage.GetPrimAtPath(path)
         times = all_times(prim, request.bake)
         every += times
@@ -330,7 +321,7 @@ def _read(
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:
-            readers.append(read_garment(prim, held, request))
+            readers.append(read_garment(prim, instances, request))
     if request.frames and every and not within(every, request.frames):
         message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
         raise StageError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")

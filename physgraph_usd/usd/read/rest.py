@@ -1,9 +1,8 @@
-"""A garment's rest shape in metres, and where it came from.
+"""A garment's rest shape in metres, and its source.
 
-The order: what the user asked for (a frame, or `--rest auto`: the shape fitted to the median length that each edge has
-over the shot), ``physics:restShapePoints``, ``primvars:rest``, ``primvars:Pref``, the
-points' default value, the points' first sample. It is scaled as the garment is placed in the world at its first time
-code; a skinned garment's rest shape is placed by its bind transform.
+The first of these: ``--rest`` (a frame, or "auto": the shape fitted to the median length that each edge has over the
+shot), ``physics:restShapePoints``, ``primvars:rest``, ``primvars:Pref``, the points' default value, the points' first
+sample. It is placed in the world as the garment at its first time code, or by a skinned garment's bind transform.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from ..stage import Notice
 from .cage import as_points, repair
 
 AUTO = "auto"
-"""In place of a time code: a rest shape fitted to the animation."""
+"""A rest shape fitted to the animation, in place of a time code."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
 _BENT = ("restShape", "restShapeDefault")
 _TINY = 1e-9
@@ -34,8 +33,8 @@ class Rest:
 
     Attributes:
         points: Rest positions [m], shape (V, 3), float64.
-        source: Where they came from, for the report.
-        notices: What was odd.
+        source: Their source in words, for the report.
+        notices: What is odd about them.
     """
 
     points: np.ndarray
@@ -66,9 +65,7 @@ def read_rest(
     path, count = str(prim.GetPath()), len(first)
     authored = _authored(prim, count)
     if authored is not None:
-        local, source = authored
-        _refuse_broken(path, local, source)
-        return checked(prim, edges, Rest(place(local), source), first=first)
+        return checked(prim, edges, Rest(place(authored[0]), authored[1]), first=first)
     default = _default_points(prim, baked)
     if default is None:
         return checked(prim, edges, Rest(first, "first sample of points"), first=first)
@@ -84,7 +81,7 @@ def read_rest(
 
 
 def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray) -> Rest:
-    """Refuse a rest shape without size; say where edges have no length, and when its size differs from the animation's.
+    """A rest shape with notices of edges without length, and of a size that differs from the animation's.
 
     Points at one place are sewn together where the animation has them at one place, too; the faces between them are no
     cloth.
@@ -126,7 +123,7 @@ def rests_bent(prim: Usd.Prim) -> bool:
 
 
 def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
-    """Local rest points that something other than ``points`` gives."""
+    """Local rest points of an attribute other than ``points``."""
     for name in _AUTHORED:
         attribute = prim.GetAttribute(name)
         if not attribute or not attribute.HasAuthoredValue():
@@ -140,6 +137,11 @@ def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
             message = f"{name} has {len(points)} values, the mesh has {count} points"
             remedy = "author one value per point (vertex interpolation), or remove it"
             raise GarmentError(str(prim.GetPath()), message, remedy=remedy)
+        broken = ~np.isfinite(points).all(axis=1)
+        if broken.any():
+            message = f"{source_name(attribute)}[{broken.argmax()}] is NaN or infinite"
+            remedy = "author finite rest positions, or remove them"
+            raise GarmentError(str(prim.GetPath()), message, remedy=remedy)
         return points, source_name(attribute)
     return None
 
@@ -151,10 +153,3 @@ def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:
             value = spec.default
             return None if isinstance(value, Sdf.ValueBlock) else as_points(value, str(prim.GetPath()), "points")
     return None
-
-
-def _refuse_broken(path: str, points: np.ndarray, source: str) -> None:
-    broken = ~np.isfinite(points).all(axis=1)
-    if broken.any():
-        message = f"{source}[{broken.argmax()}] is NaN or infinite"
-        raise GarmentError(path, message, remedy="author finite rest positions, or remove them")

@@ -18,8 +18,6 @@ from ..stage import TRAVERSAL, Notice, timecode
 from ..times import SAME_TIME, garment_times, merge, transform_times
 from .find import instance_roots
 
-_SHAPE_COUNT = (4, 4)
-
 
 @dataclass(frozen=True, eq=False)
 class Skinned:
@@ -29,7 +27,7 @@ class Skinned:
         path: Prim path.
         root: Its skel root.
         times: Authored time codes of its skeleton's animation and placement, ascending.
-        query: UsdSkel's view of its binding.
+        query: UsdSkel's query of its binding.
         skeleton: The skeleton's prim path.
         animation: The animation's prim path, or None.
     """
@@ -46,7 +44,7 @@ class Bake:
     """The anonymous layer that holds baked points, on top of the stage.
 
     Attributes:
-        skinned: What was baked, by prim path.
+        skinned: The baked meshes, by prim path.
         layer: The anonymous layer; keep it alive as long as the stage.
     """
 
@@ -62,15 +60,12 @@ class Bake:
     def add(
         self, garments: Sequence[Sdf.Path], frames: tuple[float, float] | None, *, bodies: Sequence[Sdf.Path] = ()
     ) -> list[Notice]:
-        """Bake those of the prims that are skinned, bodies also at the garments' times.
+        """Bake those of the prims that are skinned, bodies also at the garments' times; notices of those that seem so.
 
         Args:
             garments: Mesh prims; those inside instances become editable in the anonymous layer.
             frames: First and last time code, or None for all.
             bodies: Colliders.
-
-        Returns:
-            What looks skinned and is not.
 
         Raises:
             GarmentError: When UsdSkel bakes nothing for a skinned mesh.
@@ -114,7 +109,7 @@ def make_editable(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
 
 
 def find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
-    """How UsdSkel deforms a mesh; None when it does not."""
+    """The skinning of a mesh by UsdSkel; None when there is none."""
     prim = stage.GetPrimAtPath(path)
     root = skel_root(prim)
     if root is None:
@@ -198,11 +193,11 @@ def _sample_animation(
     attribute = next((each for each in attributes if each and each.GetNumTimeSamples()), None)
     if attribute is None:
         return
-    own = attribute.GetTimeSamples()
-    wanted = merge([*own, *skinned.times, *transform_times(stage.GetPrimAtPath(skinned.path)), *times])
-    if len(wanted) == len(own):
+    samples = attribute.GetTimeSamples()
+    every = merge([*samples, *skinned.times, *transform_times(stage.GetPrimAtPath(skinned.path)), *times])
+    if len(every) == len(samples):
         return
-    values = {time: attribute.Get(time) for time in wanted if interval.Contains(time) or time in own}
+    values = {time: attribute.Get(time) for time in every if interval.Contains(time) or time in samples}
     with Usd.EditContext(stage, layer):
         for time, value in values.items():
             attribute.Set(value, time)
@@ -216,13 +211,8 @@ def _others(stage: Usd.Stage, roots: Iterable[Sdf.Path], keep: Sequence[Sdf.Path
 
 
 def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, frames: tuple[float, float] | None) -> None:
-    """See that baking gave points; turn a rigid mesh's baked transform into points.
-
-    Raises:
-        GarmentError: When it gave nothing although the animation has samples in range.
-    """
-    points = layer.GetAttributeAtPath(skinned.path.AppendProperty("points"))
-    if points is not None:
+    """Turn a rigid mesh's baked transform into points; GarmentError when an animation in range gave neither."""
+    if layer.GetAttributeAtPath(skinned.path.AppendProperty("points")) is not None:
         return
     if layer.GetAttributeAtPath(skinned.path.AppendProperty(UsdGeom.Tokens.xformOpOrder)) is not None:
         _rigid_points(stage, layer, skinned.path)
@@ -234,7 +224,7 @@ def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, frames: tupl
 
 
 def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
-    """Move a baked transform into the points, so that the prim keeps the transform of its own layers."""
+    """Move a baked transform into the points, so that the prim keeps the transform of its layers."""
     mesh = UsdGeom.Mesh.Get(stage, path)
     times = mesh.GetTimeSamples() or [None]
     codes = [timecode(time) for time in times]
@@ -244,15 +234,15 @@ def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
         spec.RemoveProperty(each)
     with Usd.EditContext(stage, layer):
         for code, matrix in zip(codes, baked, strict=True):
-            own = UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim())
-            change = np.array(matrix * own.GetInverse()).reshape(_SHAPE_COUNT)
+            unbaked = UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim())
+            change = np.array(matrix * unbaked.GetInverse())
             local = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.Default()), dtype=np.float64)
             moved = local @ change[:3, :3] + change[3, :3]
             mesh.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(moved, dtype=np.float32)), code)
 
 
 def _unskinned(prim: Usd.Prim) -> list[Notice]:
-    """Say when a mesh has joint influences that UsdSkel does not use."""
+    """A notice of joint influences that UsdSkel does not use."""
     binding = UsdSkel.BindingAPI(prim)
     if not binding.GetJointIndicesAttr().HasAuthoredValue():
         return []

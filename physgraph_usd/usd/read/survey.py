@@ -1,4 +1,4 @@
-"""What meshes a stage has and whether each could be refined; for ``inspect``, so it never raises on a mesh."""
+"""The meshes of a stage and whether each could be refined; for ``inspect``, so it never raises on a mesh."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pxr import Usd
 from ...errors import StageError
 from ...solver.colliders.orient import pieces_of
 from ..schema import GARMENT_API
-from ..stage import Notice, list_meshes, metres_per_unit, open_stage, pxr_errors, quiet, read_units, shot_name
+from ..stage import Notice, list_meshes, open_stage, pxr_errors, quiet, read_units, shot_name
 from ..times import garment_times
 from .cage import PointReader, read_cage
 from .find import has_schema, instance_roots
@@ -31,7 +31,7 @@ class MeshReport:
         is_open: Whether most of its faces are in pieces that are not closed.
         times: Authored time codes of points and transforms, not those of a skeleton.
         problem: Why it could not be refined; "" when it could.
-        notices: What refining would tell about it.
+        notices: Warnings that refining would give of it.
     """
 
     path: str
@@ -48,7 +48,7 @@ class MeshReport:
 
 @dataclass(frozen=True)
 class Survey:
-    """What is on a stage.
+    """A stage and its meshes.
 
     Attributes:
         path: The shot file, or the name of a stage that has none.
@@ -64,53 +64,31 @@ class Survey:
 
 
 def survey(shot: str | Usd.Stage) -> Survey:
-    """Look at every mesh of a shot, broken ones included.
-
-    Raises:
-        StageError: When the file cannot be opened at all.
-    """
+    """Survey every mesh of a shot, broken ones included; StageError when the file cannot be opened at all."""
     path = shot_name(shot)
     stage, notices = open_stage(shot)
     with pxr_errors(f"cannot read {path}"), quiet():
         units, odd = read_units(stage)
-        meshes = tuple(survey_mesh(stage.GetPrimAtPath(mesh), units.metres) for mesh in list_meshes(stage))
+        meshes = tuple(_survey_mesh(stage.GetPrimAtPath(mesh), units.metres) for mesh in list_meshes(stage))
     return Survey(path, units.metres, meshes, (*notices, *odd))
 
 
-def survey_meshes(stage: Usd.Stage) -> tuple[MeshReport, ...]:
-    """Look at every mesh of an opened stage; never raises."""
-    metres = metres_per_unit(stage)[0]
-    return tuple(survey_mesh(stage.GetPrimAtPath(path), metres) for path in list_meshes(stage))
-
-
-def survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
-    """Look at one mesh; never raises, a broken one tells its problem.
-
-    Args:
-        prim: Mesh prim.
-        metres: Length of one stage unit [m].
-    """
+def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
+    """One mesh; never raises, a broken one has a problem."""
     path = str(prim.GetPath())
     kind = (has_schema(prim, GARMENT_API), skel_root(prim) is not None, bool(instance_roots(prim)))
     count = 0
     try:
         with pxr_errors(f"cannot read <{path}>"):
             times = garment_times(prim)
-            points = PointReader(prim, times[0] if times else None)
+            first = times[0] if times else None
+            points = PointReader(prim, first)
             count = points.count
             cage = read_cage(prim, count, times)
-            placed = points.read(times[0] if times else None, cage.mesh.half_edges.edges)[0]
+            placed = points.read(first, cage.mesh.half_edges.edges)[0]
             pieces = pieces_of(placed, cage.mesh.triangulate(placed).triangles)
             odd = check_placement(prim, metres, times)
     except StageError as error:
         return MeshReport(path, *kind, points=count, problem=str(error))
-    return MeshReport(
-        path,
-        *kind,
-        count,
-        len(cage.kept_faces),
-        len(pieces.open) > len(pieces.closed),
-        times,
-        "",
-        (*cage.notices, *odd),
-    )
+    is_open, notices = len(pieces.open) > len(pieces.closed), (*cage.notices, *odd)
+    return MeshReport(path, *kind, count, len(cage.kept_faces), is_open, times, notices=notices)

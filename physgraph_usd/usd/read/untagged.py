@@ -1,4 +1,4 @@
-"""Meshes of a stage that are neither garments nor colliders, and where they are in a few frames."""
+"""Meshes of a stage that are neither garments nor colliders, posed in a few frames."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ..stage import TRAVERSAL, pxr_errors, quiet, timecode
 from .bodies import ColliderReader
 from .find import has_schema, traverse
 from .garment import is_visible
-from .placement import to_metres
+from .placement import place, to_metres
 from .reader import Shot
 
 _MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")
-"""Schemas by which a prim, or one above it, says itself whether cloth touches it."""
+"""Schemas by which a prim, or one above it, decides whether cloth touches it."""
 Box = np.ndarray
 """Least and greatest corner [m], world space, shape (2, 3)."""
 
@@ -36,7 +36,7 @@ def meshes_beside(
     Args:
         shot: An open shot.
         times: Time codes of the frames.
-        boxes: Where garments and what is near them may be in each.
+        boxes: Bounds of garments and their neighbourhood in each.
         least: Longest side of the smallest mesh that counts [m].
 
     Yields:
@@ -46,10 +46,10 @@ def meshes_beside(
     Raises:
         StageError: USD cannot read the files any more.
     """
-    known = {*shot.colliders, *(garment.path for garment in shot.scene.garments)}
-    known |= {path for source in shot.sources for path in source.apart_from}
+    in_shot = {*shot.colliders, *(garment.path for garment in shot.scene.garments)}
+    in_shot |= {path for source in shot.sources for path in source.apart_from}
     with pxr_errors(f"cannot read {shot.path}"), quiet():
-        prims = [prim for prim in traverse(shot.stage) if UsdGeom.Mesh(prim) and str(prim.GetPath()) not in known]
+        prims = [prim for prim in traverse(shot.stage) if UsdGeom.Mesh(prim) and str(prim.GetPath()) not in in_shot]
         prims = [prim for prim in prims if _is_plain(prim, times)]
         skinned = _Skinning(shot, [prim.GetPath() for prim in prims if _is_skinned(prim)])
         seen = [pose for time in times[:1] for pose in shot.frame(time).colliders] if prims else []
@@ -65,7 +65,7 @@ def meshes_beside(
 
 
 def _is_plain(prim: Usd.Prim, times: Sequence[float | None]) -> bool:
-    """Whether a mesh is seen, and nothing says whether cloth touches it."""
+    """Whether a mesh is visible, and no schema decides whether cloth touches it."""
     if any(has_schema(each, mark) for each in with_ancestors(prim) for mark in _MARKS):
         return False
     guide = UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
@@ -86,8 +86,8 @@ def _may_meet(
     every = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy]
     for time, box in zip(times, boxes, strict=True):
         bound = UsdGeom.BBoxCache(timecode(time), every).ComputeWorldBound(prim).ComputeAlignedRange()
-        own = metres * np.array([bound.GetMin(), bound.GetMax()], dtype=np.float64)
-        if not bound.IsEmpty() and _overlap(own, box) and np.ptp(own, axis=0).max() >= least:
+        bounds = metres * np.array([bound.GetMin(), bound.GetMax()], dtype=np.float64)
+        if not bound.IsEmpty() and _overlap(bounds, box) and np.ptp(bounds, axis=0).max() >= least:
             return True
     return False
 
@@ -99,8 +99,8 @@ def _meeting(poses: Iterable[Pose | None], boxes: Sequence[Box], *, least: float
         points = points[np.isfinite(points).all(axis=1)]
         if pose is None or not len(points):
             continue
-        own = np.stack([points.min(axis=0), points.max(axis=0)])
-        if _overlap(own, box) and np.ptp(own, axis=0).max() >= least:
+        bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+        if _overlap(bounds, box) and np.ptp(bounds, axis=0).max() >= least:
             yield index, pose
 
 
@@ -116,10 +116,10 @@ def _same_place(a: Pose | None, b: Pose | None) -> bool:
 
 
 class _Skinning:
-    """Joint skinning of meshes at single time codes, without blend shapes: near enough to see what touches cloth."""
+    """Joint skinning of meshes at single time codes, without blend shapes: near enough to find contact with cloth."""
 
     def __init__(self, shot: Shot, paths: Sequence[Sdf.Path]) -> None:
-        """Find what moves some meshes, on a stage that shows what the shot's did before garments were baked."""
+        """Find the skeletons of meshes, on a stage as the shot's was before garments were baked."""
         self._metres, self._stage = shot.metres_per_unit, None
         self._bound: Mapping[Sdf.Path, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]] = {}
         if paths:
@@ -165,4 +165,4 @@ class _Skinning:
             matrix = to_metres(skeleton.GetPrim(), self._metres, time)
         except GarmentError:
             return None
-        return np.asarray(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        return place(np.asarray(points, dtype=np.float64), matrix)
