@@ -87,7 +87,7 @@ def test_replayed_steps_are_the_same_steps(vectors: tuple[str, ...]) -> None:
     one, frames = cloth("cuda", torch.float32)
     systems, coarse = one.systems(frames)
     system, x = systems[-1], one.levels[-1].base.apply(coarse)
-    network = random_network(PhysgraphConfig(vectors, width=16, means=False), seed=3, scale=0.1)
+    network = random_network(PhysgraphConfig(vectors, width=16), seed=3, scale=0.1)
     assert isinstance(network, Physgraph)
     plain, replayed = LearnedMetric(network, record=False), LearnedMetric(network)
     a, b = plain.start(system, x), replayed.start(system, x)

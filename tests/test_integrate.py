@@ -183,8 +183,8 @@ class TestQuasiNewton:
         scale = 1.0 / system.diagonal(x).unsqueeze(1)
         for _ in range(6):
             carry = method.step(system, carry)
-        assert len(carry.memory.pairs) >= 3
-        for pair in carry.memory.pairs:
+        assert len(carry.memory.secants) >= 3
+        for pair in carry.memory.secants:
             expected = system.apply_metric_inverse(pair.yields) if use_metric else scale * pair.yields
             assert float((pair.image - expected).norm() / expected.norm()) < 1e-9
             assert pair.curvature == pytest.approx(float((pair.move * pair.yields).sum()), rel=1e-12)
@@ -196,7 +196,7 @@ class TestQuasiNewton:
         carry = method.start(system, x)
         for _ in range(6):
             carry = method.step(system, carry)
-        assert len(carry.memory.pairs) == 2
+        assert len(carry.memory.secants) == 2
 
     def test_one_metric_solve_and_mostly_one_force_a_step(self):
         system, x = real_problem()
@@ -278,7 +278,7 @@ class TestRounding:
         system, method = system_of(spd(12, 50.0), metric=np.eye(12)), QuasiNewton()
         carry = method.step(system, method.start(system, start(12)))
         monkeypatch.setattr("physgraph_usd.solver.integrate.quasi_newton.backtrack", short)
-        assert len(method.step(system, carry).memory.pairs) == kept
+        assert len(method.step(system, carry).memory.secants) == kept
 
 
 class TestNewton:

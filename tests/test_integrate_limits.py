@@ -43,12 +43,12 @@ def test_secants_of_negative_curvature_are_not_kept(use_metric: bool):
     after = method.step(problem, carry)
     moved, yielded = after.x - carry.x, carry.force - after.force
     assert float((moved * yielded).sum()) < 0
-    assert after.memory.pairs == ()
+    assert after.memory.secants == ()
     kept = 0
     for _ in range(20):
         after = method.step(problem, after)
-        assert all(pair.curvature > 0 for pair in after.memory.pairs)
-        kept = max(kept, len(after.memory.pairs))
+        assert all(pair.curvature > 0 for pair in after.memory.secants)
+        kept = max(kept, len(after.memory.secants))
     assert kept > 0
     assert float((after.x.abs() - 1.0).abs().max()) < 1e-3
 

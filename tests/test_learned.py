@@ -24,7 +24,7 @@ from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.integrate import METHODS, paper_network
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
-from physgraph_usd.solver.integrate.features import NORMAL, seeing
+from physgraph_usd.solver.integrate.fused import seeing
 from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
 from physgraph_usd.solver.integrate.paper_network import PaperConfig
@@ -33,9 +33,8 @@ from physgraph_usd.solver.integrate.weights import FOLDER, load_network, make_ne
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import GarmentFrame
 
-ALL = PhysgraphConfig(vectors=VECTORS, width=16, rounds=1, strain=True)
+ALL = PhysgraphConfig(vectors=VECTORS, width=16, depth=3)
 PLAIN = PhysgraphConfig(width=16)
-LOCAL = PhysgraphConfig(width=16, means=False)
 PAPER = PaperConfig(latent=16, rounds=3)
 SMALL = 0.1
 """Scale of random weights whose steps keep the cloth whole."""
@@ -53,7 +52,7 @@ def run(integrator: Integrator, system: System, x: torch.Tensor, *, steps: int =
     return carry
 
 
-@pytest.mark.parametrize("config", [PLAIN, LOCAL, ALL])
+@pytest.mark.parametrize("config", [PLAIN, ALL])
 def test_untrained_it_takes_the_metric_step(config: PhysgraphConfig):
     system, x = problem()
     integrator = integrator_of(make_network(config))
@@ -83,28 +82,18 @@ def test_edges_in_pieces_are_the_edges_at_once(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(
-    "more",
-    [
-        {"means": False},
-        {"means": False, "strain": True},
-        {"strain": True, "depth": 3},
-        {"strain": True, "products": "few"},
-        {"means": False, "products": "few"},
-    ],
-)
-@pytest.mark.parametrize(
     "vectors",
     [
         ("metric", "move1", "diagonal"),
         ("secant", "metric", "metric1", "move1"),
-        ("secant", "secant.normal", "metric.strain", "diagonal.smooth"),
+        ("secant", "secant.normal", "metric.smooth", "diagonal.smooth"),
         ("secant", "metric", "secant.normal", "metric.normal", "metric.smooth", "secant.smooth"),
         ("secant", "metric.normal", "diagonal", "diagonal.normal", "diagonal1.normal"),
     ],
 )
-def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str, Any]):
+def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...]):
     system, x = problem(torch.float32, level=2)
-    network = random_network(PhysgraphConfig(vectors=vectors, width=16, **more), seed=7, scale=0.3)
+    network = random_network(PhysgraphConfig(vectors=vectors, width=16), seed=7, scale=0.3)
     assert isinstance(network, Physgraph)
     one, other = LearnedMetric(network), LearnedMetric(network, fuse=False)
     carry = one.start(system, x)
@@ -117,24 +106,23 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...], more: dict[str
 
 def test_networks_of_one_size_do_not_share_a_kernel():
     """Warp keeps what it compiled under a hash that does not see everything; the names of the kernels must."""
-    three, two = ((0, 0), (1, 0), (0, NORMAL)), ((0, 0), (1, 0), (1, NORMAL))
+    three, two = ((0, False), (1, False), (0, True)), ((0, False), (1, False), (1, True))
     one, other = ((0, True),) * 3, ((0, True), (1, True), (0, False))
     made = [(three, ((0, 1), (0, 2)), one), (two, ((0, 1), (0, 2)), one), (three, ((0, 1), (1, 2)), one)]
     made.append((three, ((0, 1), (0, 2)), other))
-    names = {seeing(parts, pairs, (), shares, means=False).module.name for parts, pairs, shares in made}
+    names = {seeing(parts, pairs, (), families).module.name for parts, pairs, families in made}
     assert len(names) == len(made)
 
 
-def test_few_products_are_those_of_whole_vectors_and_of_what_belongs_together():
+def test_products_are_those_of_whole_vectors_and_of_what_belongs_together():
     names = ("secant", "metric", "secant.normal", "metric.normal", "move1.normal", "metric.smooth")
-    pairs = [(names[a], names[b]) for a, b in pairs_of(PhysgraphConfig(names, products="few")).T.tolist()]
+    pairs = [(names[a], names[b]) for a, b in pairs_of(names).T.tolist()]
     assert set(pairs) == {
         ("secant", "metric"),
         ("metric", "metric.smooth"),
         ("secant.normal", "metric.normal"),
         ("secant.normal", "move1.normal"),
     }
-    assert pairs_of(PhysgraphConfig(names)).shape == (2, 15)
 
 
 @pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])
@@ -145,7 +133,7 @@ def test_one_evaluation_a_step(config: PhysgraphConfig | PaperConfig):
 
 
 @pytest.mark.parametrize(("dtype", "most"), [(torch.float32, 1e-4), (torch.float64, 1e-5)])
-@pytest.mark.parametrize("config", [PLAIN, LOCAL, ALL])
+@pytest.mark.parametrize("config", [PLAIN, ALL])
 def test_s11_it_turns_with_the_cloth(config: PhysgraphConfig, dtype: torch.dtype, most: float):
     mesh, rest = sheet(6, 5)
     turn, far = rotation(3), np.array([1e5, -2e5, 3e5])
@@ -226,10 +214,10 @@ def test_s12_no_force_no_step_and_no_step_beyond_the_cap(config: PhysgraphConfig
         assert longest == 0.0
 
 
-def test_s10_without_means_a_patch_moves_as_it_would_in_a_larger_garment():
+def test_s10_a_patch_moves_as_it_would_in_a_larger_garment():
     """Beside three copies of itself and a resting sheet, a garment's displacement is its own."""
     mesh, rest = sheet(6, 5)
-    integrator = integrator_of(random_network(LOCAL, seed=5, scale=SMALL))
+    integrator = integrator_of(random_network(PLAIN, seed=5, scale=SMALL))
     alone, x = finest_system(group_of(mesh, rest, level=1), wave(rest))
     one = run(integrator, alone, x).x - x
     group = group_of(mesh, rest, level=1)
@@ -343,7 +331,7 @@ def test_a_user_brings_weights_of_their_own(tmp_path: Path):
     """`refine --weights`: other numbers give another layer, which names them; what does not fit is refused."""
     stage = write_sample("swatch", tmp_path)
     own = tmp_path / "own.safetensors"
-    digest = save_network(random_network(LOCAL, seed=5, scale=0.05), own)
+    digest = save_network(random_network(PLAIN, seed=5, scale=0.05), own)
     written = {}
     for name, options in (("shipped", []), ("own", ["--weights", str(own)])):
         out = tmp_path / f"{name}.usda"

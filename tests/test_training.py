@@ -119,7 +119,7 @@ def calm(patches: list[Patch]) -> list[Patch]:
     "config",
     [
         PhysgraphConfig(width=8),
-        PhysgraphConfig(("secant", "metric", "metric.normal", "move1.strain", "diagonal.smooth"), 8, 2, 1, True),
+        PhysgraphConfig(("secant", "metric", "metric.normal", "move1.smooth", "diagonal.smooth"), 8),
     ],
 )
 @pytest.mark.parametrize("which", ["patches", "resting"])
@@ -191,7 +191,7 @@ def test_the_loss_counts_gaps_of_each_patch_relative_to_its_own_start():
 @pytest.mark.parametrize("through_forces", [False, True])
 def test_training_lowers_the_loss(through_forces: bool):
     config = TrainConfig(
-        network=PhysgraphConfig(width=8, means=False),
+        network=PhysgraphConfig(width=8),
         patches=FEW,
         iterations=30,
         unroll=5,
@@ -240,7 +240,7 @@ def test_a_twin_tells_how_many_times_steps_magnify_a_difference(patches: list[Pa
 
 def test_what_steadies_a_descent_reaches_the_weights(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(loop, "TWINS", 1.0)
-    config = TrainConfig(network=PhysgraphConfig(width=8, means=False), patches=FEW, unroll=3, segments=1, held_out=0)
+    config = TrainConfig(network=PhysgraphConfig(width=8), patches=FEW, unroll=3, segments=1, held_out=0)
     weights = []
     for steady in (0.0, 1.0):
         trainer = Trainer(replace(config, steady=steady, iterations=3))
@@ -258,7 +258,7 @@ def test_detached_carries_hold_no_graph(patches: list[Patch]):
     assert carry.x.requires_grad
     after = detached(carry)
     assert not after.x.requires_grad
-    assert not any(move.requires_grad for move in after.memory.moves)
+    assert not any(secant.move.requires_grad for secant in after.memory.secants)
 
 
 def run(*arguments: object) -> Result:
@@ -266,7 +266,7 @@ def run(*arguments: object) -> Result:
 
 
 def configured(folder: Path, *, kind: str = "physgraph", iterations: int = 4) -> Path:
-    network = "width = 8\nmeans = false" if kind == "physgraph" else "latent = 8\nrounds = 2"
+    network = "width = 8" if kind == "physgraph" else "latent = 8\nrounds = 2"
     file = folder / f"{kind}-{iterations}.toml"
     file.write_text(TINY.format(kind=kind, iterations=iterations, network=network))
     return file

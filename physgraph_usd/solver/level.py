@@ -23,7 +23,7 @@ from .mesh.topology import TriangleSplit, edges_of, find_edges, hinges_of
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
-"""Cap of l0^2 / (A1 + A2): 1.15 on equilateral triangles, unbounded on slivers (STABILITY.md S3)."""
+"""Cap of l0^2 / (A1 + A2): 1.15 on equilateral triangles, unbounded on slivers."""
 
 QUAD_SPRING = (0.75, 1.5)
 """Factors of the springs along a quad's sides and diagonal: with them squares whose diagonals alternate, as subdivision
@@ -264,7 +264,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
 
 
 def _sound(split: TriangleSplit, rest: np.ndarray) -> TriangleSplit:
-    """Without triangles that have no rest area or repeat an earlier one: they are no cloth (STABILITY.md S2)."""
+    """Without triangles that have no rest area or repeat an earlier one: they are no cloth."""
     corners = rest[split.triangles]
     sides = corners - np.roll(corners, 1, axis=1)
     area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)

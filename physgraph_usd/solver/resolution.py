@@ -1,4 +1,4 @@
-"""How fine a garment must be: no more than its wrinkles (DESIGN section 5), and whether it was fine enough.
+"""How fine a garment must be: no more than its wrinkles, and whether it was fine enough.
 
 The buckling wavelength is 2 pi sqrt(D / (Y strain)), with the compression of the cage's edges, 90th percentile over
 a few frames. It is the shortest wave in which the cloth can fold; settled folds are longer (`benchmarks.levels`).

@@ -22,7 +22,7 @@ from physgraph_usd.solver.scene import GarmentFrame
 
 RANDOM = {
     "physgraph": PhysgraphConfig(width=16),
-    "with everything": PhysgraphConfig(vectors=VECTORS, width=16, rounds=1, strain=True),
+    "with everything": PhysgraphConfig(vectors=VECTORS, width=16),
     "physgraph-paper": PaperConfig(latent=16, rounds=3),
     "raw features": PaperConfig(latent=16, rounds=2, features="paper"),
 }

@@ -16,9 +16,9 @@ from torch import Tensor
 from ...solver.contact.settings import ContactSettings
 from ...solver.forces.base import ForceModule
 from ...solver.forces.contact import Contact, Planes
-from ...solver.integrate.around import Around
 from ...solver.integrate.base import System
 from ...solver.integrate.metric import Metric
+from ...solver.integrate.vertex_frame import VertexFrame
 from ...solver.level import Level
 
 HEIGHT = (-2.0, -0.9)
@@ -62,7 +62,7 @@ class Body:
             base: The upsampled cage [m].
             span: The patch's vertices.
         """
-        normal = self.side * Around(level, base).normal[span]
+        normal = self.side * VertexFrame(level, base).normal[span]
         own = base[span]
         lift = self.height * torch.sin(own @ torch.as_tensor(self.wave).to(own) + self.phase)
         vertex = torch.arange(span.start, span.stop, dtype=torch.int32, device=base.device)

@@ -1,7 +1,7 @@
 """Bending: dihedral angles at the edges.
 
-    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D c_h l0^2 / (A1 + A2)   (potential="continuum", DESIGN 4.1)
-                                                w_h = k_b a_h / A              (potential="paper", P7)
+    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D c_h l0^2 / (A1 + A2)   (potential="continuum")
+                                                w_h = k_b a_h / A              (potential="paper")
 
 | symbol | here | meaning |
 |---|---|---|

@@ -1,7 +1,7 @@
 """Contact: pushes vertices out of bodies, each body seen as a plane near each vertex.
 
     E = 1/2 sum_v k_c a_v phi_v^2                        (form="quadratic")
-    E = (k_c / A) sum_v a_v phi_v,  A = sum_{phi_v > 0} a_v   (form="linear", PAPER P9)
+    E = (k_c / A) sum_v a_v phi_v,  A = sum_{phi_v > 0} a_v   (form="linear")
 
 | symbol | here | meaning |
 |---|---|---|
@@ -10,7 +10,7 @@
 | k_c | ``stiffness`` | [N/m^3]; of the linear form [N] |
 
 The planes stay while the term lives, so it is a function of x alone. A is piecewise constant; its jumps are no forces
-and are left out of the linear form's (PAPER A12).
+and are left out of the linear form's.
 """
 
 # Warp's kernels are typed by values that only Warp reads.

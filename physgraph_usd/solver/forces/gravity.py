@@ -1,10 +1,10 @@
 """Gravity.
 
-    E = - sum_v m_v g . x_v,   m_v = density a_v         (potential="continuum", DESIGN 4.1)
-                               m_v = density a_v^2 / A   (potential="paper", P8)
+    E = - sum_v m_v g . x_v,   m_v = density a_v         (potential="continuum")
+                               m_v = density a_v^2 / A   (potential="paper")
 
 The solver recentres each frame on the mean of its coarse positions, so the energy is relative to the input's mean
-height (PAPER fact 3).
+height.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@
 | s_c | painted ``guideScale`` |
 | p_v | 10 pin / (1 - pin) | soft pins: 0 where the pin weight is 0, grows without bound towards 1 |
 
-The target is the average of the upsampled cage, not the cage vertex itself (DESIGN 4.1): at a rim and where the cage is
+The target is the average of the upsampled cage, not the cage vertex itself: at a rim and where the cage is
 curved the average lies inside the vertex, and cloth at rest would be pushed outwards (by 0.2 fine edges at a rim).
 Wrinkles whose mean is zero over a coarse vertex's neighbourhood cost nothing, so large motion stays the artist's.
 """

@@ -1,14 +1,14 @@
 """Contact of cloth with cloth: springs that keep parts apart, each pair seen as a plane.
 
     E = 1/2 sum_g k_g phi_g^2,   phi_g = max(offset_g - n_g . sum_i w_gi x_i, 0)          (`SelfContact`)
-    E = (k_sc / A) sum_uv (a_u + a_v) psi_uv^2,   psi_uv = max(R - |x_u - x_v|, 0)         (`Spheres`, PAPER P10)
+    E = (k_sc / A) sum_uv (a_u + a_v) psi_uv^2,   psi_uv = max(R - |x_u - x_v|, 0)         (`Spheres`)
 
 | symbol | here | meaning |
 |---|---|---|
 | sum_i w_gi x_i | ``Gaps`` | way from one point to another: vertex, face (1, -b0, -b1, -b2), edges (1-s, s, t-1, -t) |
 | n_g | ``Gaps.normal`` | the side on which the first point lies, a unit vector |
 | k_g | ``Gaps.stiffness`` | k_c times the pair's area [N/m] |
-| A | sum of a_u + a_v over pairs nearer than R | [m^2]; its jumps are no forces (PAPER A12) |
+| A | sum of a_u + a_v over pairs nearer than R | [m^2]; its jumps are no forces |
 
 Pairs, weights and normals stay while the term lives, so it is a function of x alone, and a convex one.
 """

@@ -1,7 +1,7 @@
 """Stretch: springs along the edges.
 
-    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y c_e a_e / l0_e^2  (potential="continuum", DESIGN 4.1)
-                                        k_e = k_s a_e / A           (potential="paper", P6)
+    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y c_e a_e / l0_e^2  (potential="continuum")
+                                        k_e = k_s a_e / A           (potential="paper")
 
 | symbol | here | meaning |
 |---|---|---|

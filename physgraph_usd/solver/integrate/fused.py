@@ -1,17 +1,19 @@
-"""`Physgraph` without messages as two kernels around a few products of matrices.
+"""`Physgraph` as two kernels around a few products of matrices, on the CPU and on CUDA.
 
-In torch a step at 26,000 vertices writes some forty arrays; on a CPU that costs several force evaluations. One kernel
-takes the parts of the vectors and writes the features, the layers are products of matrices, and a second kernel
-combines; `tests/test_learned.py` holds them against `network.Physgraph`. The same code runs on CUDA.
+In torch a step at 26,000 vertices writes some forty arrays; on a CPU that costs several force evaluations. Here one
+kernel finds normals, means over the neighbours and scalar products in a single pass, so that what a vertex gathers from
+its neighbours is still at hand when it is used; the layers are products of matrices, and a second kernel combines. A
+normal part is a number times the normal; its products come from that number.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportIndexIssue=false
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from typing import Any
 
 import torch
 import warp as wp
@@ -20,85 +22,60 @@ from torch import Tensor
 
 from ..mesh.stencil import vectors
 from ..mesh.threads import Launch
-from .around import Around
-from .features import NORMAL, STRAIN, Parts, seeing
-from .network import (
-    FLOOR,
-    LOG_OFFSET,
-    LOG_SCALE,
-    Physgraph,
-    PhysgraphConfig,
-    clock_of,
-    counted,
-    families_of,
-    pairs_of,
-)
+from .network import FLOOR, LOG_OFFSET, LOG_SCALE, Physgraph, clock_of, counted, families_of, pairs_of
+from .vertex_frame import VertexFrame, normal_of
 
 wp.set_module_options({"enable_backward": False})
 
-
-def can_fuse(config: PhysgraphConfig, dtype: torch.dtype) -> bool:
-    """Whether the kernels cover a network: no messages, float32."""
-    return not config.rounds and dtype == torch.float32
+Parts = tuple[tuple[int, bool], ...]
+Pairs = tuple[tuple[int, int], ...]
+Families = tuple[tuple[int, bool], ...]
 
 
 class FusedPhysgraph:
-    """A network's weights and buffers for one number of vertices.
+    """A network's weights and buffers for one number of vertices, in float32.
 
     Attributes:
-        vertices: That number.
-        count: Number of vectors.
         bases: Names of the vectors that are handed over; the others are parts that the kernels take of them.
     """
 
-    def __init__(
-        self, network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, threads: int
-    ) -> None:
+    def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> None:
         """Lay out the weights.
 
         Args:
-            network: A network that `can_fuse` covers.
-            starts: First vertex of each garment, and the number of vertices.
+            network: The network.
+            vertices: Number of vertices.
             longest: Longest displacement in local edge lengths.
             device: "cpu" or a CUDA device.
             threads: Most threads that a kernel uses on the CPU.
         """
-        self._config = config = network.config
-        self.vertices = vertices = starts[-1]
-        self.count = len(config.vectors)
-        self._spans = [slice(a, b) for a, b in pairwise(starts)]
-        self.bases, self._smoothed, self._parts = in_rows(config.vectors)
-        self._kinds = {kind for _, kind in self._parts}
-        self._pairs = pairs_of(config).to(device)
-        self._rows = torch.zeros((len(self.bases) + len(self._smoothed), vertices, 3), device=device)
+        names = network.config.vectors
+        self.bases, smoothed, parts = in_rows(names)
+        self._frames = bool(smoothed) or any(normal for _, normal in parts)
+        self._rows = torch.zeros((len(self.bases) + len(smoothed), vertices, 3), device=device)
         self._out = torch.zeros((vertices, 3), device=device)
-        self._scaled = torch.zeros((self.count, vertices if config.means else 1, 3), device=device)
-        means = network.encode_means.weight.detach()
-        self._clock, self._at_means = means[:, 0], means[:, 1:]
-        layers = [network.encode, *network.hidden, network.decode]
-        # Turned, so that each layer is one product whose rows are vertices.
-        self._weights = [layer.weight.detach().T.contiguous() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
-        self._biases = [layer.bias.detach().clone() for layer in layers]  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+        layers: list[Any] = [network.encode, *network.hidden, network.decode]
+        # Transposed, so that each layer is one product whose rows are vertices.
+        self._weights = [layer.weight.detach().T.contiguous() for layer in layers]
+        self._biases = [layer.bias.detach().clone() for layer in layers]
         self._biases[-1][0] += 1.0
-        self._stretches = 3 * config.strain
+        self._clock = network.encode_means.weight.detach()[:, 0]
         self._features = torch.zeros((vertices, len(self._weights[0])), device=device)
         self._layers = [torch.zeros((vertices, len(bias)), device=device) for bias in self._biases]
         flat, spacing = vectors(self._rows.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
-        normal = wp.zeros(vertices if NORMAL in self._kinds else 1, dtype=wp.vec3f, device=device)
-        strain, x, others = (wp.zeros(1, dtype=t, device=device) for t in (wp.mat33f, wp.vec3f, wp.vec2i))
-        number = wp.zeros(1, dtype=wp.int32, device=device)
-        shared = [vertices, flat, spacing, normal, strain]
-        given = {"device": device, "threads": threads}
-        seen = [wp.from_torch(self._features), vectors(self._scaled.reshape(-1, 3))]
-        between = tuple((a, b) for a, b in self._pairs.T.tolist())
-        shares = tuple(zip(families_of(config.vectors), counted(config.vectors), strict=True))
-        see = seeing(self._parts, between, self._smoothed, shares, means=config.means)
-        self._see = Launch(see, vertices, [*shared, x, number, others, number, number, *seen], **given)
+        normal = wp.zeros(vertices if self._frames else 1, dtype=wp.vec3f, device=device)
+        x, others, number = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.vec3f, wp.vec2i, wp.int32))
+        shared, place = [vertices, flat, spacing, normal], {"device": device, "threads": threads}
+        pairs = tuple((a, b) for a, b in pairs_of(names).T.tolist())
+        families = tuple(zip(families_of(names), counted(names), strict=True))
+        mesh = [x, number, others, number, number]
+        see = seeing(parts, pairs, smoothed, families)
+        self._see = Launch(see, vertices, [*shared, *mesh, wp.from_torch(self._features)], **place)
+        ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
+        self._combine = Launch(combining(parts), vertices, [*shared, *ends], **place)
         self._mesh: object = None
         self._spacing: Tensor | None = None
-        ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
         self._reach: Tensor | None = None
-        self._combine = Launch(combining(self._parts), vertices, [*shared, *ends], **given)
 
     def __call__(
         self,
@@ -107,7 +84,7 @@ class FusedPhysgraph:
         reach: Float[Tensor, " vertices"],
         step: int | Tensor,
         *,
-        around: Callable[[], Around],
+        frame: Callable[[], VertexFrame],
     ) -> Float[Tensor, "vertices 3"]:
         """The displacement [m], no longer than allowed.
 
@@ -116,74 +93,188 @@ class FusedPhysgraph:
             spacing: Mean rest edge at each vertex [m].
             reach: The same, and 0 where a vertex may not move [m].
             step: Number of steps made before, a scalar on the device while steps are recorded.
-            around: Gives the surroundings of the vertices; called where parts need them.
+            frame: Gives the surroundings of the vertices; called where parts need them.
         """
         torch.stack(list(bases), out=self._rows[: len(self.bases)])
         changed = {}
         if self._spacing is not spacing:
             self._spacing, changed[2] = spacing, wp.from_torch(spacing, requires_grad=False)
-        seen = around() if self._kinds & {NORMAL, STRAIN} or self._smoothed or self._config.strain else None
-        if seen is not None and STRAIN in self._kinds:
-            changed[4] = wp.from_torch(seen.strain, dtype=wp.mat33f)
-            self._combine.change({4: changed[4]})
         if self._reach is not reach:
             self._reach = reach
             self._combine.change({2: wp.from_torch(reach, requires_grad=False)})
-        if seen is not None:
-            changed[5] = seen.positions
+        if self._frames:
+            seen = frame()
+            changed[4] = seen.positions
             if self._mesh is not seen.mesh:
                 self._mesh = seen.mesh
-                changed |= dict(enumerate(seen.mesh, start=6))
+                changed |= dict(enumerate(seen.mesh, start=5))
         self._see(changed)
-        if seen is not None and self._stretches:
-            self._features[:, -self._stretches :] = seen.stretch
         h = self._features
         biases = [self._biases[0] + self._clock * clock_of(step), *self._biases[1:]]
         for place, (bias, weight, out) in enumerate(zip(biases, self._weights, self._layers, strict=True)):
             h = torch.addmm(bias, h.relu_() if place else h, weight, out=out)
-            if self._config.means and not place:
-                for span in self._spans:
-                    h[span] += self._from_means(span)
         self._combine({})
         return self._out.clone()
 
-    def _from_means(self, span: slice) -> Float[Tensor, " width"]:
-        """What the first layer takes from a garment's means."""
-        flat = self._scaled[:, span].reshape(self.count, -1)
-        products = flat @ flat.T / max(span.stop - span.start, 1)
-        root = (products.diagonal() + FLOOR**2).sqrt()
-        first, second = self._pairs
-        cosine = products[first, second] / (root[first] * root[second])
-        return self._at_means @ torch.cat([2.0 * LOG_SCALE * root.log() + LOG_OFFSET, cosine])
-
 
 @functools.lru_cache(maxsize=8)
-def fused_physgraph(
-    network: Physgraph, starts: tuple[int, ...], longest: float, *, device: str, threads: int
-) -> FusedPhysgraph:
-    """The same, kept for the next frame; the network's weights must not change any more."""
-    return FusedPhysgraph(network, starts, longest, device=device, threads=threads)
+def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> FusedPhysgraph:
+    """A `FusedPhysgraph`, reused in the next frame; the network's weights must not change any more."""
+    return FusedPhysgraph(network, vertices, longest, device=device, threads=threads)
 
 
 def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Parts]:
-    """The whole vectors behind vectors of these names, those whose means follow them, and each one's row and part."""
+    """The rows that vectors of these names are made of.
+
+    Returns:
+        The whole vectors, which are the first rows; those of them whose means over the neighbours are the last rows; of
+        each name its row and whether it is the normal part of that.
+    """
     split = [name.partition(".")[::2] for name in names]
     wholes = tuple(dict.fromkeys(whole for whole, _ in split))
     smoothed = tuple(wholes.index(whole) for whole, part in split if part == "smooth")
 
-    def place(whole: str, part: str) -> tuple[int, int]:
+    def place(whole: str, part: str) -> tuple[int, bool]:
         row = wholes.index(whole)
-        if part == "smooth":
-            return len(wholes) + smoothed.index(row), 0
-        return row, {"normal": NORMAL, "strain": STRAIN}.get(part, 0)
+        return (len(wholes) + smoothed.index(row), False) if part == "smooth" else (row, part == "normal")
 
     return wholes, smoothed, tuple(place(*each) for each in split)
 
 
 @functools.cache
+def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], families: Families) -> wp.Kernel:
+    """The kernel that finds the normal, the neighbours' means and the features of each vertex.
+
+    Args:
+        parts: Row of each vector, and whether it is the normal part of that.
+        pairs: The vectors whose products are shown.
+        smoothed: Rows whose means over the neighbours are the last rows.
+        families: Family of each vector, over whose mean square its products are shown, and whether it counts in that.
+    """
+    # Warp's hash of a kernel does not see all values that functions of any type are made with; the name carries them.
+    made = hashlib.sha256(repr((parts, pairs, smoothed, families)).encode()).hexdigest()[:16]
+    measure, compare = _measuring(1 + max(row for row, _ in parts), smoothed), _comparing(parts, families)
+    show = _showing(parts, pairs, 1 + max(families)[0])
+
+    @wp.kernel(module=f"{__name__}.{made}")
+    def see(
+        first: wp.int32,
+        vertices: wp.int32,
+        v: wp.array(dtype=wp.vec3f),
+        spacing: wp.array(dtype=wp.float32),
+        normal: wp.array(dtype=wp.vec3f),
+        x: wp.array(dtype=wp.vec3f),
+        corners: wp.array(dtype=wp.int32),
+        others: wp.array(dtype=wp.vec2i),
+        ends: wp.array(dtype=wp.int32),
+        far: wp.array(dtype=wp.int32),
+        features: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        i = first + wp.tid()
+        across = wp.vec3f()
+        if wp.static(any(is_normal for _, is_normal in parts)):
+            across = normal_of(i, x, corners, others)
+            normal[i] = across
+        near = measure(i, vertices, ends, far, v, spacing)
+        unit, size = compare(near, across)
+        show(i, unit, size, across, features)
+
+    return see
+
+
+def _measuring(rows: int, smoothed: tuple[int, ...]) -> Any:
+    """The function that gives a vertex's rows in local edges and writes those that are means over its neighbours."""
+    table = wp.types.matrix(shape=(rows, 3), dtype=wp.float32)
+    means = wp.types.matrix(shape=(max(len(smoothed), 1), 3), dtype=wp.float32)
+    wholes = rows - len(smoothed)
+
+    @wp.func
+    def measure(
+        i: wp.int32,
+        vertices: wp.int32,
+        ends: wp.array(dtype=wp.int32),
+        far: wp.array(dtype=wp.int32),
+        v: wp.array(dtype=wp.vec3f),
+        spacing: wp.array(dtype=wp.float32),
+    ):
+        near, total = table(), means()
+        scale = wp.float32(1.0) / spacing[i]
+        if wp.static(len(smoothed) > 0):
+            for k in range(ends[i], ends[i + 1]):
+                j = far[k]
+                for s in range(wp.static(len(smoothed))):
+                    total[s] += v[wp.static(smoothed[s]) * vertices + j]
+            part = wp.float32(1.0) / wp.float32(wp.max(ends[i + 1] - ends[i], 1))
+            for s in range(wp.static(len(smoothed))):
+                v[wp.static(wholes + s) * vertices + i] = part * total[s]
+        for u in range(wp.static(rows)):
+            near[u] = scale * v[u * vertices + i]
+        return near
+
+    return measure
+
+
+def _comparing(parts: Parts, families: Families) -> Any:
+    """The function that divides rows by the root mean square of their family's vectors, and gives the mean squares."""
+    kinds, rows = 1 + max(family for family, _ in families), 1 + max(row for row, _ in parts)
+    table = wp.types.matrix(shape=(rows, 3), dtype=wp.float32)
+    column = wp.types.vector(length=kinds, dtype=wp.float32)
+    known = {row: family for (row, _), (family, _) in reversed(tuple(zip(parts, families, strict=True)))}
+    of = tuple(known.get(row, 0) for row in range(rows))
+    counts = tuple(a for a, (_, counts) in enumerate(families) if counts)
+    inverse_count = tuple(1.0 / sum(families[a][0] == kind for a in counts) for kind in range(kinds))
+
+    @wp.func
+    def compare(near: Any, across: wp.vec3f):
+        unit, size, inverse = table(), column(), column()
+        for k in range(wp.static(len(counts))):
+            w = near[wp.static(parts[counts[k]][0])]
+            if wp.static(parts[counts[k]][1]):
+                w = wp.dot(w, across) * across
+            size[wp.static(families[counts[k]][0])] += wp.dot(w, w)
+        for k in range(wp.static(kinds)):
+            size[k] = wp.float32(wp.static(inverse_count[k])) * size[k] + wp.float32(wp.static(FLOOR**2))
+            inverse[k] = wp.float32(1.0) / wp.sqrt(size[k])
+        for u in range(wp.static(rows)):
+            unit[u] = inverse[wp.static(of[u])] * near[u]
+        return unit, size
+
+    return compare
+
+
+def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
+    """The function that writes what the network sees of a vertex: squares, products, logarithms of the mean squares."""
+    every = wp.types.vector(length=len(parts), dtype=wp.float32)
+    shown = (*((a, a) for a in range(len(parts))), *pairs)
+
+    @wp.func
+    def show(i: wp.int32, unit: Any, size: Any, across: wp.vec3f, features: wp.array(dtype=wp.float32, ndim=2)):
+        height = every()
+        for a in range(wp.static(len(parts))):
+            if wp.static(parts[a][1]):
+                height[a] = wp.dot(unit[wp.static(parts[a][0])], across)
+        for p in range(wp.static(len(shown))):
+            a, b = wp.static(shown[p][0]), wp.static(shown[p][1])
+            if wp.static(parts[shown[p][0]][1] and parts[shown[p][1]][1]):
+                product = height[a] * height[b]
+            elif wp.static(parts[shown[p][0]][1]):
+                product = height[a] * wp.dot(unit[wp.static(parts[shown[p][1]][0])], across)
+            elif wp.static(parts[shown[p][1]][1]):
+                product = height[b] * wp.dot(unit[wp.static(parts[shown[p][0]][0])], across)
+            else:
+                product = wp.dot(unit[wp.static(parts[shown[p][0]][0])], unit[wp.static(parts[shown[p][1]][0])])
+            features[i, p] = product
+        for k in range(wp.static(kinds)):
+            features[i, wp.static(len(shown)) + k] = wp.float32(wp.static(LOG_SCALE)) * wp.log(size[k]) + wp.float32(
+                wp.static(LOG_OFFSET)
+            )
+
+    return show
+
+
+@functools.cache
 def combining(parts: Parts) -> wp.Kernel:
-    """The kernel that combines vectors of which these are the rows and parts."""
-    kinds = {kind for _, kind in parts}
+    """The kernel that combines vectors of which these are the rows and normal parts."""
 
     @wp.kernel(module="unique")
     def combine(
@@ -192,24 +283,19 @@ def combining(parts: Parts) -> wp.Kernel:
         v: wp.array(dtype=wp.vec3f),
         reach: wp.array(dtype=wp.float32),
         normal: wp.array(dtype=wp.vec3f),
-        strain: wp.array(dtype=wp.mat33f),
         coefficients: wp.array(dtype=wp.float32, ndim=2),
         longest: wp.float32,
         out: wp.array(dtype=wp.vec3f),
     ):
         i = first + wp.tid()
-        move, across, along = wp.vec3f(), wp.vec3f(), wp.mat33f()
+        move, across = wp.vec3f(), wp.vec3f()
         lift = wp.float32(0.0)
-        if wp.static(NORMAL in kinds):
+        if wp.static(any(is_normal for _, is_normal in parts)):
             across = normal[i]
-        if wp.static(STRAIN in kinds):
-            along = strain[i]
         for a in range(wp.static(len(parts))):
             s = v[wp.static(parts[a][0]) * vertices + i]
-            if wp.static(parts[a][1] == NORMAL):
+            if wp.static(parts[a][1]):
                 lift += coefficients[i, a] * wp.dot(s, across)
-            elif wp.static(parts[a][1] == STRAIN):
-                move += coefficients[i, a] * (along * s)
             else:
                 move += coefficients[i, a] * s
         move += lift * across

@@ -1,4 +1,4 @@
-"""The guard: keeps an integrator's step only if the energy falls (DESIGN 4.4)."""
+"""The guard: keeps an integrator's step only if the energy falls."""
 
 from __future__ import annotations
 

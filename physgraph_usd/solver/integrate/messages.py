@@ -10,15 +10,12 @@ passes from round to round stays float32.
 # pyright: reportMissingImports=false, reportIndexIssue=false, reportCallIssue=false
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import triton
 import triton.language as tl
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
-
-if TYPE_CHECKING:
-    from .paper_network import Ways
 
 ROWS, WARPS = 64, 4
 """Edges or vertices of a block of threads, and its warps."""
@@ -30,7 +27,7 @@ def updated_edges(
     from_sender: Float[Tensor, "vertices latent"],
     edge: Float[Tensor, "directed latent"],
     *,
-    ways: Ways,
+    ends: tuple[Int[Tensor, " directed"], Int[Tensor, " directed"]],
 ) -> Float[Tensor, "directed latent"]:
     """The edges after a perceptron of (receiver, sender, edge) has been added to them, in place.
 
@@ -39,11 +36,11 @@ def updated_edges(
         from_receiver: What the first layer makes of each vertex as a receiver.
         from_sender: The same as a sender.
         edge: The edges in both directions, float32 on CUDA; overwritten.
-        ways: Which vertices they join.
+        ends: Receiver and sender of each edge.
     """
     count, latent = edge.shape
     layers = _laid_out(perceptron, latent)
-    shown = [from_receiver.contiguous(), from_sender.contiguous(), ways.receiver, ways.sender]
+    shown = [from_receiver.contiguous(), from_sender.contiguous(), *ends]
     _update_edges[_blocks(count)](edge, *shown, *layers, count, latent, ROWS, num_warps=WARPS)
     return edge
 

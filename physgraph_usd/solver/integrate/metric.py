@@ -1,4 +1,4 @@
-"""The metric: one scalar symmetric positive definite matrix per level, factorised once (DESIGN 4.3)."""
+"""The metric: one scalar symmetric positive definite matrix per level, factorised once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Truncated Newton: the reference that polishes Phi* (DESIGN 4.5). Meant for float64.
+"""Truncated Newton: the reference that polishes Phi*. Meant for float64.
 
 Solves H d = F by conjugate gradients preconditioned by the metric; H v is a difference of forces,
 (F(x) - F(x + h v)) / h, so the reference needs nothing of the physics that the others do not have.

@@ -1,4 +1,4 @@
-"""The paper's encode-process-decode network (PAPER.md P3 to P5, choices A1 to A7, A17)."""
+"""The encode-process-decode network of "PhysGraph: Physics-Based Cloth Enhancement Using Graph Neural Networks"."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PIECE = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class DirectedEdges:
     """The edges in both directions, sorted by their receiver.
 
     Attributes:
@@ -33,11 +33,11 @@ class Ways:
     degree: Int[Tensor, " vertices"]
 
     @staticmethod
-    def of(edges: Int[Tensor, "edges 2"], vertices: int) -> Ways:
-        """Both ways of each edge."""
+    def of(edges: Int[Tensor, "edges 2"], vertices: int) -> DirectedEdges:
+        """Each edge in both directions."""
         sender, receiver = torch.cat([edges, edges.flip(1)]).long().T
         order = receiver.argsort(stable=True)
-        return Ways(sender[order], receiver[order], torch.bincount(receiver, minlength=vertices))
+        return DirectedEdges(sender[order], receiver[order], torch.bincount(receiver, minlength=vertices))
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PaperConfig:
         rounds: Rounds of message passing.
         history: Displacements and forces shown (H).
         shared: All rounds have the same weights.
-        features: "scaled" without units (A7) or "paper", metres and newtons as they are.
+        features: "scaled" without units or "paper", metres and newtons as they are.
     """
 
     latent: int = 128
@@ -60,10 +60,10 @@ class PaperConfig:
 
 
 class PaperNetwork(nn.Module):
-    """Encode, process, decode; two hidden layers, LayerNorm on all but the decoder, residuals, sums (A2)."""
+    """Encode, process, decode; two hidden layers, LayerNorm on all but the decoder, residuals, sums."""
 
     def __init__(self, config: PaperConfig) -> None:
-        """Make the five perceptrons; the decoder's last layer starts at zero (A6)."""
+        """Make the five perceptrons; the decoder's last layer starts at zero."""
         super().__init__()
         self.config = config
         latent, rounds = config.latent, 1 if config.shared else config.rounds
@@ -83,25 +83,25 @@ class PaperNetwork(nn.Module):
         edge: Float[Tensor, "directed 8"],
         fixed: Float[Tensor, "vertices 1"],
         *,
-        ways: Ways,
+        edges: DirectedEdges,
     ) -> Float[Tensor, "vertices 3"]:
         """Displacement in local edge lengths.
 
         Args:
-            vertex: Past displacements and forces (P3).
-            edge: Present and rest spans and their lengths (P4), of each edge in both directions (A3).
-            fixed: 1 where a vertex may not move (A17).
-            ways: The edges in both directions.
+            vertex: Past displacements and forces.
+            edge: Present and rest spans and their lengths, of each edge in both directions.
+            fixed: 1 where a vertex may not move.
+            edges: The edges in both directions.
         """
         v = self.encode_vertex(torch.cat([self.vertex_scale(vertex), fixed], dim=1))  # V L
         e = self.encode_edge(self.edge_scale(edge))  # 2E L
         kernels = self._kernels(e)
         for k in range(self.config.rounds):
-            own = 0 if self.config.shared else k
-            edges, vertices = (cast(nn.Sequential, updates[own]) for updates in (self.update_edge, self.update_vertex))
-            e = _updated_edges(edges, v, e, ways=ways, kernels=kernels)  # 2E L
-            gathered = torch.segment_reduce(e, "sum", lengths=ways.degree, axis=0, unsafe=True)  # V L
-            v = v + _vertex_update(vertices, v, gathered, kernels=kernels)  # V L
+            layers = 0 if self.config.shared else k
+            at_edge, at_vertex = (cast(nn.Sequential, each[layers]) for each in (self.update_edge, self.update_vertex))
+            e = _updated_edges(at_edge, v, e, edges=edges, kernels=kernels)  # 2E L
+            gathered = torch.segment_reduce(e, "sum", lengths=edges.degree, axis=0, unsafe=True)  # V L
+            v = v + _vertex_update(at_vertex, v, gathered, kernels=kernels)  # V L
         return self.step_length * self.decode(v)  # V 3
 
     def _kernels(self, like: Tensor) -> bool:
@@ -110,15 +110,15 @@ class PaperNetwork(nn.Module):
         return wanted and self.config.latent in LATENTS and has_triton()
 
 
-def _updated_edges(perceptron: nn.Sequential, v: Tensor, e: Tensor, *, ways: Ways, kernels: bool) -> Tensor:
-    """e and the perceptron of (receiver, sender, edge); its first layer meets each vertex once, not once an edge."""
+def _updated_edges(perceptron: nn.Sequential, v: Tensor, e: Tensor, *, edges: DirectedEdges, kernels: bool) -> Tensor:
+    """e and the perceptron of (receiver, sender, edge), whose first layer runs once a vertex, not once an edge."""
     first, *others = perceptron
     at_receiver, at_sender, at_edge = cast(nn.Linear, first).weight.chunk(3, dim=1)
     from_receiver, from_sender = v @ at_receiver.T, v @ at_sender.T
     if kernels:
         from .messages import updated_edges  # noqa: PLC0415  Triton is not everywhere
 
-        return updated_edges(perceptron, from_receiver, from_sender, e, ways=ways)
+        return updated_edges(perceptron, from_receiver, from_sender, e, ends=(edges.receiver, edges.sender))
 
     def change(e: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
         h = nn.functional.linear(e, at_edge, cast(nn.Linear, first).bias)
@@ -128,8 +128,8 @@ def _updated_edges(perceptron: nn.Sequential, v: Tensor, e: Tensor, *, ways: Way
         return h
 
     if torch.is_grad_enabled() or e.is_cuda:
-        return e + change(e, ways.receiver, ways.sender)
-    pieces = (part.split(PIECE) for part in (e, ways.receiver, ways.sender))
+        return e + change(e, edges.receiver, edges.sender)
+    pieces = (part.split(PIECE) for part in (e, edges.receiver, edges.sender))
     return torch.cat([part + change(part, *ends) for part, *ends in zip(*pieces, strict=True)])
 
 
@@ -150,7 +150,7 @@ def has_triton() -> bool:
 
 
 class Normaliser(nn.Module):
-    """Scales features by their mean and deviation, gathered while training until it is frozen (A5)."""
+    """Scales features by their mean and deviation, gathered while training until it is frozen."""
 
     def __init__(self, width: int, *, most: int = 1000) -> None:
         """Start with nothing gathered.

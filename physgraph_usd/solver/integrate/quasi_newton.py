@@ -1,14 +1,6 @@
-"""Quasi-Newton: L-BFGS whose first guess of the inverse Hessian is the metric's (DESIGN 4.3).
+"""Quasi-Newton: L-BFGS (`secants`) whose first guess of the inverse Hessian is the metric's.
 
-| symbol | here | meaning |
-|---|---|---|
-| s_i, y_i | ``moves``, ``yields`` | differences of positions and of negative forces |
-| z_i | ``images`` | H0^-1 y_i, a difference of preconditioned forces: no extra solve |
-| rho_i | 1 / s_i.y_i |
-| gamma | s.y / y.z of the newest pair: scales H0^-1 to the curvature last seen |
-
-The two-loop recursion (Nocedal 1980) applied to F needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, so a
-step costs one metric solve and, when the first trial is accepted, one force evaluation.
+A step costs one metric solve and, when the first trial is accepted, one force evaluation.
 
 H0 is of the rest shape. A collapsed triangle is up to 10^5 times as stiff, so that H0^-1 F goes much too far there and
 a line search shortens the steps of the whole garment to nothing. After such a step the metric is made as stiff as the
@@ -18,6 +10,7 @@ are secants, since a triangle that opens would stay as slow as it was.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,22 +18,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, Solver, System
+from .secants import Secant, dot, secant_direction, secant_of
 from .truncation import truncated
 
 ARMIJO = 1e-4
 MAX_BACKTRACKS = 12
 SHORTENED = 0.01
 """Part of its length to which a step is shortened from which on the secants are dropped and the metric is stiffened."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """One secant pair and its image under H0^-1."""
-
-    move: Tensor
-    yields: Tensor
-    image: Tensor
-    curvature: float
 
 
 class QuasiNewton:
@@ -54,7 +38,7 @@ class QuasiNewton:
         """Choose the memory and the first guess.
 
         Args:
-            history: Number of secant pairs kept.
+            history: Number of secants kept.
             use_metric: False scales by the Hessian's diagonal at the start instead of H0.
         """
         self.name = "quasi-newton" if use_metric else "lbfgs"
@@ -70,8 +54,8 @@ class QuasiNewton:
         """Evaluate x anew under forces that changed a little; the secants are kept."""
         memory: _Memory = carry.memory
         energy, force = system.energy_and_force(carry.x)
-        kept = replace(memory, image=self._image(system, memory.inverse, force))
-        return self._carry(carry.x, energy, force, kept)
+        memory = replace(memory, image=self._image(system, memory.inverse, force))
+        return self._carry(carry.x, energy, force, memory)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One secant step with a backtracking line search; the energy never rises by more than rounding.
@@ -80,24 +64,25 @@ class QuasiNewton:
         the next one has to be, too, the metric misled both, and the one after knows the present state's stiffness.
         """
         memory = self._softened(system, carry) if carry.memory.stiff >= self._history else carry.memory
-        direction = two_loop(carry.force, memory.image, memory.pairs)
-        slope = _dot(carry.force, direction)
+        direction = secant_direction(carry.force, memory.image, memory.secants)
+        slope = dot(carry.force, direction)
         if not slope > 0:
-            direction, slope = memory.image, _dot(carry.force, memory.image)
+            direction, slope = memory.image, dot(carry.force, memory.image)
         found = backtrack(system, carry, direction, slope, by_force=True)
         if found is None:
             return self._forget(system, carry)
         x, energy, force = found
         move = x - carry.x
-        if _dot(move, move) < SHORTENED**2 * _dot(direction, direction):
+        if dot(move, move) < SHORTENED**2 * dot(direction, direction):
             again = memory.shortened and not memory.stiff
             inverse = self._present(system, x) if again or not self._use_metric else None
             begun = self._begin(system, x, energy, force, inverse=inverse)
             return replace(begun, memory=replace(begun.memory, shortened=True))
         image = self._image(system, memory.inverse, force)
-        pair = pair_of(move, carry.force - force, memory.image - image)
-        pairs = memory.pairs if pair is None else (*memory.pairs, pair)[-self._history :]
-        return self._carry(x, energy, force, _Memory(pairs, memory.inverse, image, memory.stiff + bool(memory.stiff)))
+        secants, newest = memory.secants, secant_of(move, carry.force - force, memory.image - image)
+        if newest.curvature < math.inf:
+            secants = (*secants, newest)[-self._history :]
+        return self._carry(x, energy, force, _Memory(secants, memory.inverse, image, memory.stiff + bool(memory.stiff)))
 
     def _begin(self, system: System, x: Tensor, energy: float, force: Tensor, *, inverse: Solver | None) -> Carry:
         stiff = int(inverse is not None and self._use_metric)
@@ -106,8 +91,8 @@ class QuasiNewton:
     def _softened(self, system: System, carry: Carry) -> _Memory:
         """The memory of a carry with the metric at rest in place of one that was stiffened."""
         memory: _Memory = carry.memory
-        pairs = tuple(replace(pair, image=system.apply_metric_inverse(pair.yields)) for pair in memory.pairs)
-        return _Memory(pairs, None, system.apply_metric_inverse(carry.force))
+        secants = tuple(replace(each, image=system.apply_metric_inverse(each.yields)) for each in memory.secants)
+        return _Memory(secants, None, system.apply_metric_inverse(carry.force))
 
     def _carry(self, x: Tensor, energy: float, force: Tensor, memory: _Memory) -> Carry:
         return Carry(x, energy, force, memory.image if self._use_metric else None, self.name, memory)
@@ -123,11 +108,11 @@ class QuasiNewton:
     def _forget(self, system: System, carry: Carry) -> Carry:
         """No secant step lowers the energy: drop the secants; without any, try one step on the diagonal, then stay."""
         memory: _Memory = carry.memory
-        if memory.pairs:
+        if memory.secants:
             inverse = self._present(system, carry.x)
             return self._begin(system, carry.x, carry.energy, carry.force, inverse=inverse)
         direction = carry.force / system.diagonal(carry.x).unsqueeze(1)
-        found = backtrack(system, carry, direction, _dot(carry.force, direction))
+        found = backtrack(system, carry, direction, dot(carry.force, direction))
         if found is None:
             return carry.moved_by("stayed")
         x, energy, force = found
@@ -139,14 +124,14 @@ class _Memory:
     """What is remembered from step to step.
 
     Attributes:
-        pairs: Secants.
+        secants: Secants, oldest first.
         inverse: First guess of the inverse Hessian; None for H0^-1.
         image: That of the present force.
         shortened: Whether it begins with a step that had to be shortened much.
         stiff: Number of the step since the metric was stiffened, from 1 on; 0 where it was not.
     """
 
-    pairs: tuple[Pair, ...]
+    secants: tuple[Secant, ...]
     inverse: Solver | None
     image: Tensor
     stiff: int = 0
@@ -182,10 +167,10 @@ def backtrack(
         energy, force = system.energy_and_force(x)
         if energy <= carry.energy - ARMIJO * length * slope:
             return x, energy, force
-        if by_force and energy <= level and _dot(force, direction) >= (2.0 * ARMIJO - 1.0) * slope:
+        if by_force and energy <= level and dot(force, direction) >= (2.0 * ARMIJO - 1.0) * slope:
             return x, energy, force
         cut = truncated(system, carry.x, direction) if trial == 0 else None
-        if cut is not None and (less := _dot(carry.force, cut)) > 0:
+        if cut is not None and (less := dot(carry.force, cut)) > 0:
             direction, slope = cut, less
             continue
         rise = energy - carry.energy + length * slope
@@ -193,35 +178,3 @@ def backtrack(
         length = min(max(guess, 0.1 * length), 0.5 * length)
     system.failed += MAX_BACKTRACKS
     return None
-
-
-def two_loop(
-    force: Float[Tensor, "vertices 3"], preconditioned: Float[Tensor, "vertices 3"], pairs: tuple[Pair, ...]
-) -> Float[Tensor, "vertices 3"]:
-    """The L-BFGS direction [m] for a force [N], from its preconditioned image [m] and the secant pairs."""
-    if not pairs:
-        return preconditioned
-    weights = []
-    residual = force.clone()
-    image = preconditioned.clone()
-    for pair in reversed(pairs):
-        weight = _dot(pair.move, residual) / pair.curvature
-        residual.add_(pair.yields, alpha=-weight)
-        image.add_(pair.image, alpha=-weight)
-        weights.append(weight)
-    newest = pairs[-1]
-    image.mul_(newest.curvature / _dot(newest.yields, newest.image))
-    for pair, weight in zip(pairs, reversed(weights), strict=True):
-        image.add_(pair.move, alpha=weight - _dot(pair.yields, image) / pair.curvature)
-    return image
-
-
-def pair_of(move: Tensor, yields: Tensor, image: Tensor) -> Pair | None:
-    """A secant pair, or None when its curvature is not safely positive."""
-    curvature = _dot(move, yields)
-    floor = 1e-8 * (_dot(move, move) * _dot(yields, yields)) ** 0.5
-    return Pair(move, yields, image, curvature) if curvature > floor and _dot(yields, image) > 0 else None
-
-
-def _dot(a: Tensor, b: Tensor) -> float:
-    return float(torch.dot(a.reshape(-1), b.reshape(-1)))

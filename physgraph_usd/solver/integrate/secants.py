@@ -1,79 +1,98 @@
-"""Secants of several garments at once, and their L-BFGS direction; gradients flow through.
+"""Secants of past steps, and the L-BFGS direction that they give (Nocedal 1980).
 
-As `quasi_newton` has them, but each garment by itself and without waiting for a number: whether a pair counts is in
-its own 1 / s.y, which is 0 where it does not.
+| symbol | here | meaning |
+|---|---|---|
+| s_i, y_i | ``move``, ``yields`` | differences of positions and of negative forces |
+| z_i | ``image`` | H0^-1 y_i, a difference of preconditioned forces: no extra solve |
+| rho_i | 1 / ``curvature`` | 1 / s_i.y_i |
+| gamma | s.y / y.z of the newest secant | scales H0^-1 to the curvature last seen |
+
+Scalar products are numbers for cloth that is one problem, or tensors: one for each garment, shown at its vertices, so
+that garments do not mix, nobody waits for a number and gradients flow through.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .network import Graph
-from .quasi_newton import Pair, pair_of, two_loop
+Dot = Callable[[Tensor, Tensor], Any]
+"""The scalar product of two fields: a float, or a tensor of one number a garment, shown at each of its vertices."""
 
 
 @dataclass(frozen=True, eq=False)
 class Secant:
-    """A difference of positions, of negative forces, of their images under H0^-1, and 1 / s.y of each garment or 0."""
+    """A difference of positions, of negative forces, of their images under H0^-1, and s.y.
+
+    The curvature s.y is infinite where it is not safely positive: the secant then changes nothing.
+    """
 
     move: Tensor
     yields: Tensor
     image: Tensor
-    inverse: Tensor
+    curvature: Any
+
+
+def dot(a: Tensor, b: Tensor) -> float:
+    """The scalar product of two fields as one number."""
+    return float(torch.dot(a.reshape(-1), b.reshape(-1)))
+
+
+def secant_of(move: Tensor, yields: Tensor, image: Tensor, *, dot: Dot = dot) -> Secant:
+    """A secant with its curvature."""
+    curvature = dot(move, yields)
+    floor = 1e-8 * (dot(move, move) * dot(yields, yields)) ** 0.5
+    size = dot(yields, image)
+    if isinstance(curvature, Tensor):
+        return Secant(move, yields, image, torch.where((curvature > floor) & (size > 0), curvature, math.inf))
+    return Secant(move, yields, image, curvature if curvature > floor and size > 0 else math.inf)
 
 
 def secant_direction(
     force: Float[Tensor, "vertices 3"],
-    image: Float[Tensor, "vertices 3"],
-    pairs: tuple[Secant, ...],
+    preconditioned: Float[Tensor, "vertices 3"],
+    secants: Sequence[Secant],
     *,
-    graph: Graph,
+    dot: Dot = dot,
 ) -> Float[Tensor, "vertices 3"]:
-    """The L-BFGS direction [m], as in `quasi_newton`, for each garment by itself.
+    """The L-BFGS direction [m].
+
+    The two-loop recursion needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, and so no solve.
 
     Args:
-        force: [N].
-        image: H0^-1 F [m].
-        pairs: Secants, oldest first.
-        graph: Which vertex belongs to which garment.
+        force: F [N].
+        preconditioned: H0^-1 F [m].
+        secants: Oldest first.
+        dot: The scalar product.
     """
-    if pairs and graph.garments == 1 and not (force.is_cuda or force.requires_grad) and float(pairs[-1].inverse) > 0:
-        known = ((pair, float(pair.inverse)) for pair in pairs)
-        good = tuple(Pair(pair.move, pair.yields, pair.image, 1.0 / each) for pair, each in known if each > 0)
-        return two_loop(force, image, good)
-    weights = []
-    for pair in reversed(pairs):
-        weight = pair.inverse * _dots(pair.move, force, graph)
-        force = torch.addcmul(force, weight, pair.yields, value=-1.0)
-        image = torch.addcmul(image, weight, pair.image, value=-1.0)
+    if not secants:
+        return preconditioned
+    weights, residual, image = [], force.clone(), preconditioned.clone()
+    for secant in reversed(secants):
+        weight = dot(secant.move, residual) / secant.curvature
+        residual, image = _plus(residual, -weight, secant.yields), _plus(image, -weight, secant.image)
         weights.append(weight)
-    if pairs:
-        newest = pairs[-1]
-        own = newest.inverse > 0
-        size = _dots(newest.yields, newest.image, graph)
-        image = image * torch.where(own, 1.0 / torch.where(own, newest.inverse * size, 1.0), 1.0)
-    for pair, weight in zip(pairs, reversed(weights), strict=True):
-        image = torch.addcmul(image, weight - pair.inverse * _dots(pair.yields, image, graph), pair.move)
+    image = _scaled(image, secants[-1], dot)
+    for secant, weight in zip(secants, reversed(weights), strict=True):
+        image = _plus(image, weight - dot(secant.yields, image) / secant.curvature, secant.move)
     return image
 
 
-def secant_of(move: Tensor, yields: Tensor, image: Tensor, *, graph: Graph) -> Secant:
-    """A secant that counts where its curvature is safely positive."""
-    if graph.garments == 1 and not (move.is_cuda or move.requires_grad):
-        pair = pair_of(move, yields, image)
-        return Secant(move, yields, image, move.new_full((1, 1), 0.0 if pair is None else 1.0 / pair.curvature))
-    curvature = _dots(move, yields, graph)
-    floor = 1e-8 * (_dots(move, move, graph) * _dots(yields, yields, graph)).sqrt()
-    good = (curvature > floor) & (_dots(yields, image, graph) > 0)
-    return Secant(move, yields, image, torch.where(good, 1.0 / torch.where(good, curvature, 1.0), 0.0))
+def _plus(field: Tensor, weight: Any, other: Tensor) -> Tensor:
+    """A field and a multiple of another; in place for numbers."""
+    return torch.addcmul(field, weight, other) if isinstance(weight, Tensor) else field.add_(other, alpha=weight)
 
 
-def _dots(a: Tensor, b: Tensor, graph: Graph) -> Tensor:
-    """Scalar products of each garment, at each of its vertices."""
-    if graph.garments == 1:
-        return torch.dot(a.reshape(-1), b.reshape(-1)).reshape(1, 1)
-    return graph.total((a * b).sum(dim=1, keepdim=True))[graph.owner]
+def _scaled(image: Tensor, newest: Secant, dot: Dot) -> Tensor:
+    """An image times gamma, which is 1 where the newest secant changes nothing."""
+    size = dot(newest.yields, newest.image)
+    if not isinstance(size, Tensor):
+        return image.mul_(newest.curvature / size if newest.curvature < math.inf else 1.0)
+    good = newest.curvature < math.inf
+    return image * torch.where(good, torch.where(good, newest.curvature, 1.0) / torch.where(good, size, 1.0), 1.0)

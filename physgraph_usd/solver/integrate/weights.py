@@ -146,7 +146,7 @@ def _config(kind: str, values: dict[str, Any]) -> PhysgraphConfig | PaperConfig:
 
 
 def random_network(config: PhysgraphConfig | PaperConfig, *, seed: int, scale: float = 1.0) -> Network:
-    """A network with random weights, the last layer's too: what the guard must withstand (STABILITY.md S37)."""
+    """A network with random weights, the last layer's too: what the guard must withstand."""
     generator = torch.Generator().manual_seed(seed)
     network = make_network(config)
     with torch.no_grad():
