@@ -45,6 +45,7 @@ SHOTS = {
     "armpit": Told(("Shirt",), ("Form",), 30, inside=0.02, deepest_mm=8.0),
     "layers": Told(("Trousers", "Shirt", "Belt"), ("Form",), 30),
     "block": Told(("Sheet",), ("Block",), 24),
+    "dancer": Told(("Dress",), ("Body",), 60),
 }
 
 

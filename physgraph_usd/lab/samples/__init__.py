@@ -16,6 +16,7 @@ SAMPLES: dict[str, str] = {
     "skirt": "a flared skirt on turning hips, with a collider",
     "tshirt": "quads with UVs, two materials and skinning that shows the armpit artefact",
     "flag": "quads in the wind, pinned on one edge, no collider",
+    "dancer": "a dress with a wide skirt on a person who turns on one foot",
     "frozen": "a cloth draped over a table, twelve equal samples",
     "armpit": "a T-shirt pinched between the side and an arm that goes down and up again",
     "layers": "trousers, a shirt over them and a belt over both, on a body that walks in place",
