@@ -14,9 +14,8 @@ import numpy as np
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
-from .grid import ease
 from .panel import Cut, sew
-from .solids import Solid
+from .shapes import Solid, ease
 
 FRAMES, RATE = 60, 24.0
 """Samples in the shot, which is one turn, and their number a second."""
