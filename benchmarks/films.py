@@ -31,8 +31,8 @@ from physgraph_usd.shot.page.raycast import View, draw, fit_view
 from physgraph_usd.shot.refine import prepare_device, refine_shot
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
 
-LEVEL, PANEL, RATE, QUALITY = 2, (480, 540), 12, "25"
-"""Subdivisions, one side's size [pixels], frames a second, and x264's rate factor."""
+LEVEL, PANEL, QUALITY = 2, (480, 540), "25"
+"""Subdivisions, one side's size [pixels], and x264's rate factor."""
 LOOP, QUADS = "Cage, Loop subdivision", "Cage, Catmull-Clark subdivision"
 """Titles of the left side: `solver/mesh/subdivide.py` has one rule of both, the pure one among one kind of face."""
 
@@ -46,18 +46,23 @@ class Shown:
         camera: Azimuth and elevation [degrees].
         still: Time code of the picture that stands for the film.
         title: Of the left side.
+        rate: Frames a second; shots have 24.
     """
 
     frames: tuple[float, float]
     camera: tuple[float, float]
     still: float
     title: str = LOOP
+    rate: int = 12
 
 
 SHOWN = {
+    "dancer": Shown((1.0, 60.0), (20.0, 7.0), 33.0, QUADS, 24),
+    "tshirt": Shown((1.0, 36.0), (15.0, 8.0), 17.0, QUADS),
+    "layers": Shown((1.0, 30.0), (30.0, 6.0), 20.0, QUADS),
     "sleeve": Shown((1.0, 24.0), (25.0, 10.0), 22.0),
-    "skirt": Shown((1.0, 32.0), (25.0, 6.0), 24.0),
-    "flag": Shown((1.0, 30.0), (25.0, 10.0), 24.0, QUADS),
+    "skirt": Shown((1.0, 48.0), (25.0, 6.0), 24.0),
+    "flag": Shown((1.0, 48.0), (25.0, 10.0), 24.0, QUADS),
     "block": Shown((1.0, 24.0), (40.0, 22.0), 16.0, QUADS),
 }
 """The films by sample."""
@@ -90,7 +95,7 @@ def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
     say(f"{name}: {said}, crossings {counts[0]:,} -> {counts[1]:,}")
     drawn = {time: Image.fromarray(pixels) for time, pixels in pictures(sides, shown)}
     drawn[shown.still].save(out.with_suffix(".jpg"), quality=85)
-    encode(list(drawn.values()), out)
+    encode(list(drawn.values()), out, rate=shown.rate)
 
 
 def smooth(name: str, fine: DrawnStage, times: Sequence[float]) -> Iterator[Side]:
@@ -138,13 +143,13 @@ def pictures(sides: Sequence[tuple[float, Side, Side]], shown: Shown) -> Iterato
         yield time, np.asarray(sheet)
 
 
-def encode(frames: Sequence[Image.Image], out: Path) -> None:
+def encode(frames: Sequence[Image.Image], out: Path, *, rate: int) -> None:
     """Write an H.264 film that every browser plays."""
     program = shutil.which("ffmpeg")
     if program is None:
         sys.exit("no ffmpeg on the path: it writes the films")
     width, height = frames[0].size
-    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{RATE}", "-i", "-"]
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{rate}", "-i", "-"]
     wanted = ["-c:v", "libx264", "-preset", "slow", "-crf", QUALITY, "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     pixels = b"".join(frame.tobytes() for frame in frames)
     subprocess.run([program, "-loglevel", "error", "-y", *given, *wanted, str(out)], input=pixels, check=True)
