@@ -58,7 +58,7 @@ np.savez(sys.argv[2], x_0_1=x, ms_0_1=ms, x_1_1=x, ms_1_1=ms)
 """A solver outside that does nothing."""
 
 OPTIONS = ChartOptions(
-    level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=2.0
+    level=1, methods=("quasi-newton", "gd"), colliders=("/World/ball",), count=1, repeats=2, budget_minutes=0.5
 )
 QUICK = replace(OPTIONS, budget_minutes=0.02)
 
@@ -77,10 +77,13 @@ def shot_with_ball(path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Chart]:
-    """A shot, its chart's folder and the chart."""
+    """A shot, its chart's folder and the chart, which goes on until all terms are measured, however busy the machine."""
     folder = tmp_path_factory.mktemp("chart")
     shot = shot_with_ball(folder / "sheet.usda")
-    return shot, folder / "out", chart_shot(shot, folder / "out", OPTIONS)
+    chart = chart_shot(shot, folder / "out", OPTIONS)
+    while "warm" not in {row["term"] for row in chart.terms}:
+        chart = chart_shot(shot, folder / "out", OPTIONS)
+    return shot, folder / "out", chart
 
 
 def point(method: str, steps: int, ms: float, gap: float) -> Point:
