@@ -15,10 +15,9 @@ from click.testing import CliRunner, Result
 from physgraph_usd.cli import main
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.train import loop, record
-from physgraph_usd.lab.train.bundle import Bundle, deal
+from physgraph_usd.lab.train.bundle import Bundle, JointSystem, Twin, deal, detached, unrolled
 from physgraph_usd.lab.train.loop import TrainConfig, Trainer, loss_of, nested_gap
 from physgraph_usd.lab.train.patches import Patch, PatchConfig, describe, make_patches
-from physgraph_usd.lab.train.unroll import JointSystem, Twin, detached, unrolled
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.forces.contact import Contact
 from physgraph_usd.solver.integrate.base import Carry, System
@@ -233,7 +232,7 @@ def test_a_twin_tells_how_many_times_steps_magnify_a_difference(patches: list[Pa
     torch.manual_seed(1)
     twin, carry = Twin(Stretching(), system, x), Stretching().start(system, x)
     for steps in (2, 1):
-        twin.unroll(steps, beside=carry.x)
+        twin.unroll(steps, other=carry.x)
         carry = unrolled(Stretching(), system, carry, steps)
         assert torch.allclose(twin.growth(carry.x), torch.full((system.garments,), 3.0**steps), rtol=1e-2)
 

@@ -1,22 +1,166 @@
-"""Patches that are stepped as one: garments of one group, with the starts and the least energies of each."""
+"""Patches that are stepped as one: a system that torch can differentiate, and the starts and least energies of each.
+
+All patches of a batch are garments of one group, so forces, metric and network each run once for all of them, and each
+patch's energy is known. A `Twin` unrolls the steps from a start that differs by noise.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ...solver.forces.base import ForceModule
 from ...solver.frame.group import Group
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS
+from ...solver.integrate.base import Carry, Integrator, Solver, System
 from ...solver.level import refine_garments
-from .bodies import with_bodies
-from .patches import Patch
-from .unroll import JointSystem
+from .patches import Patch, with_bodies
+
+NOISE = 1e-3
+"""Root mean square of what a twin's start differs by, in local edge lengths: well above float32's rounding."""
+NUDGE = 1e-2
+"""Displacement of the difference of forces behind a Hessian product, in local edge lengths."""
+
+
+class JointSystem(System):
+    """A system with gradients that knows the energy of each garment.
+
+    Attributes:
+        owner: Garment of each vertex, shape (V,).
+        garments: Number of garments.
+        through: Whether gradients flow through forces.
+        energies: Energy of each garment [J] at each evaluation, in their order.
+    """
+
+    def __init__(self, system: System, *, through_forces: bool) -> None:
+        """Take over a system that has a level.
+
+        Args:
+            system: The system.
+            through_forces: Let gradients flow through forces into the positions they were evaluated at; else only
+                through displacements.
+        """
+        level = system.level
+        assert level is not None
+        super().__init__(system.field, system.metric, free=system.free, spacing=system.spacing, level=level)
+        self.owner, self.garments = level.vertex_garment.long(), len(level.spans)
+        self.through = through_forces
+        self.energies: list[Tensor] = []
+
+    def each(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " garments"], Float[Tensor, "vertices 3"]]:
+        """Energy of each garment [J] and the force [N]."""
+        return cast(ForceModule, self.field).energy_and_force_each(x.contiguous(), self.garments)
+
+    def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
+        """Energy [J] and force [N], with gradients."""
+        self.evaluations += 1
+        energies, force = cast(tuple[Tensor, Tensor], _EnergyForce.apply(x, self))
+        self.energies.append(energies)
+        force = force if self.through else force.detach()
+        return float(energies.detach().sum()), force * self.free
+
+    def apply_metric_inverse(
+        self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
+    ) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m], with gradients; without them where another solver is to be used in place of H0^-1."""
+        if solver is not None:
+            return super().apply_metric_inverse(force, solver)
+        return cast(Tensor, _MetricSolve.apply(force, self))
+
+
+class _EnergyForce(torch.autograd.Function):
+    """Energies and force; an energy's derivative is -F, the force's a difference of forces."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, system: JointSystem) -> tuple[Tensor, Tensor]:
+        energies, force = system.each(x)
+        ctx.save_for_backward(x, force)
+        ctx.system = system
+        return energies, force
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:  # type: ignore[override]
+        x, force = ctx.saved_tensors
+        by_energy, by_force = gradients
+        system: JointSystem = ctx.system
+        gradient = -force * by_energy.to(force)[system.owner].unsqueeze(1)
+        if not system.through:
+            return gradient, None
+        size = by_force.square().sum(dim=1).sqrt() / system.spacing
+        largest = torch.zeros(system.garments, dtype=size.dtype, device=size.device)
+        largest = largest.scatter_reduce(0, system.owner, size, "amax").clamp_min(1e-30)[system.owner].unsqueeze(1)
+        nudge = NUDGE / largest * by_force
+        there, back = (system.field.energy_and_force((x + sign * nudge).contiguous())[1] for sign in (1.0, -1.0))
+        return gradient + (there - back) * (largest / (2.0 * NUDGE)), None
+
+
+class _MetricSolve(torch.autograd.Function):
+    """H0^-1 F; H0 is symmetric, so it is its own transpose."""
+
+    @staticmethod
+    def forward(ctx: Any, force: Tensor, system: JointSystem) -> Tensor:
+        ctx.system = system
+        return System.apply_metric_inverse(system, force)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:  # type: ignore[override]
+        return System.apply_metric_inverse(ctx.system, gradients[0].contiguous()), None
+
+
+def unrolled(integrator: Integrator, system: System, carry: Carry, steps: int) -> Carry:
+    """The carry after so many steps."""
+    for _ in range(steps):
+        carry = integrator.step(system, carry)
+    return carry
+
+
+def detached(carry: Any) -> Any:
+    """The carry without the graph that led to it."""
+    if isinstance(carry, Tensor):
+        return carry.detach()
+    if isinstance(carry, tuple):
+        return tuple(detached(item) for item in carry)
+    if is_dataclass(carry) and not isinstance(carry, type):
+        return replace(carry, **{f.name: detached(getattr(carry, f.name)) for f in fields(carry)})
+    return carry
+
+
+class Twin:
+    """A second descent, whose start differs by noise from another's."""
+
+    def __init__(self, integrator: Integrator, system: JointSystem, x: Float[Tensor, "vertices 3"]) -> None:
+        """Start near x [m]."""
+        self._integrator, self._system = integrator, system
+        drawn = torch.randn(x.shape, dtype=x.dtype, device=x.device) / 3.0**0.5
+        self._carry = integrator.start(system, x + NOISE * system.spacing.unsqueeze(1) * drawn * system.free)
+        self._before = torch.ones(system.garments, dtype=x.dtype, device=x.device)
+
+    def unroll(self, steps: int, *, other: Float[Tensor, "vertices 3"]) -> None:
+        """Make so many steps; the other descent is at ``other`` [m] before it makes as many."""
+        self._carry = detached(self._carry)
+        self._before = self._apart(other).detach()
+        self._carry = unrolled(self._integrator, self._system, self._carry, steps)
+
+    def growth(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " garments"]:
+        """How many times as far as before those steps the two are apart in each garment, the other being at x [m]."""
+        return self._apart(x) / self._before
+
+    def _apart(self, x: Tensor) -> Float[Tensor, " garments"]:
+        """Root mean square distance to x in each garment, in local edge lengths."""
+        system = self._system
+        square = (self._carry.x - x).square().sum(dim=1) / system.spacing.square()  # V
+        total, count = (
+            square.new_zeros(system.garments).index_add_(0, system.owner, values)
+            for values in (square, torch.ones_like(square))
+        )
+        return (total / count + 1e-12).sqrt()
 
 
 class Bundle:
@@ -29,13 +173,7 @@ class Bundle:
     """
 
     def __init__(self, patches: Sequence[Patch], *, device: str, through_forces: bool) -> None:
-        """Build the group.
-
-        Args:
-            patches: The patches; all have the same number of levels and the same gravity.
-            device: "cpu" or a CUDA device.
-            through_forces: As in `JointSystem`.
-        """
+        """Build the group of patches that have the same number of levels and the same gravity."""
         self.patches = tuple(patches)
         garments, count = [patch.garment for patch in patches], patches[0].garment.level
         settings = SolveSettings(METHODS["quasi-newton"])
@@ -54,27 +192,27 @@ class Bundle:
             for name in ("raw", "solved")
         )
         self.least = torch.tensor([p.least for p in patches], dtype=torch.float64, device=device).T.contiguous()
-        self._kept = [x.clone() for x in self._raw]
+        self._ends = [x.clone() for x in self._raw]
         self._known = torch.zeros((self.levels, len(patches)), dtype=torch.bool, device=device)
 
-    def begin(self, index: int, dice: Callable[[], Float[Tensor, " patches"]], *, shares: Any) -> Tensor:
+    def begin(self, index: int, dice: Callable[[], Float[Tensor, " patches"]], *, config: Any) -> Tensor:
         """A start of each patch at a level [m]: the upsampled cage, a solved level below, or an earlier end.
 
         Args:
             index: The level.
             dice: Gives a number between 0 and 1 for each patch.
-            shares: A `TrainConfig`, for its ``raw``, ``middle`` and ``own``.
+            config: A `TrainConfig`, for its ``raw``, ``middle`` and ``own``.
         """
         owner = self.systems[index].owner
         first, second = dice(), dice()
         x = self._raw[index]
         below = self._from_below[index]
         if below is not None:
-            mine = (self._known[index - 1] & (second < shares.own))[self.systems[index - 1].owner]
-            lower = torch.where(mine.unsqueeze(1), self._kept[index - 1], self._solved[index - 1])
-            x = torch.where((first >= shares.raw)[owner].unsqueeze(1), below.apply(lower), x)
-        again = (first > 1.0 - shares.middle) & self._known[index]
-        return torch.where(again[owner].unsqueeze(1), self._kept[index], x)
+            mine = (self._known[index - 1] & (second < config.own))[self.systems[index - 1].owner]
+            lower = torch.where(mine.unsqueeze(1), self._ends[index - 1], self._solved[index - 1])
+            x = torch.where((first >= config.raw)[owner].unsqueeze(1), below.apply(lower), x)
+        again = (first > 1.0 - config.middle) & self._known[index]
+        return torch.where(again[owner].unsqueeze(1), self._ends[index], x)
 
     def learn(self, index: int, energies: Float[Tensor, "steps patches"]) -> None:
         """Note energies that lie below the least known ones."""
@@ -82,18 +220,18 @@ class Bundle:
         self.least[index] = torch.minimum(self.least[index], reached)
 
     def keep(self, index: int, x: Float[Tensor, "vertices 3"], better: Bool[Tensor, " patches"]) -> None:
-        """Keep where patches that went downhill came to, as a start for later."""
+        """Store the ends of patches that went downhill, as starts for later."""
         owner = self.systems[index].owner
-        self._kept[index] = torch.where(better[owner].unsqueeze(1), x, self._kept[index])
+        self._ends[index] = torch.where(better[owner].unsqueeze(1), x, self._ends[index])
         self._known[index] |= better
 
     def state(self) -> dict[str, Any]:
-        """What training changed, for a checkpoint."""
-        return {"kept": self._kept, "known": self._known, "least": self.least}
+        """Values that training changed, for a checkpoint."""
+        return {"kept": self._ends, "known": self._known, "least": self.least}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take back what `state` gave."""
-        self._kept, self._known, self.least = state["kept"], state["known"], state["least"]
+        self._ends, self._known, self.least = state["kept"], state["known"], state["least"]
 
 
 def deal(patches: Sequence[Patch], size: int) -> list[list[Patch]]:

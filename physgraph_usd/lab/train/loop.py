@@ -25,44 +25,43 @@ from ...solver.integrate.network import Physgraph, PhysgraphConfig
 from ...solver.integrate.paper_network import PaperConfig, PaperNetwork
 from ...solver.integrate.quasi_newton import QuasiNewton
 from ...solver.integrate.weights import make_network
-from .bundle import Bundle, deal
+from .bundle import Bundle, Twin, deal, detached, unrolled
 from .patches import Patch, PatchConfig, make_patches
-from .unroll import Twin, detached, unrolled
 
 HARMLESS = 0.02
-"""Part of the energy at the start below which the logarithm of the gap stops to reward."""
+"""Fraction of the energy at the start below which the logarithm of the gap stops to reward."""
 TWINS = 1 / 3
-"""Part of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
+"""Fraction of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
 SCHEDULES = ((5, 5, 5), (10, 10, 5))
 """Steps a level at which held-out patches are measured."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that a training run depends on.
+    """A training run.
 
     Attributes:
         kind: "physgraph" or "physgraph-paper".
         network: Size of the network.
-        patches: What it is trained on.
+        patches: The patches that it is trained on.
         seed: Of patches, weights and order.
         minutes: How long to train, patches not counted.
         iterations: Most iterations, or None.
         batch: Most patches an iteration; they are dealt into batches once, and a batch is stepped as one.
         unroll: Steps that gradients flow through.
         segments: Most unrolls one after another on a patch; later ones start where the last one ended.
-        through_forces: Gradients flow through forces too, by differences; else through displacements only (A19).
-        loss: "ratio" or "log" of the gap, averaged over the steps (A18).
+        through_forces: Gradients flow through forces too, by differences; else through displacements only.
+        loss: "ratio" or "log" of the gap, averaged over the steps.
         late: Weight of step k in that average, as the power of k: 0 counts all alike, more counts where an unroll ends.
         steady: Weight of how much an unroll magnifies the difference of two descents whose starts differ by noise, as a
             logarithm. Without, rounding decides where cloth folds.
-        raw: Part of the starts that are the upsampled cage.
-        middle: Part of the starts where an earlier unroll ended; the others come from a solved level below.
-        own: Part of those that the network itself has solved; quasi-Newton the others.
-        turn: Turn each start at random (A8); only where neither gravity nor guide has a direction.
+        raw: Fraction of the starts that are the upsampled cage.
+        middle: Fraction of the starts where an earlier unroll ended; the others come from a solved level below.
+        own: Fraction of those that the network itself has solved; quasi-Newton the others.
+        turn: Turn each start at random; only where neither gravity nor guide has a direction.
         rate: Adam's first rate; it falls to a hundredth along a cosine.
         clip: Largest norm of the gradient.
-        average: Decay of the weights' running mean, which is what is kept.
+        average: Decay of the weights' running mean, which is the result.
         held_out: Patches to measure on, of another seed.
     """
 
@@ -97,17 +96,11 @@ class Trainer:
         network: The network.
         iteration: Iterations made.
         seconds: Time they took.
-        curve: What was measured on the way.
+        curve: Measurements on the way.
     """
 
     def __init__(self, config: TrainConfig, *, device: str = "cpu", like: Trainer | None = None) -> None:
-        """Make patches and an untrained network.
-
-        Args:
-            config: The run.
-            device: "cpu" or a CUDA device.
-            like: A finished run on the same patches, which are taken over, or None.
-        """
+        """Make patches and an untrained network; ``like`` is a finished run whose patches are taken over if alike."""
         self.config, self.device = config, device
         torch.manual_seed(config.seed)
         self.network = make_network(config.network).to(device)
@@ -153,7 +146,7 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Part of the run that is done."""
+        """Fraction of the run that is done."""
         config = self.config
         parts = [self.seconds / (60.0 * config.minutes)]
         if config.iterations is not None:
@@ -183,7 +176,7 @@ class Trainer:
         index = int(self._rng.integers(bundle.levels))
         system = bundle.systems[index]
         system.energies.clear()
-        x = bundle.begin(index, lambda: self._dice(len(bundle.patches)), shares=config)
+        x = bundle.begin(index, lambda: self._dice(len(bundle.patches)), config=config)
         integrator = integrator_of(self.network)
         segments = int(self._rng.integers(1, config.segments + 1))
         x = self._turned(x) if config.turn else x
@@ -193,7 +186,7 @@ class Trainer:
         for _ in range(segments):
             before = system.energies[-1].detach()
             if twin is not None:
-                twin.unroll(steps, beside=carry.x)
+                twin.unroll(steps, other=carry.x)
             system.energies.clear()
             carry = unrolled(integrator, system, detached(carry), steps)
             reached = torch.stack(system.energies)  # K P
@@ -279,8 +272,8 @@ class Trainer:
         self._rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch"].cpu())
         self.iteration, self.seconds, self.curve = state["iteration"], state["seconds"], state["curve"]
-        for bundle, kept in zip(self._bundles, state["bundles"], strict=True):
-            bundle.restore(kept)
+        for bundle, values in zip(self._bundles, state["bundles"], strict=True):
+            bundle.restore(values)
 
 
 def _made(config: PatchConfig, seed: int) -> list[Patch]:
@@ -295,12 +288,12 @@ def loss_of(
     kind: str,
     late: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Mean over patches, weighted over steps, of the gap or of its logarithm, relative to the start.
+    """Mean over patches, weighted over steps, of the gap or of its logarithm, relative to the start; energies [J].
 
     Args:
-        energies: Energies of the steps [J].
-        before: Energies at the start [J].
-        least: Least energies known [J].
+        energies: After each step.
+        before: At the start.
+        least: The least known.
         kind: "ratio" or "log".
         late: Power of k that weighs step k.
     """
@@ -308,11 +301,11 @@ def loss_of(
     gap = (energies - least) / scale
     # Beyond the start's own gap only the logarithm counts: one patch that blows up must not outweigh the rest.
     if kind == "ratio":
-        told = torch.where(gap < 1.0, gap, 1.0 + gap.clamp_min(1.0).log())
+        loss = torch.where(gap < 1.0, gap, 1.0 + gap.clamp_min(1.0).log())
     else:
-        told = (gap.clamp_min(0.0) + HARMLESS).log()
+        loss = (gap.clamp_min(0.0) + HARMLESS).log()
     weight = torch.arange(1, len(gap) + 1, dtype=gap.dtype, device=gap.device) ** late  # K
-    return (weight / weight.sum()) @ told.mean(dim=1)
+    return (weight / weight.sum()) @ loss.mean(dim=1)
 
 
 def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> float:

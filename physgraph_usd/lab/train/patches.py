@@ -1,8 +1,9 @@
 """Patches of cloth to train on, made from numbers alone: shapes, meshes, fabrics, borders and poses at random.
 
-A patch is a sheet, a tube or a dome of 6 to 12 cage edges (A21), irregular or in quads whose diagonals alternate. It is
-posed by a smooth random deformation, and some patches are draped first: our own solver lets the cage hang from what is
-fixed. No asset is read.
+A patch is a sheet, a tube or a dome of 6 to 12 cage edges, irregular or in quads whose diagonals alternate. It is posed
+by a smooth random deformation, and some patches are draped first: our own solver lets the cage hang from what is fixed.
+Some rest on a wavy body close to the cloth, seen as a plane at each vertex: planes that stay, about parallel to the
+cloth, some of them pushing, as the solver's rounds show them to an integrator. No asset is read.
 """
 
 from __future__ import annotations
@@ -16,43 +17,53 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ...shot.refine import prepare_device
+from ...solver.contact.settings import ContactSettings
 from ...solver.fabric import Fabric
+from ...solver.forces.base import ForceModule
+from ...solver.forces.contact import Contact, Planes
 from ...solver.frame.group import Group
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS
 from ...solver.integrate.base import System
+from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
 from ...solver.integrate.saddle import leave_saddle
 from ...solver.integrate.solve import Budget, solve_level
-from ...solver.level import refine_garments
+from ...solver.integrate.vertex_frame import VertexFrame
+from ...solver.level import Level, refine_garments
 from ...solver.mesh.topology import PolygonMesh, edges_of
 from ...solver.scene import Garment, GarmentFrame
-from .bodies import Body, with_bodies
+from ..samples.shapes import quad_grid
 
 SHAPES = ("sheet", "tube", "dome")
 BORDERS = ("fixed", "one side", "free")
+HEIGHT = (-2.0, -0.9)
+"""Powers of ten between which the heights of a body's waves lie, in cage edges: it comes through its cloth by them."""
+WAVES = (0.5, 3.0)
+"""A body's waves along a patch."""
 
 
 @dataclass(frozen=True)
 class PatchConfig:
-    """What patches are made.
+    """How patches are made.
 
     Attributes:
         count: Number of patches.
         levels: Least and most subdivisions.
         edges: Least and most cage edges along a side.
-        decades: How far stiffnesses range in all, in powers of ten; two thirds of them lie in the middle half.
+        decades: Range of the stiffnesses in powers of ten; two thirds of them lie in the middle half.
         elastic: Stretch and bending only, the border fixed, as in the paper; else gravity and guide too.
         most_vertices: Finest vertices beyond which a patch has one level less.
         reference_steps: Quasi-Newton steps a level behind the least energy known.
-        touched: Part of the patches that rest on a body.
-        skinned: Part of the poses that are bent as linear blend skinning bends, sharply and losing length.
-        pulled: Part of the poses that are stretched along one direction.
+        touched: Fraction of the patches that rest on a body.
+        skinned: Fraction of the poses that are bent as linear blend skinning bends, sharply and losing length.
+        pulled: Fraction of the poses that are stretched along one direction.
     """
 
     count: int = 64
@@ -67,6 +78,61 @@ class PatchConfig:
     pulled: float = 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A body beside one patch.
+
+    Attributes:
+        side: 1 where it lies behind the cloth's normals, -1 before them.
+        wave: Wave vector [1/m], shape (3,).
+        phase: [rad].
+        height: How far it comes through the upsampled cage at most [m]; at least it stays as far away.
+        stiffness: k_c [N/m^3].
+    """
+
+    side: float
+    wave: np.ndarray
+    phase: float
+    height: float
+    stiffness: float
+
+    @staticmethod
+    def random(rng: np.random.Generator, *, size: float, edge: float, stretch: float) -> Body:
+        """A body for a patch of so large a size [m], with cage edges [m] and a stretch stiffness [N/m]."""
+        direction = rng.normal(size=3)
+        wave = 2.0 * np.pi * rng.uniform(*WAVES) / size * direction / np.linalg.norm(direction)
+        stiffness = ContactSettings().stiffness * stretch / edge**2
+        height = edge * 10.0 ** rng.uniform(*HEIGHT)
+        return Body(float(rng.choice([-1.0, 1.0])), wave, float(rng.uniform(0.0, 2.0 * np.pi)), height, stiffness)
+
+    def contact(self, level: Level, base: Float[Tensor, "vertices 3"], *, span: slice) -> Contact:
+        """The force on a patch at a level, from the upsampled cages [m] and the span of the patch's vertices."""
+        normal = self.side * VertexFrame(level, base).normal[span]
+        cage = base[span]
+        lift = self.height * torch.sin(cage @ torch.as_tensor(self.wave).to(cage) + self.phase)
+        vertex = torch.arange(span.start, span.stop, dtype=torch.int32, device=base.device)
+        planes = Planes(vertex, normal.contiguous(), (normal * cage).sum(dim=1) + lift)
+        return Contact(level, [planes], self.stiffness)
+
+
+def with_bodies(
+    systems: Sequence[System], levels: Sequence[Level], coarse: Float[Tensor, "coarse 3"], bodies: Sequence[Body | None]
+) -> list[System]:
+    """Systems without contact, one a level, made to feel the body of each patch, in their forces and their metrics."""
+    if not any(bodies):
+        return list(systems)
+    out = []
+    for system, level in zip(systems, levels, strict=True):
+        base = level.base.apply(coarse)
+        terms = [body.contact(level, base, span=span) for body, span in zip(bodies, level.spans, strict=True) if body]
+        assert isinstance(system.field, ForceModule)
+        assert isinstance(system.metric, Metric)
+        stiff = 3.0 * torch.stack([term.diagonal(base) for term in terms]).sum(dim=0)
+        field = ForceModule((*system.field.forces, *terms))
+        out.append(System(field, system.metric.plus(stiff), free=level.free, spacing=level.spacing, level=level))
+    return out
+
+
 @dataclass(eq=False)
 class Patch:
     """One patch in one pose, on the CPU.
@@ -75,8 +141,8 @@ class Patch:
         garment: Its cage.
         frame: Its pose, about the origin, and fabric.
         gravity: [m/s^2], shape (3,).
-        words: What it is.
-        body: What it rests on, or None.
+        words: Its shape, mesh, border and levels.
+        body: The body that it rests on, or None.
         raw: Upsampled cage at each level [m], float32, off the saddle where it is flat.
         start: Its energy without leaving the saddle [J].
         least: Least energy known at each level [J].
@@ -109,7 +175,7 @@ class Patch:
         return torch.as_tensor(self.raw[index])
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what is made on demand: that holds kernels."""
+        """Every field but those made on demand, which hold kernels."""
         return {name: value for name, value in self.__dict__.items() if name not in ("group", "systems")}
 
 
@@ -117,8 +183,8 @@ def make_patches(config: PatchConfig, *, seed: int, workers: int = 1) -> list[Pa
     """Make patches; those whose pose is all but at rest are made again.
 
     Args:
-        config: What patches.
-        seed: The same seed makes the same patches, however many workers there are.
+        config: How they are made.
+        seed: One seed makes the same patches, however many workers there are.
         workers: Processes that share the work.
     """
     jobs = [(config, seed, number) for number in range(config.count)]
@@ -153,7 +219,7 @@ def measure(patch: Patch, steps: int, *, presolve: int) -> None:
 
 
 def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
-    """The patch of a number, whoever makes it."""
+    """The patch of a number, the same in every process."""
     rng = np.random.default_rng([seed, number])
     while True:
         patch = _patch(config, rng)
@@ -165,10 +231,8 @@ def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
 
 
 def _group(garment: Garment, gravity: np.ndarray, level: int) -> Group:
-    chains = refine_garments([garment], [level])
-    return Group.of(
-        [garment], chains, gravity, SolveSettings(METHODS["quasi-newton"]), dtype=torch.float32, device="cpu"
-    )
+    chains, settings = refine_garments([garment], [level]), SolveSettings(METHODS["quasi-newton"])
+    return Group.of([garment], chains, gravity, settings, dtype=torch.float32, device="cpu")
 
 
 def _patch(config: PatchConfig, rng: np.random.Generator) -> Patch:
@@ -210,10 +274,7 @@ def _mesh(config: PatchConfig, rng: np.random.Generator) -> tuple[PolygonMesh, n
     a, b, c = (points[triangles[:, i]] for i in range(3))
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     longest = np.max([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    triangles = triangles[(np.abs(area) > 0.15) & (longest < 2.2)]
-    triangles[area[(np.abs(area) > 0.15) & (longest < 2.2)] < 0] = triangles[
-        area[(np.abs(area) > 0.15) & (longest < 2.2)] < 0
-    ][:, ::-1]
+    triangles = np.where((area < 0)[:, None], triangles[:, ::-1], triangles)[(np.abs(area) > 0.15) & (longest < 2.2)]
     used, corners = np.unique(triangles, return_inverse=True)
     return PolygonMesh(np.full(len(triangles), 3), corners.reshape(-1), len(used)), points[used], False
 
@@ -224,9 +285,7 @@ def _quads(columns: int, rows: int, rng: np.random.Generator, *, closed: bool) -
     width = columns if closed else columns + 1
     v, u = np.meshgrid(np.arange(rows + 1.0), np.arange(float(width)), indexing="ij")
     cell_v, cell_u = np.divmod(np.arange(rows * columns), columns)
-    right = (cell_u + 1) % width
-    low, high = cell_v * width, (cell_v + 1) * width
-    quads = np.stack([low + cell_u, low + right, high + right, high + cell_u], axis=1)
+    quads = quad_grid(rows + 1, width, closed=closed).astype(np.int64)
     points = np.stack([u.ravel(), v.ravel()], axis=1)
     if rng.random() < 0.5:
         return PolygonMesh(np.full(len(quads), 4), quads.reshape(-1), len(points)), points

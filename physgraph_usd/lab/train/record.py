@@ -106,7 +106,7 @@ def read_config(file: Path) -> TrainConfig:
 
 
 def card_of(trainer: Trainer, digest: str, *, config_file: Path, out: Path) -> dict[str, Any]:
-    """What was trained, on what, for how long, and how to do it again."""
+    """The card of weights: network, patches, time, and the command that trains them again."""
     config = trainer.config
     cuda = trainer.device.startswith("cuda")
     command = ["physgraph-usd", "train", "--config", str(config_file), "--device", trainer.device, "-o", str(out)]
