@@ -77,7 +77,7 @@ def shot_with_ball(path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Chart]:
-    """A shot, its chart's folder and the chart, which goes on until all terms are measured, however busy the machine."""
+    """A shot, its chart's folder and the chart, continued until all terms are measured, as on a busy machine."""
     folder = tmp_path_factory.mktemp("chart")
     shot = shot_with_ball(folder / "sheet.usda")
     chart = chart_shot(shot, folder / "out", OPTIONS)
