@@ -129,7 +129,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Vt
 from physgraph_usd.interrupts import signals_raise
-from physgraph_usd.usd.stream import LayerStream
+from physgraph_usd.usd.write.stream import LayerStream
 points = Sdf.Path("/World/coat.points")
 with signals_raise(), LayerStream(Path(sys.argv[1]), overwrite=True) as stream:
     stream.attribute(points, Sdf.ValueTypeNames.Point3fArray)
@@ -194,7 +194,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Vt
 from physgraph_usd.errors import LayerError
-from physgraph_usd.usd.stream import LayerStream
+from physgraph_usd.usd.write.stream import LayerStream
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
 points = Sdf.Path("/World/coat.points")
 try:

@@ -25,8 +25,8 @@ from ..solver.fabric import PRESETS
 from ..solver.mesh.subdivide import Refinement
 from ..solver.resolution import choose_levels, sample_frames
 from ..solver.scene import Frame, State
-from ..usd.schema import AUTO_LEVEL, GARMENT
-from ..usd.write.tag import fabric_values, tag
+from ..usd.schema import AUTO_LEVEL, GARMENT, fabric_values
+from ..usd.write.tag import tag
 from .solver import FrameSolver
 from .values import TUNABLES
 

@@ -1,4 +1,4 @@
-"""The codeless schemas: one table of every attribute, and where their files are.
+"""The codeless schemas: one table of every attribute, and the folder of their files.
 
 Everything reads attributes by the names in this table, so it also works where the schemas are not registered.
 ``schemas/physgraph_usd_schemas/`` is written from it by ``python -m physgraph_usd.usd.schema_files``. pxr is imported
@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ..errors import UsageError
-from ..solver.fabric import PRESETS
+from ..solver.fabric import PRESETS, Fabric
 
 GARMENT_API = "PhysGraphGarmentAPI"
 COLLIDER_API = "PhysGraphColliderAPI"
@@ -46,14 +46,14 @@ class Property:
         schema: API schema that has it.
         name: Full attribute name.
         type: Sdf type name; "rel" is a relationship.
-        fallback: Value that refining takes where nothing gives one; None when that means something else, told in
-            ``doc``. The schema files have none: an ancestor, a material or ``--set`` may give what the prim does not.
+        fallback: Value that refining takes where nothing gives one; None when that means something else, see
+            ``doc``. The schema files have none: an ancestor, a material or ``--set`` may give the value.
         unit: SI unit, "" when it has none.
         minimum: Least value allowed, or None; of a primvar, of each of its values.
         maximum: Greatest value allowed, or None. A sheet of steel is inside those of the fabric; beyond them energies
             leave the range of numbers. The stiffest preset is some hundred times the softest; paint may go a hundred
             times farther.
-        doc: What it is, for the schema's documentation.
+        doc: Its meaning, for the schema's documentation.
         label: Display name.
         group: Display group.
         soft: Ends of the range in which artists work, for sliders; None for what is no number. A value beyond them is
@@ -219,6 +219,18 @@ COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.sch
 """Rows of the collider schema by short name."""
 
 
+def fabric_values(fabric: Fabric) -> dict[str, float]:
+    """Values of a fabric by the schema's short names, without a shear stiffness that it has not."""
+    values = {
+        "stretchStiffness": fabric.stretch,
+        "shearStiffness": fabric.shear,
+        "bendStiffness": fabric.bend,
+        "density": fabric.density,
+        "thickness": fabric.thickness,
+    }
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def find_property(text: str) -> Property:
     """Find a garment property by full name, by name without ``physgraph:`` and ``material:``, or by its last word.
 
@@ -228,15 +240,15 @@ def find_property(text: str) -> Property:
     rows = [row for row in GARMENT.values() if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}]
     if rows:
         return rows[0]
-    # "stiffness" is the last word of the guide's alone, and as well what a fabric has three of.
+    # "stiffness" is the last word of the guide's alone, but a fabric has three of them.
     meant = [row for row in (*GARMENT.values(), *COLLIDER.values()) if row.short.lower().endswith(text.lower())]
     if len(meant) == 1 and meant[0].short in GARMENT and meant[0].name.rsplit(":", 1)[-1] == text:
         return meant[0]
     if len(meant) > 1:
         raise UsageError(f"attribute {text!r} may mean {', '.join(row.short for row in meant)}; write one of them out")
     near = nearest_property(text, GARMENT.values())
-    message = f"did you mean {near.short}? " if near else ""
-    raise UsageError(f"unknown attribute {text!r}; {message}known attributes: {', '.join(sorted(GARMENT))}")
+    hint = f"did you mean {near.short}? " if near else ""
+    raise UsageError(f"unknown attribute {text!r}; {hint}known attributes: {', '.join(sorted(GARMENT))}")
 
 
 def nearest_property(text: str, rows: Iterable[Property]) -> Property | None:

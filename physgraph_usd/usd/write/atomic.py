@@ -26,24 +26,12 @@ HOST = re.sub(r"[^\w-]", "_", socket.gethostname()) or "host"
 
 
 def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
-    """Name a temporary file beside its target.
-
-    Args:
-        target: Final path.
-        suffix: Format of the temporary file.
-
-    Returns:
-        ``<target>.<host>.<pid>.tmp<suffix>``.
-    """
+    """A temporary file beside its target: ``<target>.<host>.<pid>.tmp<suffix>``."""
     return target.with_name(f"{target.name}.{HOST}.{os.getpid()}.tmp{suffix}")
 
 
 def prepare_target(target: Path, *, overwrite: bool) -> None:
-    """Check that a target may be written and remove what dead processes left beside it.
-
-    Args:
-        target: Final path.
-        overwrite: Whether an existing file may be replaced.
+    """Check that a target may be written and remove temporary files that dead processes left beside it.
 
     Raises:
         UsageError: The target exists and may not be replaced, or is a folder or a link.
@@ -62,14 +50,7 @@ def prepare_target(target: Path, *, overwrite: bool) -> None:
 
 
 def remove_stale(target: Path) -> list[Path]:
-    """Remove this host's temporary files of this target whose process is gone, and this process's own.
-
-    Args:
-        target: Final path.
-
-    Returns:
-        The files removed.
-    """
+    """Remove this host's temporary files of a target whose process is gone, and this process's; returns them."""
     pattern = re.compile(re.escape(f"{target.name}.{HOST}.") + r"(\d+)\.tmp(\.\w+)?")
     removed = []
     for path in sorted(target.parent.iterdir()):
@@ -96,37 +77,18 @@ def _is_other_process(pid: int) -> bool:
 
 
 def check_no_link(target: Path) -> None:
-    """Refuse a link, for what it leads to is nothing that was named; one to a device, such as a terminal, is none.
-
-    Raises:
-        UsageError: The target is a link to a file or a folder, or to nothing.
-    """
+    """Refuse (UsageError) a link to a file, a folder or nothing, which nobody named; one to a device may be used."""
     if target.is_symlink() and (target.is_file() or target.is_dir() or not target.exists()):
         raise UsageError(f"{target} is a link to {os.readlink(target)}; name that, or remove the link")
 
 
 def make_file(path: Path) -> BinaryIO:
-    """Open a file for writing, emptied where it is there.
-
-    Args:
-        path: The file; a link is not followed.
-
-    Raises:
-        OSError: It is a link, or cannot be written.
-    """
+    """Open a file for writing, emptied where it is there; OSError where it is a link, or cannot be written."""
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | NO_LINK, 0o666), "wb")
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text, whole or not at all; its folder is made where it is not there.
-
-    Args:
-        target: Final path.
-        text: What to write, as UTF-8.
-
-    Raises:
-        LayerError: The file cannot be written.
-    """
+    """Write a text as UTF-8, whole or not at all (LayerError); its folder is made where it is missing."""
     temporary = temporary_path(target, suffix="")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -141,10 +103,7 @@ def write_text(target: Path, text: str) -> None:
 
 
 def check_place(target: Path) -> None:
-    """Refuse a place where no file can be made; leaves nothing there.
-
-    Args:
-        target: A file to write later; its folder may be missing.
+    """Refuse a place where no file can be made later; its folder may be missing.
 
     Raises:
         UsageError: The target is a folder or a link, or a file stands where a folder is needed.
@@ -161,11 +120,7 @@ def check_place(target: Path) -> None:
 
 
 def publish(temporary: Path, target: Path) -> None:
-    """Flush a finished temporary file to the disk and move it over the target.
-
-    Args:
-        temporary: Complete file in the target's folder.
-        target: Final path.
+    """Flush a finished temporary file to the disk and move it over the target in the same folder.
 
     Raises:
         LayerError: The disk is full or the target is held open by another program.

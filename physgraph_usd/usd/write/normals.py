@@ -1,4 +1,4 @@
-"""Smooth vertex normals of a polygon mesh, fast enough to be free beside the solve."""
+"""Smooth vertex normals of a polygon mesh, at a small part of the cost of a solve."""
 
 from __future__ import annotations
 
@@ -24,12 +24,7 @@ class VertexNormals:
     """
 
     def __init__(self, mesh: PolygonMesh, *, left_handed: bool = False) -> None:
-        """Prepare the stencils.
-
-        Args:
-            mesh: The topology; faces under three corners are ignored.
-            left_handed: Whether faces run clockwise seen from outside.
-        """
+        """Prepare the stencils; left-handed faces run clockwise seen from outside."""
         self.vertex_count = mesh.vertex_count
         counts = np.asarray(mesh.counts, np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
@@ -41,13 +36,9 @@ class VertexNormals:
         self._sign = np.float32(-1.0 if left_handed else 1.0)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Compute the normals.
+        """Unit normals at positions, both of shape (V, 3), float32.
 
-        Args:
-            points: Positions, shape (V, 3).
-
-        Returns:
-            Unit normals, shape (V, 3), float32; a vertex without area takes its neighbours', or +Y where it has none.
+        A vertex without area takes its neighbours', or +Y where it has none.
         """
         a, b, c, d = (np.take(points, corners, axis=0) for corners in self._diagonals)
         areas = _cross(b - a, d - c)

@@ -1,4 +1,4 @@
-"""What a garment's fine topology replaces on its prim: authored once, as defaults, all in one layer."""
+"""Opinions over a garment's prim that do not move: its fine topology, values used, and what these take the place of."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from ...errors import LayerError
 from ...solver.scene import Garment, GarmentFrame
-from ..schema import GARMENT_API
+from ..schema import GARMENT, GARMENT_API, fabric_values
 from ..stage import GarmentSource, Notice
 from .primvars import FineMap
 from .stream import LayerStream
@@ -29,13 +29,9 @@ REST_POINTS = "physics:restShapePoints"
 
 
 def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> None:
-    """Author counts, indices, ``subdivisionScheme`` none, and hide what belonged to the coarse topology.
+    """Author counts, indices, ``subdivisionScheme`` none, and hide everything that belongs to the coarse topology.
 
-    Args:
-        stream: The layer.
-        target: Prim to author on.
-        prim: Coarse mesh as composed.
-        fine: Map to the fine mesh.
+    Here and below ``target`` is the prim to author on and ``prim`` the coarse mesh as composed.
     """
     for name, values in (("faceVertexCounts", fine.fine.counts), ("faceVertexIndices", fine.fine.indices)):
         path = target.AppendProperty(name)
@@ -54,12 +50,7 @@ def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine:
 
 
 def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
-    """Tell what becomes of the velocities and accelerations of a coarse mesh.
-
-    Args:
-        prim: Coarse mesh as composed.
-        written: Whether velocities are written for the fine mesh.
-    """
+    """Notices that velocities and accelerations of a coarse mesh are blocked, or velocities written anew."""
     blocked = "are blocked: they belong to the coarse points"
     message = {
         "velocities": "are written anew, from the refined points" if written else blocked,
@@ -74,17 +65,7 @@ def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
 
 
 def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> list[Notice]:
-    """Refine the rest shape of the deformable-body schema; name other arrays that may no longer fit.
-
-    Args:
-        stream: The layer.
-        target: Prim to author on.
-        prim: Coarse mesh as composed.
-        fine: Map to the fine mesh.
-
-    Returns:
-        Arrays as long as the coarse mesh's elements that stay as authored.
-    """
+    """Refine the rest shape of the deformable-body schema; notices of other arrays that may no longer fit."""
     notices = []
     sizes = {fine.count(kind): kind for kind in ("faceVarying", "uniform", "vertex")}
     for attribute in prim.GetAuthoredAttributes():
@@ -110,14 +91,7 @@ def _is_elsewhere(name: str) -> bool:
 
 
 def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, skinned: bool) -> None:
-    """Take a mesh out of skinning: its points are the skinned ones already.
-
-    Args:
-        stream: The layer.
-        target: Prim to author on.
-        prim: Coarse mesh as composed.
-        skinned: Whether the points came from skinning, perhaps by influences inherited from an ancestor.
-    """
+    """Take a mesh out of skinning: its points are the skinned ones already, if ``skinned``."""
     for name in ("skel:joints", "skel:blendShapes"):
         if prim.GetAttribute(name).HasAuthoredValue():
             stream.block(target.AppendProperty(name), _TYPES.TokenArray)
@@ -148,15 +122,7 @@ def edit_schemas(
 
 
 def open_instances(stream: LayerStream, source: GarmentSource) -> list[Notice]:
-    """Make the instances that hold a garment editable.
-
-    Args:
-        stream: The layer.
-        source: Where the garment is.
-
-    Returns:
-        One notice per instance.
-    """
+    """Make the instances that hold a garment editable, with one notice each."""
     notices = []
     for root in source.instance_roots:
         stream.prim(root).SetInfo("instanceable", False)
@@ -165,16 +131,9 @@ def open_instances(stream: LayerStream, source: GarmentSource) -> list[Notice]:
 
 
 def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
-    """Define the refined sibling of a mesh and make the mesh its proxy.
+    """Define the refined sibling of a mesh, ``<name>_refined``, make the mesh its proxy, and return the sibling's path.
 
     The sibling references the mesh, so everything not refined (bindings, transforms, visibility) follows it.
-
-    Args:
-        stream: The layer.
-        prim: Coarse mesh as composed.
-
-    Returns:
-        Path of the sibling, ``<name>_refined``.
 
     Raises:
         LayerError: There is such a prim already.
@@ -213,36 +172,17 @@ def _copy_collection_binding(stream: LayerStream, target: Sdf.Path, prim: Usd.Pr
 
 
 def author_used_values(stream: LayerStream, source: GarmentSource, garment: Garment, values: GarmentFrame) -> None:
-    """Author the fabric, guide and level that were used, except where they are animated.
+    """Author the level, fabric, guide and detail of the first time code, except those whose source is animated.
 
-    Args:
-        stream: The layer.
-        source: Where the garment is; values whose source is animated are left alone.
-        garment: Its constant data.
-        values: Its data at the first time code.
+    An artist can change one and refine again.
     """
     edit_schemas(stream, source.path, added=[GARMENT_API])
     level = source.path.AppendProperty("physgraph:refine:level")
     stream.attribute(level, Sdf.ValueTypeNames.Int, uniform=True)
     stream.set(level, garment.level)
-    for short, value in _used(values).items():
-        if value is None or short in source.animated:
-            continue
-        prefix = "physgraph:" if ":" in short else "physgraph:material:"
-        path = source.path.AppendProperty(prefix + short)
-        stream.attribute(path, Sdf.ValueTypeNames.Float)
-        stream.set(path, float(value))
-
-
-def _used(values: GarmentFrame) -> dict[str, float | None]:
-    """Values by short name, as in `GarmentSource.sources`."""
-    fabric = values.fabric
-    return {
-        "stretchStiffness": fabric.stretch,
-        "shearStiffness": fabric.shear,
-        "bendStiffness": fabric.bend,
-        "density": fabric.density,
-        "thickness": fabric.thickness,
-        "guide:stiffness": values.guide,
-        "refine:detail": values.detail,
-    }
+    used = fabric_values(values.fabric) | {"guide:stiffness": values.guide, "refine:detail": values.detail}
+    for short, value in used.items():
+        if short not in source.animated:
+            path = source.path.AppendProperty(GARMENT[short].name)
+            stream.attribute(path, Sdf.ValueTypeNames.Float)
+            stream.set(path, float(value))

@@ -30,10 +30,9 @@ STALE = ("primvars:normals", "primvars:skel:jointIndices", "primvars:skel:jointW
 def carry_primvars(
     stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap, *, span: tuple[float, float] | None
 ) -> list[Notice]:
-    """Author every primvar of a mesh that depends on topology, refined.
+    """Author every primvar of a coarse mesh that depends on topology, refined, with its time samples.
 
-    Those with time samples keep them. One that does not fit its own mesh is hidden, since its values would fit the
-    fine mesh even less.
+    One that does not fit its own mesh is hidden, since its values would fit the fine mesh even less.
 
     Args:
         stream: The layer.
@@ -43,7 +42,7 @@ def carry_primvars(
         span: First and last time code that matter, or None for all.
 
     Returns:
-        What was hidden, and why.
+        Notices of primvars that were hidden, and why.
     """
     notices = []
     for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithAuthoredValues():
@@ -126,15 +125,7 @@ def carry_subsets(
 ) -> list[Notice]:
     """Author the indices of every subset of a mesh, refined; a partition stays a partition.
 
-    Args:
-        stream: The layer.
-        target: Mesh prim to author below.
-        prim: Coarse mesh as composed.
-        fine: Map to the fine mesh.
-        span: First and last time code that matter, or None for all.
-
-    Returns:
-        Subsets that could not be refined, and why; they are emptied.
+    Arguments are as for `carry_primvars`. Returns notices of subsets that could not be refined and are emptied.
     """
     notices = []
     imageable = UsdGeom.Imageable(prim)
@@ -158,7 +149,7 @@ def carry_subsets(
 
 
 class FineMap:
-    """From a garment's authored arrays to its fine mesh."""
+    """Map from a garment's authored arrays to its fine mesh, made once for each garment."""
 
     def __init__(
         self, cage: PolygonMesh, refinements: Sequence[Refinement], counts: np.ndarray, kept: np.ndarray
@@ -236,7 +227,7 @@ class FineMap:
             smooth: Whether values between two are meaningful; otherwise the nearest parent's is taken.
 
         Returns:
-            Fine values, or None where the authored ones stay as they are, and fine indices where it is indexed then.
+            Fine values, or None where the authored ones stay; and fine indices, or None where there are none.
 
         Raises:
             ValueError: The number of elements is not the mesh's, or an index is out of range.
@@ -272,8 +263,8 @@ class FineMap:
 
     def _corners(self, values: np.ndarray, indices: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         """Refine values on corners along their own topology, so that seams stay seams."""
-        own = self.kept_corners if indices is None else np.asarray(indices)[self.kept_corners]
-        fine, refined = corner_values(self._refinements, self.cage.counts, own.astype(np.int32), values)
+        coarse = self.kept_corners if indices is None else np.asarray(indices)[self.kept_corners]
+        fine, refined = corner_values(self._refinements, self.cage.counts, coarse.astype(np.int32), values)
         return (refined[fine], None) if indices is None else (refined, fine.astype(np.int32))
 
     def subset(self, element: str, indices: np.ndarray, *, exclusive: bool = False) -> np.ndarray:
@@ -311,40 +302,25 @@ class FineMap:
 
 
 def to_numpy(value: Any) -> tuple[np.ndarray, bool]:
-    """Bring a ``Vt`` array to numpy.
+    """A ``Vt`` array as numpy, shape (N, ...), and whether values between two are meaningful.
 
-    Returns:
-        The array, shape (N, ...), and whether values between two are meaningful. Quaternions are not interpolated:
-        q and -q are the same rotation.
+    Quaternions are not interpolated: q and -q are the same rotation. Strings, tokens and asset paths become objects.
 
     Raises:
         ValueError: The value is no array.
     """
     if not hasattr(type(value), "__len__") or not type(value).__name__.endswith("Array"):
         raise ValueError(f"is a {type(value).__name__}, no array")
-    if not hasattr(type(value), "FromNumpy"):
-        return _objects(value), False
-    array = np.asarray(value)
-    return array, array.dtype.kind == "f" and "Quat" not in type(value).__name__
-
-
-def _objects(value: Any) -> np.ndarray:
-    """Strings, tokens and asset paths as an array of objects, shape (N,)."""
+    if hasattr(type(value), "FromNumpy"):
+        array = np.asarray(value)
+        return array, array.dtype.kind == "f" and "Quat" not in type(value).__name__
     array = np.empty(len(value), object)
     array[:] = list(value)
-    return array
+    return array, False
 
 
 def to_vt(array: np.ndarray, like: Any) -> Any:
-    """Bring an array back to the ``Vt`` type that it came from.
-
-    Args:
-        array: Shape (N, ...).
-        like: A value of the wanted type.
-
-    Returns:
-        The ``Vt`` array.
-    """
+    """An array, shape (N, ...), as the ``Vt`` type of another value."""
     kind = type(like)
     if array.dtype == object:
         return kind(array.tolist())

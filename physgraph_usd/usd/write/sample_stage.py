@@ -8,20 +8,13 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from ..provenance import export_layer
+from ..schema import fabric_values
 from .atomic import prepare_target
 from .plain import Look, PlainMesh, PlainStage, Skeleton
 
 
 def write_stage(record: PlainStage, path: Path, *, overwrite: bool = False) -> Path:
-    """Write a shot to a new layer.
-
-    Args:
-        record: The shot.
-        path: File to write; its suffix chooses the format.
-        overwrite: Whether an existing file may be replaced.
-
-    Returns:
-        The path written.
+    """Write a shot to a new layer, in the format of the path's suffix, and return the path.
 
     Raises:
         UsageError: The file exists and may not be replaced.
@@ -147,16 +140,7 @@ def _write_garment(prim: Usd.Prim, mesh: PlainMesh) -> None:
         if value is not None:
             whole = Sdf.ValueTypeNames.Int
             prim.CreateAttribute(f"physgraph:{name}", whole, False, Sdf.VariabilityUniform).Set(value)
-    fabric = mesh.fabric
-    if fabric is None:
-        return
-    values = {
-        "stretchStiffness": fabric.stretch,
-        "bendStiffness": fabric.bend,
-        "density": fabric.density,
-        "thickness": fabric.thickness,
-    }
-    for name, value in values.items():
+    for name, value in ({} if mesh.fabric is None else fabric_values(mesh.fabric)).items():
         prim.CreateAttribute(f"physgraph:material:{name}", Sdf.ValueTypeNames.Float, False).Set(value)
 
 

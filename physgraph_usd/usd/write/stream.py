@@ -1,4 +1,4 @@
-"""A layer written piece by piece: what has been written leaves memory.
+"""A layer written piece by piece, whose written parts leave memory.
 
 Author through ``Sdf``, not through a stage: nothing is composed, so a time sample costs no more than its copy.
 """
@@ -18,7 +18,7 @@ from ..stage import reason_of
 from .atomic import prepare_target, publish, temporary_path
 
 IN_MEMORY = "refined.usda"
-"""What a layer in memory is called."""
+"""Name of a layer in memory."""
 FLUSH_BYTES = 16_000_000
 """Pending array bytes at which the layer is saved; each save rewrites a few kilobytes of tables."""
 
@@ -78,24 +78,9 @@ class LayerStream:
         return self.layer.GetPrimAtPath(path) or Sdf.CreatePrimInLayer(self.layer, path)
 
     def attribute(
-        self,
-        path: Sdf.Path,
-        type_name: Sdf.ValueTypeName,
-        *,
-        uniform: bool = False,
-        interpolation: str = "",
+        self, path: Sdf.Path, type_name: Sdf.ValueTypeName, *, uniform: bool = False, interpolation: str = ""
     ) -> Sdf.AttributeSpec:
-        """The attribute spec at a path, made where missing.
-
-        Args:
-            path: Property path.
-            type_name: Its value type.
-            uniform: Whether it may not vary in time.
-            interpolation: ``interpolation`` metadata to author, if any.
-
-        Returns:
-            The spec.
-        """
+        """The attribute spec at a path, made where missing; ``interpolation`` is authored as metadata, if any."""
         spec = self.layer.GetAttributeAtPath(path)
         if spec is None:
             variability = Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying
@@ -105,16 +90,7 @@ class LayerStream:
         return spec
 
     def set(self, path: Sdf.Path, value: Any, *, time: float | None = None) -> None:
-        """Author one value of an existing attribute spec.
-
-        Args:
-            path: Property path.
-            value: A ``Vt`` array or plain value.
-            time: Time code, or None for the default.
-
-        Raises:
-            LayerError: The disk is full.
-        """
+        """Author one value, a ``Vt`` array or a plain one, of an existing attribute spec; LayerError on a full disk."""
         if time is None:
             self.layer.GetAttributeAtPath(path).default = value
         else:
@@ -128,7 +104,7 @@ class LayerStream:
         self.attribute(path, type_name).default = Sdf.ValueBlock()
 
     def flush(self) -> None:
-        """Save what is pending and let go of its memory.
+        """Save pending values and let go of their memory.
 
         Raises:
             LayerError: The disk is full or gone.
@@ -148,10 +124,7 @@ class LayerStream:
             raise LayerError(f"cannot write {self.target}: saving failed without a reason")
 
     def commit(self) -> Path | None:
-        """Move the layer to its final name.
-
-        Returns:
-            The final path; None for a layer in memory, which stays in ``layer``.
+        """Move the layer to its final path and return it; None for a layer in memory, which stays in ``layer``.
 
         Raises:
             LayerError: The disk is full, or the target is held open by another program.
@@ -187,7 +160,7 @@ class LayerStream:
         self.temporary.unlink(missing_ok=True)
 
     def _failure(self, error: Tf.ErrorException) -> LayerError:
-        """Say in one line what stopped a save."""
+        """An error with the reason why a save failed, in one line."""
         reasons = reason_of(error).split("; ")
         # Some versions report unrelated trouble first, such as a plugin that failed to load.
         reason = next((each for each in reasons if "writ" in each.lower()), reasons[0])

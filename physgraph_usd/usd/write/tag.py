@@ -8,12 +8,12 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import SchemaError, StageError, UsageError
-from ...solver.fabric import PRESETS, Fabric
+from ...solver.fabric import PRESETS
 from ..files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from ..lookup import check_limits
 from ..provenance import asset_path, export_layer
 from ..read.find import find_colliders, find_garments
-from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, SIDES, Property
+from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, SIDES, Property, fabric_values
 from ..stage import open_stage
 from ..view import root_over
 from .atomic import ASSET_PATHS, prepare_target
@@ -75,9 +75,9 @@ def tag(
         _check_editable(prim)
     for prim in cloth:
         spec = _applied(root, prim, GARMENT_API)
-        own = {} if preset is None else fabric_values(PRESETS[preset])
-        own |= {} if layer is None else {"contact:layer": layer}
-        for name, value in (own | dict((values or {}).get(str(prim.GetPath()), {}))).items():
+        authored = {} if preset is None else fabric_values(PRESETS[preset])
+        authored |= {} if layer is None else {"contact:layer": layer}
+        for name, value in (authored | dict((values or {}).get(str(prim.GetPath()), {}))).items():
             _author(spec, GARMENT[name], round(value) if GARMENT[name].type == "int" else value)
             if prim.GetAttribute(GARMENT[name].name).HasAuthoredConnections():  # They would go before the value.
                 spec.attributes[GARMENT[name].name].connectionPathList.ClearEditsAndMakeExplicit()
@@ -88,29 +88,28 @@ def tag(
     return export_layer(root, target)
 
 
-def _check_word(what: str, word: str | None, known: Sequence[str]) -> None:
-    """Refuse a word that is none of those known."""
-    if word is not None and word not in known:
-        raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(known)}")
+def _check_word(what: str, word: str | None, words: Sequence[str]) -> None:
+    """Refuse a word that is none of some words."""
+    if word is not None and word not in words:
+        raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(words)}")
 
 
 def _check_values(values: Mapping[str, Mapping[str, float]], layer: int | None) -> None:
     """Refuse a value that refining would refuse."""
-    given = [(path, name, value) for path, own in values.items() for name, value in own.items()]
+    every = {**values, "/": {} if layer is None else {"contact:layer": layer}}
     try:
-        for path, name, value in given + ([] if layer is None else [("/", "contact:layer", layer)]):
-            check_limits(GARMENT[name], value, f"<{path}>")
+        for path, items in every.items():
+            for name, value in items.items():
+                check_limits(GARMENT[name], value, f"<{path}>")
     except SchemaError as error:
         raise UsageError(str(error)) from error
 
 
 def _check_editable(prim: Usd.Prim) -> None:
-    """Refuse prims where an opinion would be ignored or mean nothing."""
+    """Refuse prims on which an opinion would be ignored or mean nothing."""
     if prim.IsInstanceProxy():
-        raise StageError(
-            f"<{prim.GetPath()}> lies in an instance, where a layer over the shot cannot reach; tag the prim in the "
-            "asset, or name it when refining"
-        )
+        remedy = "tag the prim in the asset, or name it when refining"
+        raise StageError(f"<{prim.GetPath()}> lies in an instance, where a layer over the shot cannot reach; {remedy}")
     if not UsdGeom.Gprim(prim):
         raise StageError(f"<{prim.GetPath()}> is a {prim.GetTypeName() or 'prim without a type'}; it has no surface")
 
@@ -122,18 +121,6 @@ def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
     schemas.prependedItems = [schema]
     spec.SetInfo("apiSchemas", schemas)
     return spec
-
-
-def fabric_values(fabric: Fabric) -> dict[str, float]:
-    """What a fabric gives, by the schema's short names."""
-    values = {
-        "stretchStiffness": fabric.stretch,
-        "shearStiffness": fabric.shear,
-        "bendStiffness": fabric.bend,
-        "density": fabric.density,
-        "thickness": fabric.thickness,
-    }
-    return {name: value for name, value in values.items() if value is not None}
 
 
 def _author(spec: Sdf.PrimSpec, row: Property, value: float | str) -> None:

@@ -1,4 +1,8 @@
-"""The animated part of one garment: points, normals, extent and velocities, one time code after the other."""
+"""The animated opinions of one garment, one time code after the other.
+
+Points, normals, extent and velocities; heat maps, which show how deep vertices are in a body and which cross; and the
+``extentsHint`` of models above it, a box cached by hand, which finer cloth may leave.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ...errors import LayerError
+from ..lookup import with_ancestors
 from ..stage import at_time, timecode
 from .normals import VertexNormals
 from .stream import LayerStream
@@ -52,7 +57,7 @@ class PointTrack:
         Args:
             stream: The layer.
             target: Prim to author on.
-            normals: Computes normals from local points.
+            normals: Normals of local points.
             rest: Local points for the default time, shape (V, 3); None takes the first that come.
             still: Whether the garment's input has no samples: only a default is written until something moves.
             rate: Time codes per second for velocities; None leaves them out.
@@ -67,22 +72,18 @@ class PointTrack:
         self._has_default = False
         self._last: _Sample | None = None
         self._matrix: np.ndarray | None = None
-        self._held: float | None = None
+        self._run_end: float | None = None
         self._queue: list[_Sample] = []
         self.box = np.zeros((2, 3), np.float32)
 
     def check(self, points: np.ndarray, time: float | None) -> None:
-        """Refuse points that are not the fine mesh's.
-
-        Raises:
-            LayerError: The shape is wrong.
-        """
+        """Refuse points that are not of the fine mesh's shape."""
         if points.shape != (self._count, 3):
             place = f"<{self._paths['points'].GetPrimPath()}>" + at_time(time)
             raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {self._count} vertices")
 
     def write(self, time: float | None, world: np.ndarray, to_metres: np.ndarray, *, changed: bool = True) -> None:
-        """Take one time code.
+        """Write one time code.
 
         Args:
             time: Time code, or None for the default of a shot without samples.
@@ -125,7 +126,7 @@ class PointTrack:
         if self._rate is not None and not self._still:
             self._emit(sample)
         else:
-            self._held = sample.time
+            self._run_end = sample.time
 
     def _move(self, sample: _Sample) -> None:
         """Take a sample that differs from the last one, and close the run before it."""
@@ -134,9 +135,9 @@ class PointTrack:
         if self._still:
             self._still = False
             self._emit(last)
-        if self._held is not None:
-            self._emit(_Sample(self._held, last.points))
-            self._held = None
+        if self._run_end is not None:
+            self._emit(_Sample(self._run_end, last.points))
+            self._run_end = None
         self._last = sample
         self._emit(sample)
 
@@ -153,14 +154,10 @@ class PointTrack:
             self._queue.pop(0)
 
     def finish(self, *, hold: bool = False) -> None:
-        """Author what waited for a next sample.
-
-        Args:
-            hold: Whether the end of a run of equal samples is written too, because further samples are to follow it.
-        """
-        if hold and self._held is not None and self._last is not None and not self._still:
-            self._emit(_Sample(self._held, self._last.points))
-            self._held = None
+        """Author the last velocity, and with ``hold`` the end of a run of equal samples that others are to follow."""
+        if hold and self._run_end is not None and self._last is not None and not self._still:
+            self._emit(_Sample(self._run_end, self._last.points))
+            self._run_end = None
         if len(self._queue) == 1:
             self._author_velocity(self._queue[0], self._queue[0], self._queue[0])
         elif self._queue:
@@ -239,11 +236,7 @@ class HeatTrack:
         self._runs: dict[str, tuple[np.ndarray, float | None]] = {}
 
     def check(self, heat: Mapping[str, np.ndarray], time: float | None) -> None:
-        """Refuse values that are not one finite number a vertex.
-
-        Raises:
-            LayerError: Naming the primvar and the time.
-        """
+        """Refuse values that are not one finite number a vertex."""
         for name, values in heat.items():
             place = f"<{self._path(name)}>" + at_time(time)
             if name not in HEAT:
@@ -252,34 +245,29 @@ class HeatTrack:
                 raise LayerError(f"{place}: needs {self._count} finite values, got shape {values.shape}")
 
     def write(self, time: float | None, heat: Mapping[str, np.ndarray]) -> None:
-        """Take one time code.
-
-        Args:
-            time: Time code, or None for the default of a shot without samples.
-            heat: Values by name, each of shape (V,); a map that is left out has no sample here.
-        """
-        for name, given in heat.items():
-            values = np.ascontiguousarray(given, np.float32)
+        """Write the maps of a time code by name, each of shape (V,); one that is left out has no sample here."""
+        for name, array in heat.items():
+            values = np.ascontiguousarray(array, np.float32)
             if name not in self._runs:
                 path = self._path(name)
                 self._stream.attribute(path, Sdf.ValueTypeNames.FloatArray, interpolation=UsdGeom.Tokens.vertex)
                 self._set(name, None if self._still else time, values)
                 self._runs[name] = values, time if self._still else None
                 continue
-            last, held = self._runs[name]
+            last, end = self._runs[name]
             if np.array_equal(values, last):
                 self._runs[name] = last, time
                 continue
-            if held is not None:
-                self._set(name, held, last)
+            if end is not None:
+                self._set(name, end, last)
             self._set(name, time, values)
             self._runs[name] = values, None
 
     def finish(self, *, hold: bool = False) -> None:
         """Author the ends of runs of equal samples where further samples are to follow them (``hold``)."""
-        for name, (last, held) in self._runs.items() if hold else ():
-            if held is not None and not self._still:
-                self._set(name, held, last)
+        for name, (last, end) in self._runs.items() if hold else ():
+            if end is not None and not self._still:
+                self._set(name, end, last)
 
     def _path(self, name: str) -> Sdf.Path:
         return self._target.AppendProperty(PREFIX + name)
@@ -292,32 +280,18 @@ class ModelHints:
     """Grows the authored hints of one garment's ancestors so that they hold the fine cloth."""
 
     def __init__(self, stream: LayerStream, stage: Usd.Stage, path: Sdf.Path, *, purpose: str) -> None:
-        """Find the ancestors with a hint.
-
-        Args:
-            stream: The layer.
-            stage: The shot.
-            path: The coarse garment.
-            purpose: Purpose of the fine mesh, which chooses the box to grow.
-        """
+        """Find the ancestors of a coarse garment with a hint; the fine mesh's purpose chooses the box to grow."""
         self._stream, self._stage = stream, stage
         self._prim = stage.GetPrimAtPath(path)
         self._row = 2 * _PURPOSES.index(purpose if purpose in _PURPOSES else "default")
         self._models = []
-        prim = self._prim
-        while prim and not prim.IsPseudoRoot():
+        for prim in with_ancestors(self._prim):
             attribute = prim.GetAttribute(ATTRIBUTE)
             if attribute and attribute.HasAuthoredValue() and isinstance(attribute.Get(_FIRST), Vt.Vec3fArray):
                 self._models.append(prim)
-            prim = prim.GetParent()
 
     def write(self, time: float | None, box: np.ndarray) -> None:
-        """Grow the hints by one box.
-
-        Args:
-            time: Time code, or None.
-            box: Local extent of the fine mesh, shape (2, 3).
-        """
+        """Grow the hints by the local extent of the fine mesh, shape (2, 3), at a time code."""
         if not self._models:
             return
         code = timecode(time)
@@ -337,8 +311,8 @@ class ModelHints:
         path = model.GetPath().AppendProperty(ATTRIBUTE)
         code = timecode(time)
         spec = self._stream.attribute(path, Sdf.ValueTypeNames.Float3Array)
-        ours = self._stream.layer.QueryTimeSample(path, time) if time is not None else spec.default
-        value = attribute.Get(code) if ours is None else ours
+        grown = self._stream.layer.QueryTimeSample(path, time) if time is not None else spec.default
+        value = attribute.Get(code) if grown is None else grown
         rows = np.array(value if value is not None else [], np.float32).reshape(-1, 3)
         empty = np.tile(np.array([[np.finfo(np.float32).max], [-np.finfo(np.float32).max]], np.float32), (1, 3))
         while len(rows) < self._row + 2:
