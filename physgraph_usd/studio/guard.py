@@ -1,4 +1,4 @@
-"""Who may open the page: nobody without the secret in its address, and no page of another site with it."""
+"""Access to the page: for nobody without the secret in its address, and for no page of another site."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NAMES = (ADDRESS, "localhost")
 
 
 class Guard:
-    """Looks at every request and websocket handshake before the viewer does.
+    """A check of every request and websocket handshake, before the viewer sees it.
 
     Attributes:
         token: The secret, the first part of every path.
@@ -36,18 +36,14 @@ class Guard:
         self.token, self.is_asked = secrets.token_urlsafe(16), False
 
     def refusal(self, request: Request) -> str | None:
-        """Why a request is refused, or None where it is not.
-
-        Args:
-            request: With the path as asked for and all headers.
-        """
+        """Why a request, with its path and all headers, is refused; None where it is not."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) != 1 or _name_of(hosts[0]) not in _NAMES:
             return "another host"
         if any(origin != f"http://{hosts[0]}" for origin in origins):
             return "a page of another site"
-        given = request.path.partition("?")[0].split("/")[1:2]
-        if not given or not secrets.compare_digest(given[0].encode(), self.token.encode()):
+        first = request.path.partition("?")[0].split("/")[1:2]
+        if not first or not secrets.compare_digest(first[0].encode(), self.token.encode()):
             return "the address lacks its secret; open the one that physgraph-usd tune printed"
         return None
 
@@ -86,14 +82,7 @@ def _name_of(host: str) -> str | None:
 
 
 def guarded_server(*, port: int, label: str) -> tuple[viser.ViserServer, str]:
-    """A viewer on this machine that only who has its address can open.
-
-    Args:
-        port: Port; the next free one where it is taken.
-        label: Title of the page.
-
-    Returns:
-        The server and its address, with the secret.
+    """A viewer on this machine, at this port or the next free one, and its address, which alone opens it.
 
     Raises:
         UsageError: The viewer is of a version that cannot be guarded.

@@ -1,4 +1,4 @@
-"""A thread that solves what is asked of a session, so that a page stays alive."""
+"""A thread that makes the changes asked of a session and solves its frame, so that a page stays alive."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ REST_SECONDS = 0.5
 """How long nothing must be asked before the frame is solved as ``refine`` does."""
 
 Change = Callable[[TuneSession], None]
-"""What is asked of a session."""
+"""A change asked of a session."""
 
 
 class Watcher(Protocol):
-    """Who is told; called from the loop's thread."""
+    """Receiver of results; called from the loop's thread."""
 
     def busy(self, what: str) -> None:
         """Work has begun."""
@@ -28,12 +28,12 @@ class Watcher(Protocol):
         ...
 
     def fail(self, error: PhysGraphError) -> None:
-        """What was asked for cannot be done, or the frame cannot be solved."""
+        """A change cannot be made, or the frame cannot be solved."""
         ...
 
 
 class SolveLoop:
-    """Owns a session: changes that come while a frame is solved are made together, and solved once.
+    """The owner of a session: changes that come while a frame is solved are made together, and solved once.
 
     When nothing has been asked for `REST_SECONDS`, the frame is solved as ``refine`` does; a change ends that.
     """
@@ -43,7 +43,7 @@ class SolveLoop:
 
         Args:
             session: The session; from here on it is the thread's.
-            watcher: Who is told.
+            watcher: Receives the results.
             rest_seconds: Time without a change before a frame is settled.
         """
         self._session, self._watcher, self._rest = session, watcher, rest_seconds

@@ -13,7 +13,6 @@ from typing import Any
 from ..errors import PhysGraphError
 from ..solver.fabric import PRESETS
 from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
-from .figures import figures
 from .guard import guarded_server
 from .loop import SolveLoop
 from .picture import PLAIN, SHOWS, Picture
@@ -22,7 +21,7 @@ from .values import PAINTED, TUNABLES, Tunable
 
 AS_AUTHORED, OWN = "as authored", "own values"
 WORKING, MOVING, SETTLED, WRONG = "#b45f06", "#5b6470", "#1a7f37", "#c0392b"
-"""Colours of what the page says that it does."""
+"""Colours of the page's state."""
 FINEST = 0.002
 """Step of a slider, in its length."""
 STYLE = """<style>
@@ -41,12 +40,7 @@ class TunePage:
     """
 
     def __init__(self, session: TuneSession, *, port: int = 8080) -> None:
-        """Serve the page and solve the first frame.
-
-        Args:
-            session: The session.
-            port: Port on this machine; the next free one where it is taken.
-        """
+        """Serve the page and solve the first frame, at this port or the next free one."""
         self._session, self._garment = session, session.garments[0]
         self._server, self.url = guarded_server(port=port, label="physgraph-usd tune")
         self._picture = Picture(self._server, session)
@@ -68,14 +62,11 @@ class TunePage:
         """Draw a solved frame and write its figures and values."""
         self._picture.draw(shown)
         settled = shown.run is not None
-        said = "settled: as refine solves it" if settled else "quick: solved from where the cloth was"
-        self._state.content = _badge(said, SETTLED if settled else MOVING)
+        state = "settled: as refine solves it" if settled else "quick: solved from where the cloth was"
+        self._state.content = _badge(state, SETTLED if settled else MOVING)
         self._command.content = _small(f"<code>{html.escape(shown.command)}</code>")
         index = self._session.garments.index(self._garment)
-        points = shown.points[index]
-        count = 0 if points is None else len(points)
-        told = figures(shown.telemetry[index], seconds=shown.seconds, vertices=count)
-        self._figures.content = _table(told)
+        self._figures.content = _table(figures(shown, index))
         follow, self._follow = self._follow, False
         for name, (text, slider) in self._sliders.items():
             self._write_value(TUNABLES[name], text, slider if follow else None)
@@ -120,7 +111,7 @@ class TunePage:
         colors.on_update(lambda event: self._ask(event, lambda _: setattr(self._picture, "map", colors.value)))
 
     def _build_group(self, group: str) -> None:
-        """A slider for each value of a display group, after what else belongs there."""
+        """A slider for each value of a display group, after the group's other controls."""
         gui = self._server.gui
         if group == FABRIC:
             self._preset = gui.add_dropdown("Preset", (AS_AUTHORED, OWN, *sorted(PRESETS)), initial_value=AS_AUTHORED)
@@ -129,7 +120,7 @@ class TunePage:
             self._build_level()
         elif group == CONTACT:
             contact = gui.add_checkbox("Contact", True, hint="With bodies and of cloth with cloth.")
-            contact.on_update(lambda event: self._ask(event, lambda own: own.set_contact(contact.value)))
+            contact.on_update(lambda event: self._ask(event, lambda session: session.set_contact(contact.value)))
         for tunable in (each for each in TUNABLES.values() if each.group == group):
             text = gui.add_html("")
             hint = f"{GARMENT[tunable.name].name}: {GARMENT[tunable.name].doc}"
@@ -143,7 +134,7 @@ class TunePage:
         hint = f"{row.name}: {row.doc}"
         most = max(row.soft or (0, level_now))
         level = self._server.gui.add_slider(row.label, 0, int(most), 1, min(level_now, int(most)), hint=hint)
-        level.on_update(lambda event: self._ask(event, lambda own: own.set_level(self._garment, int(level.value))))
+        level.on_update(lambda event: self._ask(event, lambda each: each.set_level(self._garment, int(level.value))))
 
     def _choose(self, garment: str) -> None:
         self._garment, self._follow = garment, True
@@ -171,7 +162,7 @@ class TunePage:
     def _write_value(self, tunable: Tunable, text: Any, slider: Any) -> None:
         """Write what a value is, and put its slider there, if given."""
         value = self._session.value(self._garment, tunable.name)
-        text.content = _row(tunable.label, tunable.said(value))
+        text.content = _row(tunable.label, tunable.text(value))
         if slider is not None:
             slider.value = tunable.place(value if value is not None else tunable.ends[0])
 
@@ -186,13 +177,7 @@ class TunePage:
 
 
 def serve(session: TuneSession, *, port: int = 8080, say: Callable[[str], None]) -> None:
-    """Serve a session's page until it is interrupted.
-
-    Args:
-        session: The session.
-        port: Port on this machine; the next free one where it is taken.
-        say: Told where the page is.
-    """
+    """Serve a session's page until it is interrupted; ``say`` is called with its address."""
     page = TunePage(session, port=port)
     say(page.url)
     try:
@@ -204,6 +189,24 @@ def serve(session: TuneSession, *, port: int = 8080, say: Callable[[str], None])
 def nearest(times: Sequence[float], time: float) -> float:
     """The sample that is nearest to a time code."""
     return min(times, key=lambda each: abs(each - time))
+
+
+def figures(shown: Shown, index: int) -> dict[str, str]:
+    """Figures of a solved garment in words, by name, as in a report."""
+    points, entry = shown.points[index], shown.telemetry[index]
+    lines = {"Vertices": f"{0 if points is None else len(points):,}"}
+    if "energy_joules" in entry:
+        lines["Energy"] = f"{1e3 * sum(entry['energy_joules']['output'].values()):.4g} mJ"
+    if "strain" in entry:
+        lines["Strain, 99th percentile"] = f"{100.0 * entry['strain']['p99']:.2g} %"
+    contact = entry.get("contact", {})
+    if "cloth" in contact:
+        lines["Crossings of cloth"] = str(contact["cloth"]["after"]["crossings"])
+    if "bodies" in contact:
+        lines["Vertices inside bodies"] = str(sum(body["after"]["inside"] for body in contact["bodies"].values()))
+    if "levels" in entry:
+        lines["Evaluations"] = str(sum(level["evaluations"] for level in entry["levels"]))
+    return lines | {"Seconds": f"{shown.seconds:.2f}", "Start": str(entry.get("start", ""))}
 
 
 def _badge(text: str, color: str) -> str:
@@ -222,11 +225,11 @@ def _small(content: str) -> str:
     return f"<div style='margin:0.1em 1em;font-size:0.75em;color:#5b6470;overflow-wrap:anywhere'>{content}</div>"
 
 
-def _table(told: dict[str, str]) -> str:
+def _table(lines: dict[str, str]) -> str:
     cell = "padding:0.1em 0.2em"
     rows = (
         f"<tr><td style='{cell}'>{html.escape(name)}</td>"
         f"<td style='{cell};text-align:right'><b>{html.escape(value)}</b></td></tr>"
-        for name, value in told.items()
+        for name, value in lines.items()
     )
     return f"<table style='width:calc(100% - 1.6em);margin:0 0.8em;font-size:0.8em'>{''.join(rows)}</table>"

@@ -33,12 +33,7 @@ class Picture:
     """
 
     def __init__(self, server: viser.ViserServer, session: TuneSession) -> None:
-        """Set up floor, light and camera about the session's first frame.
-
-        Args:
-            server: Of the page.
-            session: What is drawn.
-        """
+        """Set up floor, light and camera about the session's first frame."""
         self.shows, self.map = BOTH, PLAIN
         self._scene, self._session = server.scene, session
         scene, frame = session.shot.scene, session.shot.frame(session.time)
@@ -60,22 +55,22 @@ class Picture:
 
     def draw(self, shown: Shown) -> None:
         """Draw a frame."""
-        beside = self.shows == BOTH
+        both = self.shows == BOTH
         parts = zip(shown.frame.garments, shown.points, strict=True)
         for index, (frame, points) in enumerate(parts):
             cage, chain = self._session.shot.scene.garments[index], self._session.refinements[index]
             split = cage.mesh.triangulate(cage.rest).triangles
-            coarse = (frame.points, split) if beside else None
+            coarse = (frame.points, split) if both else None
             fine = None if points is None else (points, chain[-1].mesh.triangulate(None).triangles if chain else split)
             colors = None
             if self.map != PLAIN:
                 colors = painted_colors(painted_on(cage, chain, self.map), self.map)
-            self._place(f"fine/{index}", fine, FINE, side=beside, colors=colors)
-            self._place(f"coarse/{index}", coarse, COARSE, side=-beside, flat=True)
+            self._place(f"fine/{index}", fine, FINE, side=both, colors=colors)
+            self._place(f"coarse/{index}", coarse, COARSE, side=-both, flat=True)
         for index, pose in enumerate(shown.frame.colliders):
             mesh = None if pose is None else mesh_of(pose)
-            self._place(f"body/fine/{index}", mesh, BODY, side=beside)
-            self._place(f"body/coarse/{index}", mesh if beside else None, BODY, side=-beside)
+            self._place(f"body/fine/{index}", mesh, BODY, side=both)
+            self._place(f"body/coarse/{index}", mesh if both else None, BODY, side=-both)
 
     def _place(
         self,
@@ -98,8 +93,7 @@ class Picture:
         if handle is not None and known == key and colors is None:
             handle.vertices = points
         elif colors is None:
-            given = {"color": color, "flat_shading": flat, "side": "double"}
-            handle = self._scene.add_mesh_simple(name, points, mesh[1], **given)
+            handle = self._scene.add_mesh_simple(name, points, mesh[1], color=color, flat_shading=flat, side="double")
         else:
             handle = self._scene.add_glb(name, _colored(points, mesh[1], colors))
         self._handles[name] = key, handle
@@ -155,14 +149,12 @@ def _colored(points: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> b
 
 
 def painted_colors(values: np.ndarray, name: str) -> np.ndarray:
-    """Colours of a painted map, shape (V, 4), uint8: grey where it changes nothing, blue below, red above.
+    """Colours of a map of `PAINTED` from its values, shape (V,): grey where it changes nothing, blue below, red above.
 
-    Args:
-        values: Per vertex, shape (V,).
-        name: The map's short name, a name of `PAINTED`.
+    They are bytes, shape (V, 4).
     """
     neutral = 0.0 if name == "pin" else 1.0
     away = values - neutral
-    share = np.clip(away / max(float(np.abs(away).max()), 1e-6), -1.0, 1.0)[:, None]
-    colors = MIDDLE + np.where(share > 0, share * (HIGH - MIDDLE), -share * (LOW - MIDDLE))
-    return np.concatenate([colors, np.full_like(share, 255.0)], axis=1).round().astype(np.uint8)
+    amount = np.clip(away / max(float(np.abs(away).max()), 1e-6), -1.0, 1.0)[:, None]
+    colors = MIDDLE + np.where(amount > 0, amount * (HIGH - MIDDLE), -amount * (LOW - MIDDLE))
+    return np.concatenate([colors, np.full_like(amount, 255.0)], axis=1).round().astype(np.uint8)

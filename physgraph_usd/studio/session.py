@@ -1,4 +1,4 @@
-"""A shot and the values that an artist tries on it; driven by the page, and without one.
+"""A shot and the values that an artist tries on it, with a page or without one.
 
 session = TuneSession("shot.usda", out="shot.tuned.usda")
 session.set_value("/World/Coat", "bendStiffness", 2e-5)
@@ -36,9 +36,9 @@ class Shown:
     """A solved frame.
 
     Attributes:
-        frame: What was solved: cages, values and bodies.
+        frame: The input: cages, values and bodies.
         points: Fine positions of each garment [m], world space; None for one without a sample here.
-        telemetry: What the solver tells of each garment, as a report's frame does.
+        telemetry: The solver's figures of each garment, as in a report's frame.
         seconds: Wall time of reading and solving.
         cpu_seconds: This process's own time for it.
         run: First and last time code of the run of ``refine`` that gives these positions; None where none does, because
@@ -56,7 +56,7 @@ class Shown:
 
 
 class TuneSession:
-    """What is tried on a shot, and how it looks.
+    """Values tried on a shot, and the cloth with them.
 
     Attributes:
         out: The layer that `save` writes.
@@ -65,8 +65,8 @@ class TuneSession:
         time: The one that is solved next.
         levels: Subdivisions of each garment.
         contact: Whether cloth feels bodies and cloth.
-        warning: What the cloth touches and does not feel, or "".
-        values: What `save` authors, by prim path and the schema's short names.
+        warning: Bodies that the cloth touches and does not feel, in words, or "".
+        values: The values that `save` authors, by prim path and the schema's short names.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class TuneSession:
         Args:
             shot: The shot file; never edited.
             garments: Prim paths, names, globs or collections; empty finds applied schemas.
-            colliders: The same of bodies.
+            colliders: Bodies, as ``garments``.
             out: Layer to save into; ``<shot>.tuned.usda`` beside the shot when None.
             overwrite: Whether a file there may be replaced.
 
@@ -150,8 +150,8 @@ class TuneSession:
         Raises:
             UsageError: The garment is unknown.
         """
-        kept = {name: value for name, value in self.values.get(garment, {}).items() if name not in TUNABLES}
-        self._read_with(garment, kept)
+        values = self.values.get(garment, {})
+        self._read_with(garment, {name: value for name, value in values.items() if name not in TUNABLES})
 
     def set_level(self, garment: str, level: int) -> None:
         """Try another number of subdivisions.
@@ -182,7 +182,7 @@ class TuneSession:
         self.time, self._shown = time, None
 
     def solve(self) -> Shown:
-        """The frame with what is tried, soon: from where the cloth was, if that is this frame or the one before.
+        """The frame with the values tried, soon: from where the cloth was, if that is this frame or the one before.
 
         Raises:
             SolveError: A term of the potential is not finite.
@@ -191,13 +191,7 @@ class TuneSession:
         return self._shown or self._show(self._solver.solve_soon)
 
     def settle(self, cancelled: Callable[[], bool] = lambda: False) -> Shown | None:
-        """The frame as ``refine`` gives it.
-
-        Args:
-            cancelled: Asked before each step: whether nobody waits for it any more.
-
-        Returns:
-            None where it was cancelled.
+        """The frame as ``refine`` gives it; None where ``cancelled``, which is asked before each step, says so.
 
         Raises:
             SolveError: A term of the potential is not finite.
@@ -213,7 +207,7 @@ class TuneSession:
         return shown
 
     def save(self) -> Path:
-        """Write what is tried as a layer over the shot, as ``tag`` does; nothing else is ever written.
+        """Write the values tried as a layer over the shot, as ``tag`` does; nothing else is ever written.
 
         Raises:
             UsageError: The layer's name is one of the shot's files, or its suffix is unknown.
@@ -244,14 +238,16 @@ class TuneSession:
 
     def _try(self, garment: str, values: Mapping[str, float]) -> None:
         """Read the shot with values more, rounded to floats that a layer can hold."""
-        held = {name: float(np.float32(value)) for name, value in values.items()}
-        self._read_with(garment, self.values.get(garment, {}) | held)
+        rounded = {name: float(np.float32(value)) for name, value in values.items()}
+        self._read_with(garment, self.values.get(garment, {}) | rounded)
 
     def _read_with(self, garment: str, values: dict[str, float]) -> None:
-        """Read the shot with a garment's values; what cannot be used changes nothing."""
+        """Read the shot with a garment's values; values that cannot be used change nothing."""
         self._index(garment)
         tried = {**self.values, garment: values}
-        texts = [f"{path}.{GARMENT[name].name}={value!r}" for path, own in tried.items() for name, value in own.items()]
+        texts = [
+            f"{path}.{GARMENT[name].name}={value!r}" for path, each in tried.items() for name, value in each.items()
+        ]
         self.shot, self.values, self._shown = self._opened.with_values(texts), tried, None
 
 

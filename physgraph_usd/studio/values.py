@@ -1,4 +1,4 @@
-"""What an artist tunes: how each value is found in a frame, named and drawn as a slider."""
+"""Values that an artist tunes: how each is found in a frame, named and drawn as a slider."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Tunable:
         """The slider's ends, SI: the schema's soft limits."""
         return GARMENT[self.name].soft or (0.0, 1.0)
 
-    def said(self, value: float | None) -> str:
+    def text(self, value: float | None) -> str:
         """A value as the page writes it."""
         return "not set" if value is None else f"{float(f'{value * self.factor:.3g}'):,.8g} {self.unit}".strip()
 
     def place(self, value: float) -> float:
-        """Where a value is on the slider, 0 to 1; values beyond its ends are at them."""
+        """The place of a value on the slider, 0 to 1; values beyond its ends are at them."""
         numbers = (*self.ends, value)
         low, high, at = np.log10(np.maximum(numbers, 1e-12)) if self.decades else numbers
         return float(np.clip((at - low) / (high - low), 0.0, 1.0))
@@ -88,11 +88,5 @@ PAINTED: dict[str, Callable[[Garment], np.ndarray]] = {
 
 
 def painted_on(garment: Garment, refinements: Sequence[Refinement], name: str) -> np.ndarray:
-    """A painted map on a garment's finest vertices, shape (V,).
-
-    Args:
-        garment: The garment.
-        refinements: Its subdivisions, coarsest first.
-        name: The map's short name, a name of `PAINTED`.
-    """
+    """A map of `PAINTED` on a garment's finest vertices, shape (V,), by its subdivisions, coarsest first."""
     return reduce(lambda values, step: np.asarray(step.linear @ values), refinements, PAINTED[name](garment))
