@@ -106,31 +106,24 @@ class LearnedMetric:
         spacing = system.spacing
         return fused_physgraph(self._network, len(spacing), LONGEST, device=str(spacing.device), threads=threads)
 
-    def _combined(self, carry: Carry, *, system: System, fused: FusedPhysgraph | None) -> Tensor:
-        """The network's combination of vectors [m]."""
+    def _combined(
+        self,
+        carry: Carry,
+        *,
+        system: System,
+        fused: FusedPhysgraph | None,
+        secant: Callable[[Carry], Tensor] | None = None,
+    ) -> Tensor:
+        """The network's combination of vectors [m]; a recording gives the L-BFGS direction by itself."""
         names, step = self._network.config.vectors, carry.memory.step
         frame = cache(lambda: VertexFrame(_level(system), carry.x))
-        whole = partial(self._vector, system=system, carry=carry)
+        whole = partial(_vector, system=system, carry=carry, secant=secant or _secant_direction)
         if fused is not None:
             return fused(vectors_of(fused.bases, whole, frame=frame), system.spacing, system.reach, step, frame=frame)
         stacked = torch.stack(vectors_of(names, whole, frame=frame), dim=1)  # V N 3
         coefficients = self._network(stacked / system.spacing.reshape(-1, 1, 1), step)  # V N
         move = (coefficients.unsqueeze(2) * stacked).sum(dim=1)  # V 3
         return limited(move, system.spacing) * system.free
-
-    def _vector(self, name: str, *, system: System, carry: Carry) -> Tensor:
-        """One of `network.WHOLE` [m]; zero where the past does not reach so far."""
-        memory: Memory = carry.memory
-        image = carry.preconditioned
-        assert image is not None
-        if name == "secant":
-            return secant_direction(carry.force, image, memory.secants, dot=self._dot(system))
-        if name.startswith("diagonal"):
-            return (memory.force if name == "diagonal1" else carry.force) / system.rest_diagonal.unsqueeze(1)
-        if name.startswith("metric"):
-            return (image, *memory.images)[int(name.removeprefix("metric") or 0)]
-        age = int(name.removeprefix("move"))
-        return memory.secants[-age].move if age <= len(memory.secants) else torch.zeros_like(carry.x)
 
     def _dot(self, system: System) -> Dot:
         """The scalar product: numbers where nothing is lost by waiting for them."""
@@ -153,13 +146,34 @@ class LearnedMetric:
         if known is None:
             # A recording keeps what its kernels write to: what is cached for all may be dropped.
             propose = partial(self._combined, system=system, fused=self._fused(system))
-            known = Recording(system, propose, self._dot(system))
+            known = Recording(system, propose, dot=self._dot(system))
             for other in [each for each in self._recordings if not (each.lasting or system.lasting)]:
                 del self._recordings[other]
         self._recordings[system] = known
         while len(self._recordings) > RECORDINGS:
             del self._recordings[next(iter(self._recordings))]
         return known
+
+
+def _secant_direction(carry: Carry) -> Tensor:
+    """The L-BFGS direction of a carry [m]."""
+    assert carry.preconditioned is not None
+    return secant_direction(carry.force, carry.preconditioned, carry.memory.secants)
+
+
+def _vector(name: str, *, system: System, carry: Carry, secant: Callable[[Carry], Tensor]) -> Tensor:
+    """One of `network.WHOLE` [m]; zero where the past does not reach so far."""
+    memory: Memory = carry.memory
+    if name == "secant":
+        return secant(carry)
+    if name.startswith("diagonal"):
+        return (memory.force if name == "diagonal1" else carry.force) / system.rest_diagonal.unsqueeze(1)
+    if name.startswith("metric"):
+        image = (carry.preconditioned, *memory.images)[int(name.removeprefix("metric") or 0)]
+        assert image is not None
+        return image
+    age = int(name.removeprefix("move"))
+    return memory.secants[-age].move if age <= len(memory.secants) else torch.zeros_like(carry.x)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, Solver, System
-from .secants import Secant, dot, secant_direction, secant_of
+from .secants import Secant, dot, secant_direction
 from .truncation import truncated
 
 ARMIJO = 1e-4
@@ -79,7 +79,7 @@ class QuasiNewton:
             begun = self._begin(system, x, energy, force, inverse=inverse)
             return replace(begun, memory=replace(begun.memory, shortened=True))
         image = self._image(system, memory.inverse, force)
-        secants, newest = memory.secants, secant_of(move, carry.force - force, memory.image - image)
+        secants, newest = memory.secants, Secant(move, carry.force - force, memory.image - image)
         if newest.curvature < math.inf:
             secants = (*secants, newest)[-self._history :]
         return self._carry(x, energy, force, _Memory(secants, memory.inverse, image, memory.stiff + bool(memory.stiff)))

@@ -2,8 +2,19 @@
 
 A step of some hundred small kernels costs a GPU a tenth of a millisecond and Python several: replayed, only the first
 is left. A graph reads and writes buffers that stay where they are, so a carry is copied in before it and out after.
+
+The L-BFGS direction is a combination of fields whose coefficients depend on their scalar products alone, so one product
+of matrices, a kernel of one thread a garment and one more product replace the two loops of `secants`.
+
+| symbol | field | meaning |
+|---|---|---|
+| s_i, y_i, z_i | 0-4, 5-9, 10-14 | moves, differences of negative forces, their images; newest last |
+| F, H0^-1 F | 15, 16 | force and its image |
+| | 17-20 | x, the force before, the two images before |
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false, reportReturnType=false
 from __future__ import annotations
 
 import functools
@@ -12,19 +23,24 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import torch
+import warp as wp
 from torch import Tensor
 
+from ..mesh.threads import Launch
 from .base import Carry, System
-from .secants import Dot, Secant, secant_of
+from .secants import Dot, Secant
+
+wp.set_module_options({"enable_backward": False})
 
 SECANTS = 5
 """Secants kept."""
 MOST_GARMENTS = 8
 """Garments solved together beyond which steps are not recorded: each has scalar products of its own."""
-PAST = 6
-"""Fields of a carry before its secants: x, force, its image, the force before, the two images before."""
+COMBINED, FIELDS = 3 * SECANTS + 2, 3 * SECANTS + 6
+"""Fields that the L-BFGS direction combines, and all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,50 +62,81 @@ class Memory:
     def after(self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot) -> Memory:
         """The memory after a displacement [m] from a carry with this one to where force [N] and image [m] are."""
         assert carry.preconditioned is not None
-        newest = secant_of(move, carry.force - force, carry.preconditioned - image, dot=dot)
+        newest = Secant(move, carry.force - force, carry.preconditioned - image, dot)
         images = (carry.preconditioned, self.images[0])
         return Memory(carry.force, images, (*self.secants, newest)[-SECANTS:], self.step + 1)
+
+
+class Propose(Protocol):
+    """Gives the next displacement [m] from a carry, with whoever gives its L-BFGS direction."""
+
+    def __call__(self, carry: Carry, *, secant: Callable[[Carry], Tensor]) -> Tensor:
+        """The displacement [m]."""
+        ...
 
 
 class Recording:
     """The steps of one system on CUDA."""
 
-    def __init__(self, system: System, propose: Callable[[Carry], Tensor], dot: Dot) -> None:
+    def __init__(self, system: System, propose: Propose, *, dot: Dot) -> None:
         """Make the buffers.
 
         Args:
             system: The system.
             propose: Gives the next displacement [m].
-            dot: The scalar product, which waits for no number.
+            dot: The scalar product for steps that are not recorded.
         """
         self._system, self._propose, self._dot = system, propose, dot
         like = {"dtype": system.spacing.dtype, "device": system.spacing.device}
-        self._fields = torch.zeros((PAST + 3 * SECANTS, len(system.spacing), 3), **like)
-        shape = dot(self._fields[0], self._fields[0]).shape
-        self._curvatures = torch.full((SECANTS, *shape), math.inf, **like)
-        nothing = torch.zeros_like(self._fields[0])
-        self._unused = (Secant(nothing, nothing, nothing, self._curvatures[0].clone()),)
-        self._step = torch.zeros((), device=like["device"])
-        self._fields_after, self._curvatures_after = self._fields.clone(), self._curvatures.clone()
+        self._fields = torch.zeros((FIELDS, len(system.spacing), 3), **like)
+        self._after, self._nothing = torch.zeros_like(self._fields), torch.zeros_like(self._fields[0])
         self._known_after = torch.zeros(2, dtype=torch.float64, device=like["device"])
+        self._step = torch.zeros((), device=like["device"])
+        self._spans = (slice(0, len(system.spacing)),) if system.level is None else system.level.spans
+        self._products = torch.zeros((len(self._spans), COMBINED, COMBINED), **like)
+        self._coefficients = torch.zeros((len(self._spans), COMBINED), **like)
+        arrays = [wp.from_torch(self._products), wp.from_torch(self._coefficients)]
+        self._combine = Launch(_KERNEL[like["dtype"]], len(self._spans), arrays, device=str(like["device"]))
         self._graph: torch.cuda.CUDAGraph | None = None
         self._loaded = False
 
     def step(self, carry: Carry) -> Carry:
         """One step."""
-        memory: Memory = carry.memory
-        assert carry.preconditioned is not None
-        secants = self._unused * (SECANTS - len(memory.secants)) + memory.secants
-        fields = [carry.x, carry.force, carry.preconditioned, memory.force, *memory.images]
-        fields += [field for each in secants for field in (each.move, each.yields, each.image)]
-        torch.stack(fields, out=self._fields)
-        torch.stack([each.curvature for each in secants], out=self._curvatures)
-        self._step.fill_(memory.step)
+        step = carry.memory.step
+        torch.stack(self._fields_of(carry), out=self._fields)
+        self._step.fill_(step)
         self._run()
         self._system.evaluations += 1
-        after = _carry_of(self._fields_after.clone(), self._curvatures_after.clone(), memory.step + 1)
+        after = self._carry_of(self._after.clone(), step + 1)
         energy, remaining = self._known_after.tolist()  # One wait for both.
         return replace(after, energy=energy, remaining=remaining)
+
+    def _fields_of(self, carry: Carry) -> list[Tensor]:
+        """The fields of a carry, in their order."""
+        memory: Memory = carry.memory
+        assert carry.preconditioned is not None
+        unused = (Secant(self._nothing, self._nothing, self._nothing),) * (SECANTS - len(memory.secants))
+        secants = (*unused, *memory.secants)
+        fields = [getattr(each, name) for name in ("move", "yields", "image") for each in secants]
+        return [*fields, carry.force, carry.preconditioned, carry.x, memory.force, *memory.images]
+
+    def _carry_of(self, fields: Tensor, step: int | Tensor) -> Carry:
+        """The carry whose fields these are; its energy is not known."""
+        force, image, x, before, *images = fields[3 * SECANTS :]
+        moves, yields, images_of_yields = (fields[k * SECANTS : (k + 1) * SECANTS] for k in range(3))
+        secants = tuple(Secant(*each, dot=self._dot) for each in zip(moves, yields, images_of_yields, strict=True))
+        return Carry(x, math.nan, force, image, "physgraph", Memory(before, (images[0], images[1]), secants, step))
+
+    def _direction(self, _: Carry) -> Tensor:
+        """The L-BFGS direction of each garment [m], of the carry in the buffers."""
+        flat, out = self._fields[:COMBINED].reshape(COMBINED, -1), torch.empty_like(self._nothing)
+        parts = [flat[:, 3 * span.start : 3 * span.stop] for span in self._spans]
+        for part, products in zip(parts, self._products, strict=True):
+            torch.mm(part, part.T, out=products)
+        self._combine({})
+        for part, span, coefficients in zip(parts, self._spans, self._coefficients, strict=True):
+            out[span] = (coefficients.unsqueeze(0) @ part).reshape(-1, 3)
+        return out
 
     def _run(self) -> None:
         """The first step as it is, which loads every kernel; the second is recorded; all others are replayed."""
@@ -112,27 +159,15 @@ class Recording:
 
     def _advance(self) -> None:
         """The kernels of a step: those of a step that is not recorded, between buffers."""
-        system, before = self._system, _carry_of(self._fields, self._curvatures, self._step)
-        move = self._propose(before)
+        system, before = self._system, self._carry_of(self._fields, self._step)
+        move = self._propose(before, secant=self._direction)
         x = before.x + move
         energy, force = system.field.energy_and_force(x)
         force = force * system.free
         image = system.apply_smooth_inverse(force)
         memory = before.memory.after(before, move, force, image, dot=self._dot)
-        fields = [x, force, image, memory.force, *memory.images]
-        fields += [field for each in memory.secants for field in (each.move, each.yields, each.image)]
-        torch.stack(fields, out=self._fields_after)
-        torch.stack([each.curvature for each in memory.secants], out=self._curvatures_after)
+        torch.stack(self._fields_of(Carry(x, math.nan, force, image, memory=memory)), out=self._after)
         self._known_after.copy_(torch.stack([energy.double(), system.relative_move(image)]))
-
-
-def _carry_of(fields: Tensor, curvatures: Tensor, step: int | Tensor) -> Carry:
-    """The carry whose fields and curvatures lie in buffers; its energy is not known."""
-    x, force, image, force_before, *images = fields[:PAST]
-    moves, yields, images_of_yields = (fields[PAST + part :: 3] for part in range(3))
-    secants = tuple(map(Secant, moves, yields, images_of_yields, curvatures))
-    memory = Memory(force_before, (images[0], images[1]), secants, step)
-    return Carry(x, math.nan, force, image, "physgraph", memory)
 
 
 @functools.cache
@@ -157,3 +192,60 @@ def uncollected() -> Iterator[None]:
     finally:
         if running:
             gc.enable()
+
+
+@wp.func
+def two_loops(
+    products: wp.array(dtype=Any, ndim=3),
+    g: wp.int32,
+    out: wp.array(dtype=Any, ndim=2),
+    inverse: Any,
+    weight: Any,
+    amount: Any,
+):
+    """The recursion of `secants.secant_direction` on scalar products; ``inverse`` is 1 / s.y, or 0 for a bad pair."""
+    n = wp.static(SECANTS)
+    for k in range(n):
+        i = n - 1 - k
+        rest = products[g, i, 3 * n]
+        for j in range(i + 1, n):
+            rest = rest - weight[j] * products[g, i, n + j]
+        weight[i] = inverse[i] * rest
+    gamma = inverse.dtype(1.0)
+    if inverse[n - 1] > inverse.dtype(0.0):
+        gamma = gamma / (inverse[n - 1] * products[g, 2 * n - 1, 3 * n - 1])
+    for i in range(n):
+        seen = gamma * products[g, n + i, 3 * n + 1]
+        for j in range(n):
+            seen = seen - gamma * weight[j] * products[g, n + i, 2 * n + j]
+        for j in range(i):
+            seen = seen + amount[j] * products[g, n + i, j]
+        amount[i] = weight[i] - inverse[i] * seen
+    for i in range(n):
+        out[g, i] = amount[i]
+        out[g, n + i] = inverse.dtype(0.0)
+        out[g, 2 * n + i] = -gamma * weight[i]
+    out[g, 3 * n] = inverse.dtype(0.0)
+    out[g, 3 * n + 1] = gamma
+
+
+def _overload(scalar: type) -> wp.Kernel:
+    """The coefficients of the L-BFGS direction from the vectors' scalar products, one thread a garment."""
+    each = wp.types.vector(length=SECANTS, dtype=scalar)
+
+    @wp.kernel(module="unique")
+    def combine(first: wp.int32, products: wp.array(dtype=scalar, ndim=3), out: wp.array(dtype=scalar, ndim=2)):
+        g = first + wp.tid()
+        n = wp.static(SECANTS)
+        inverse, weight, amount = each(), each(), each()
+        for i in range(n):
+            curvature = products[g, i, n + i]
+            floor = scalar(1.0e-8) * wp.sqrt(products[g, i, i] * products[g, n + i, n + i])
+            if curvature > floor and products[g, n + i, 2 * n + i] > scalar(0.0):
+                inverse[i] = scalar(1.0) / curvature
+        two_loops(products, g, out, inverse, weight, amount)
+
+    return combine
+
+
+_KERNEL = {torch.float32: _overload(wp.float32), torch.float64: _overload(wp.float64)}

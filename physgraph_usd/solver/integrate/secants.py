@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -26,40 +27,33 @@ Dot = Callable[[Tensor, Tensor], Any]
 """The scalar product of two fields: a float, or a tensor of one number a garment, shown at each of its vertices."""
 
 
-@dataclass(frozen=True, eq=False)
-class Secant:
-    """A difference of positions, of negative forces, of their images under H0^-1, and s.y.
-
-    The curvature s.y is infinite where it is not safely positive: the secant then changes nothing.
-    """
-
-    move: Tensor
-    yields: Tensor
-    image: Tensor
-    curvature: Any
-
-
 def dot(a: Tensor, b: Tensor) -> float:
     """The scalar product of two fields as one number."""
     return float(torch.dot(a.reshape(-1), b.reshape(-1)))
 
 
-def secant_of(move: Tensor, yields: Tensor, image: Tensor, *, dot: Dot = dot) -> Secant:
-    """A secant with its curvature."""
-    curvature = dot(move, yields)
-    floor = 1e-8 * (dot(move, move) * dot(yields, yields)) ** 0.5
-    size = dot(yields, image)
-    if isinstance(curvature, Tensor):
-        return Secant(move, yields, image, torch.where((curvature > floor) & (size > 0), curvature, math.inf))
-    return Secant(move, yields, image, curvature if curvature > floor and size > 0 else math.inf)
+@dataclass(frozen=True, eq=False)
+class Secant:
+    """A difference of positions, of negative forces, of their images under H0^-1, and the scalar product to use."""
+
+    move: Tensor
+    yields: Tensor
+    image: Tensor
+    dot: Dot = dot
+
+    @cached_property
+    def curvature(self) -> Any:
+        """s.y, infinite where it is not safely positive: the secant then changes nothing."""
+        dot = self.dot
+        curvature, size = dot(self.move, self.yields), dot(self.yields, self.image)
+        floor = 1e-8 * (dot(self.move, self.move) * dot(self.yields, self.yields)) ** 0.5
+        if isinstance(curvature, Tensor):
+            return torch.where((curvature > floor) & (size > 0), curvature, math.inf)
+        return curvature if curvature > floor and size > 0 else math.inf
 
 
 def secant_direction(
-    force: Float[Tensor, "vertices 3"],
-    preconditioned: Float[Tensor, "vertices 3"],
-    secants: Sequence[Secant],
-    *,
-    dot: Dot = dot,
+    force: Float[Tensor, "vertices 3"], preconditioned: Float[Tensor, "vertices 3"], secants: Sequence[Secant]
 ) -> Float[Tensor, "vertices 3"]:
     """The L-BFGS direction [m].
 
@@ -69,18 +63,17 @@ def secant_direction(
         force: F [N].
         preconditioned: H0^-1 F [m].
         secants: Oldest first.
-        dot: The scalar product.
     """
     if not secants:
         return preconditioned
     weights, residual, image = [], force.clone(), preconditioned.clone()
     for secant in reversed(secants):
-        weight = dot(secant.move, residual) / secant.curvature
+        weight = secant.dot(secant.move, residual) / secant.curvature
         residual, image = _plus(residual, -weight, secant.yields), _plus(image, -weight, secant.image)
         weights.append(weight)
-    image = _scaled(image, secants[-1], dot)
+    image = _scaled(image, secants[-1])
     for secant, weight in zip(secants, reversed(weights), strict=True):
-        image = _plus(image, weight - dot(secant.yields, image) / secant.curvature, secant.move)
+        image = _plus(image, weight - secant.dot(secant.yields, image) / secant.curvature, secant.move)
     return image
 
 
@@ -89,10 +82,9 @@ def _plus(field: Tensor, weight: Any, other: Tensor) -> Tensor:
     return torch.addcmul(field, weight, other) if isinstance(weight, Tensor) else field.add_(other, alpha=weight)
 
 
-def _scaled(image: Tensor, newest: Secant, dot: Dot) -> Tensor:
+def _scaled(image: Tensor, newest: Secant) -> Tensor:
     """An image times gamma, which is 1 where the newest secant changes nothing."""
-    size = dot(newest.yields, newest.image)
+    size, good = newest.dot(newest.yields, newest.image), newest.curvature < math.inf
     if not isinstance(size, Tensor):
-        return image.mul_(newest.curvature / size if newest.curvature < math.inf else 1.0)
-    good = newest.curvature < math.inf
+        return image.mul_(newest.curvature / size if good else 1.0)
     return image * torch.where(good, torch.where(good, newest.curvature, 1.0) / torch.where(good, size, 1.0), 1.0)
