@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +49,8 @@ class Found:
         attribute: The authored attribute, or None for a constant.
         constant: The value when there is no attribute; None when nothing gives one.
         scale: Factor from the stage's number to SI.
+        compute: SI value at a time code, of a value that follows from others; else None.
+        varies: Whether one of these others is animated.
     """
 
     row: Property
@@ -56,14 +58,18 @@ class Found:
     attribute: Usd.Attribute | None = None
     constant: float | None = None
     scale: float = 1.0
+    compute: Callable[[float | None], float] | None = None
+    varies: bool = False
 
     @property
     def animated(self) -> bool:
         """Whether the source has more than one sample."""
-        return self.attribute is not None and self.attribute.ValueMightBeTimeVarying()
+        return self.varies or (self.attribute is not None and self.attribute.ValueMightBeTimeVarying())
 
     def at(self, time: float | None) -> float | None:
         """Value in SI at a time code, None when nothing gives one; SchemaError when it is none, or beyond limits."""
+        if self.compute is not None:
+            return check_limits(self.row, self.compute(time), self.source)
         if self.attribute is None:
             return self.constant
         return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)

@@ -19,7 +19,7 @@ from .view import StageView
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
 """The name of a rule of USD's own parser, which tells a user nothing."""
 USD_ERRORS: tuple[type[Exception], ...] = (Tf.ErrorException, *filter(None, [getattr(Tf, "CppException", None)]))
-"""What pxr raises; it has the second, for files that end too early, since 24.11."""
+"""Exceptions of pxr; it has the second, for files that end too early, since 24.11."""
 MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 STANDARD_GRAVITY = 9.81
@@ -27,7 +27,7 @@ STANDARD_GRAVITY = 9.81
 MOST_GRAVITY = 1e5
 """Gravity beyond which a magnitude is a mistake [m/s^2]."""
 FALLBACK_METRES_PER_UNIT = 0.01
-"""What USD says an unauthored metersPerUnit means [m]."""
+"""USD's meaning of an unauthored metersPerUnit [m]."""
 _HUGE = 1e15
 """Sizes and rates of a stage are less than this, and more than its inverse: single precision holds what they scale."""
 _RATE = "rate; author one above 0, such as 24"
@@ -47,7 +47,7 @@ TRAVERSAL = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 
 @dataclass(frozen=True)
 class Notice:
-    """Something that the user should know and that did not stop the work.
+    """A warning for the user about something that did not stop the work.
 
     Attributes:
         path: Prim path, or "" for the stage.
@@ -82,7 +82,7 @@ def value_at(attribute: Usd.Attribute, time: float | None) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class GarmentSource:
-    """How one garment sits on its stage; same order as ``Scene.garments``.
+    """The place of one garment on its stage; same order as ``Scene.garments``.
 
     Attributes:
         path: Prim path.
@@ -120,7 +120,7 @@ class GarmentSource:
 
 @contextlib.contextmanager
 def pxr_errors(what: str, kind: type[PhysGraphError] = StageError) -> Iterator[None]:
-    """Turn an error that USD raises into one of ours: ``what`` was being done, and the first reasons that USD gives."""
+    """Turn an error that USD raises into ours of a kind: ``what`` was being done, and the first reasons of USD."""
     try:
         yield
     except USD_ERRORS as error:
@@ -157,11 +157,7 @@ def root_metadata(stage: Usd.Stage, key: str) -> object | None:
 
 
 def check_metadata(stage: Usd.Stage) -> None:
-    """Refuse units, rates and a range that are no numbers of their kind: the layer repeats them, and they scale all.
-
-    Raises:
-        StageError: With what is authored and what to author.
-    """
+    """Refuse (StageError) units, rates and a range that are no numbers of their kind: the layer repeats them."""
     for key, (what, positive) in _NUMBERS.items():
         value = root_metadata(stage, key)
         number = float(value) if isinstance(value, int | float) else math.nan
@@ -172,7 +168,7 @@ def check_metadata(stage: Usd.Stage) -> None:
 
 
 def bad_rate(stage: Usd.Stage) -> str:
-    """What is wrong with the time codes per second of a stage's layers, "" where nothing is: USD may not come back."""
+    """The fault in the time codes per second of a stage's layers, on which USD may never return, or ""."""
     for layer in sorted(stage.GetUsedLayers(), key=lambda layer: layer.anonymous):
         if not 1.0 / _HUGE < layer.timeCodesPerSecond < _HUGE:
             name, rate = layer.GetDisplayName(), layer.timeCodesPerSecond
@@ -194,7 +190,7 @@ def metres_per_unit(stage: Usd.Stage) -> tuple[float, list[Notice]]:
 
 @dataclass(frozen=True, eq=False)
 class Units:
-    """What the stage's numbers mean.
+    """Units, up axis and gravity of a stage.
 
     Attributes:
         metres: Length of one stage unit [m].

@@ -21,7 +21,7 @@ M v [N/m], bending M m^2 v [N m], E M/m v [Pa], volumetric density M/m^3 v [kg/m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +58,8 @@ OLD_THICKNESS = "physics:surfaceThickness"
 """On the material, before the thickness moved to the mesh."""
 ON_MATERIAL = (*STIFFNESSES.values(), DENSITY, YOUNGS, POISSONS, OLD_THICKNESS)
 """Every attribute that is read from a material."""
+Thickness = tuple[Found, np.ndarray | None, tuple[Notice, ...]]
+"""The mean, the thickness at each point over the mean, shape (V,), where it differs, and what is odd about it."""
 _API = "PhysicsSurfaceDeformableMaterialAPI"
 _YOUNGS_FALLBACK, _POISSONS_FALLBACK, _DENSITY_FALLBACK = 1e6, 0.3, 1000.0
 
@@ -73,7 +75,7 @@ class Values:
         notices: What is odd about the values.
     """
 
-    found: dict[str, Found | Derived]
+    found: dict[str, Found]
     volumetric: bool
     thickness: np.ndarray | None = None
     notices: tuple[Notice, ...] = ()
@@ -102,7 +104,7 @@ class Values:
         The painted multiplier of stretching is shear's too: it follows the thickness where both do.
         """
         names = ("bendStiffness",) if name == "bendStiffness" else ("stretchStiffness", "shearStiffness")
-        if self.thickness is None or not all(isinstance(self.found[each], Derived) for each in names):
+        if self.thickness is None or not all(self.found[each].compute for each in names):
             return 1.0
         return self.thickness ** (3 if name == "bendStiffness" else 1)
 
@@ -114,59 +116,18 @@ class Values:
 def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> Values:
     """Find the source of every fabric value, the guide's stiffness and the detail's gain."""
     materials = bound_materials(prim)
-    found: dict[str, Found | Derived] = {name: find_value(prim, GARMENT[name], overrides) for name in _FRAME_VALUES}
+    found: dict[str, Found] = {name: find_value(prim, GARMENT[name], overrides) for name in _FRAME_VALUES}
     open_rows = [name for name in _FRAME_VALUES if found[name].source == "fallback"]
-    thick = read_thickness(prim, materials, GARMENT["thickness"], units=units) if "thickness" in open_rows else None
-    if thick is not None:
-        found["thickness"] = thick.found
+    relative, notices = None, ()
+    if "thickness" in open_rows and (thick := read_thickness(prim, materials, GARMENT["thickness"], units=units)):
+        found["thickness"], relative, notices = thick
     for name in STIFFNESSES:
         if name in open_rows:
             found[name] = stiffness(materials, GARMENT[name], found["thickness"], units=units) or found[name]
     volume = density(materials, GARMENT["density"], units) if "density" in open_rows else None
     if volume is not None:
         found["density"] = volume
-    return Values(
-        found,
-        volumetric=volume is not None,
-        thickness=thick.relative if thick else None,
-        notices=thick.notices if thick else (),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Derived:
-    """A value computed from others, with the interface of `Found`.
-
-    Attributes:
-        row: The attribute of ours that it stands for.
-        source: Its source in words, for the report.
-        compute: SI value at a time code.
-        animated: Whether one of the others is animated.
-    """
-
-    row: Property
-    source: str
-    compute: Callable[[float | None], float]
-    animated: bool = False
-
-    def at(self, time: float | None) -> float:
-        """Value in SI at a time code; SchemaError when it cannot be used."""
-        return check_limits(self.row, self.compute(time), self.source)
-
-
-@dataclass(frozen=True, eq=False)
-class Thickness:
-    """Thickness that the mesh or its material gives.
-
-    Attributes:
-        found: The mean.
-        relative: Thickness at each point over the mean, shape (V,); None when it is the same everywhere.
-        notices: What is odd about it.
-    """
-
-    found: Found
-    relative: np.ndarray | None = None
-    notices: tuple[Notice, ...] = ()
+    return Values(found, volume is not None, relative, notices)
 
 
 def has_value(attribute: Usd.Attribute | None) -> bool:
@@ -174,9 +135,7 @@ def has_value(attribute: Usd.Attribute | None) -> bool:
     return attribute is not None and read_number(attribute, None) != -math.inf
 
 
-def stiffness(
-    materials: Sequence[Usd.Prim], row: Property, thickness: Found | Derived, *, units: Units
-) -> Found | Derived | None:
+def stiffness(materials: Sequence[Usd.Prim], row: Property, thickness: Found, *, units: Units) -> Found | None:
     """A stiffness that a material authors, or that follows from its Young's modulus; None when there is neither."""
     scale = units.kilograms * (units.metres**2 if row.short == "bendStiffness" else 1.0)
     for material in materials:
@@ -209,7 +168,7 @@ def read_thickness(prim: Usd.Prim, materials: Sequence[Usd.Prim], row: Property,
         if old is not None and read_number(old, None) > 0:
             message = f"{OLD_THICKNESS} is the proposal's older name; author {THICKNESSES} on <{prim.GetPath()}>"
             notice = Notice(str(material.GetPath()), None, message)
-            return Thickness(Found(row, source_name(old), old, None, units.metres), None, (notice,))
+            return Found(row, source_name(old), old, None, units.metres), None, (notice,)
     return None
 
 
@@ -220,7 +179,7 @@ def is_elastic(material: Usd.Prim) -> bool:
     return _API in named or any(has_value(authored(material, name)) for name in (YOUNGS, POISSONS))
 
 
-def _from_youngs(material: Usd.Prim, row: Property, thickness: Found | Derived, *, units: Units) -> Derived:
+def _from_youngs(material: Usd.Prim, row: Property, thickness: Found, *, units: Units) -> Found:
     """A stiffness by the formulas at the top of this file."""
     attributes = (authored(material, YOUNGS), authored(material, POISSONS))
     modulus, ratio = (each if has_value(each) else None for each in attributes)
@@ -241,7 +200,7 @@ def _from_youngs(material: Usd.Prim, row: Property, thickness: Found | Derived, 
 
     source = source_name(modulus) if modulus is not None else f"<{material.GetPath()}>: fallback of {YOUNGS}, 1e6 Pa"
     animated = thickness.animated or any(each.ValueMightBeTimeVarying() for each in (modulus, ratio) if each)
-    return Derived(row, f"{source}, with the thickness", compute, animated)
+    return Found(row, f"{source}, with the thickness", compute=compute, varies=animated)
 
 
 def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: Units) -> Thickness:
@@ -266,7 +225,7 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     mean = float(values.mean())
     found = Found(row, where if len(values) == 1 else f"{where}, mean of {len(values)}", None, mean * units.metres)
     if values.min() == values.max():
-        return Thickness(found)
+        return found, None, ()
     if element == "face":
         faces = np.bincount(indices, minlength=count)
         sums = np.bincount(indices, np.repeat(values, counts), minlength=count)
@@ -274,7 +233,7 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     low, high = 1e3 * values.min() * units.metres, 1e3 * values.max() * units.metres
     message = f"{THICKNESSES} goes from {low:.3g} to {high:.3g} mm: stiffnesses derived from {YOUNGS} follow it,"
     notice = Notice(str(prim.GetPath()), None, f"{message} contact and mass take the mean")
-    return Thickness(found, values / mean, (notice,))
+    return found, values / mean, (notice,)
 
 
 def rest_angle_notices(prim: Usd.Prim) -> list[Notice]:

@@ -1,7 +1,7 @@
-"""Writes refined garments into one new layer, frame after frame.
+"""Refined garments in one new layer, written frame after frame.
 
-The layer holds overs only (and, in sibling mode, the refined siblings). What depends on topology is authored once, when
-the writer opens; points, normals, extent and velocities come per time code. See `stream` for how it stays atomic.
+The layer holds overs only (and, in sibling mode, the refined siblings). Everything that depends on topology is authored
+once, when the writer opens; points, normals, extent and velocities come per time code. It is atomic by `stream`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LayerWriter:
     """One refined layer; a context manager. Leaving it after an error leaves nothing under the final name.
 
     Attributes:
-        notices: What was hidden, emptied or changed, and why.
+        notices: Properties hidden, emptied or changed, and why.
     """
 
     def __init__(
@@ -87,14 +87,14 @@ class LayerWriter:
             self._cleanup = stack.pop_all()
 
     def _author_still(self, refinements: Sequence[Sequence[Refinement]]) -> None:
-        """Author metadata and, per garment, what its topology decides."""
+        """Author metadata and the opinions of each garment that its topology decides."""
         times = self._shot.scene.times
         span = (times[0], times[-1]) if times else None
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
-        how = {"sibling": self._mode == "sibling", "velocities": self._velocities}
+        options = {"sibling": self._mode == "sibling", "velocities": self._velocities}
         with pxr_errors(f"cannot read {self._shot.path}"):
             for index in _garments_in(self._shot, self._chunk):
-                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **how)
+                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **options)
                 self.notices += mesh.notices
                 self._meshes[index] = mesh
 
@@ -150,7 +150,7 @@ class LayerWriter:
         self._chunk = replace(self._chunk, preroll={**self._chunk.preroll, time: found})
 
     def _author_values(self, time: float | None) -> None:
-        """Leave the values used on the coarse prims."""
+        """Author the values used on the coarse prims."""
         frame = self._shot.frame(time)
         for index in self._meshes:
             source, garment = self._shot.sources[index], self._shot.scene.garments[index]
@@ -162,13 +162,10 @@ class LayerWriter:
         return [mesh.target for mesh in self._meshes.values()]
 
     def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path | None:
-        """Finish, validate and move the layer to its final name.
+        """Finish, validate and move the layer to its final path, which is returned; None for a layer in memory.
 
         Args:
-            lacking: Entries of the record about what the layer lacks.
-
-        Returns:
-            The layer's path; None for a layer in memory.
+            lacking: Entries of the record about frames that are missing or unsettled.
 
         Raises:
             LayerError: The layer is invalid or cannot be written.
@@ -188,7 +185,7 @@ class LayerWriter:
         return path
 
     def _check_written(self) -> None:
-        """Validate the first, middle and last sample of what was written."""
+        """Validate the first, middle and last sample."""
         with pxr_errors(f"cannot read {self._shot.path} under the layer written", LayerError):
             problems = check_layer(self._stream.layer, self._shot.view, samples=3)
         errors = [problem for problem in problems if problem.severity == "error"]
@@ -197,11 +194,7 @@ class LayerWriter:
 
     @property
     def layer(self) -> Sdf.Layer:
-        """The layer being written, or in memory.
-
-        Raises:
-            LayerError: It is a file that is closed.
-        """
+        """The layer being written, or in memory; LayerError when it is a file that is closed."""
         return self._stream.layer
 
     def __enter__(self) -> LayerWriter:
@@ -225,7 +218,7 @@ class _RefinedMesh:
 
     Attributes:
         target: Its path.
-        notices: What was hidden, emptied or changed, and why.
+        notices: Properties hidden, emptied or changed, and why.
     """
 
     def __init__(
@@ -238,16 +231,7 @@ class _RefinedMesh:
         sibling: bool,
         velocities: bool,
     ) -> None:
-        """Author one garment's defaults and start its tracks.
-
-        Args:
-            stream: The layer.
-            shot: The shot.
-            index: Which garment.
-            steps: Its refinements, coarse to fine.
-            sibling: Whether it goes beside the coarse mesh.
-            velocities: Whether to author velocities where the shot has none too.
-        """
+        """Author the defaults of a garment, by number and refinements, coarse to fine, and start its tracks."""
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
         counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
@@ -312,12 +296,12 @@ def _check_sizes(
 
 
 def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
-    """What the record says of the garments, and of what they were read from."""
-    held = zip(targets, shot.sources, strict=False)
+    """Entries of the record about the garments, and the shot that they were read from."""
+    pairs = zip(targets, shot.sources, strict=False)
     return {
         "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
         "garments": [str(path) for path in targets],
-        "left_out": {str(path): source.left_out_said for path, source in held if source.left_out} or None,
+        "left_out": {str(path): source.left_out_said for path, source in pairs if source.left_out} or None,
         "variants": shot.selections or None,
     }
 
