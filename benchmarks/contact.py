@@ -61,7 +61,6 @@ def cold_frames(device: str) -> None:
         "body only": ("quadratic", "off", ball),
         "cloth only": ("off", "pairs", ball),
         "body out of reach": ("quadratic", "off", far),
-        "paper's form": ("linear", "spheres", ball),
     }
     refiners = {name: _refiner(scene, form, cloth, device=device) for name, (form, cloth, _) in cases.items()}
     times, work, solve, measure = ({name: list[float]() for name in cases} for _ in range(4))
@@ -86,7 +85,7 @@ def cold_frames(device: str) -> None:
     for name in cases:
         frame, steps, seen, worked = (statistics.median(each[name][1:]) for each in (times, solve, measure, work))
         say(f"| {name} | {frame:.0f} | {steps:.0f} | {seen:.0f} | {frame / bases[0]:.2f} | {worked / bases[1]:.2f} |")
-    for name in ("contact", "paper's form"):
+    for name in ("contact",):
         say(f"\n{name}: left to the last projection {said[name]['projected']}")
         for path, values in said[name]["bodies"].items():
             say(f"{path}: before {values['before']}\nafter {values['after']}")

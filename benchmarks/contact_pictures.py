@@ -48,7 +48,6 @@ FORMS = {
 """Titles and options of the refined panels."""
 NO_BODY = {
     "Elastic forces only": FORMS["Elastic forces only"],
-    "With the spheres of the paper": RefineOptions(self_contact="paper"),
     "With the other sheet and itself": RefineOptions(),
 }
 FINER = 3

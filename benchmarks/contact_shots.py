@@ -1,12 +1,11 @@
-"""What contact leaves in shots: vertices in bodies and crossings, before and after, in our form and in the paper's.
+"""What contact leaves in shots: vertices in bodies and crossings, before and after.
 
     python -m benchmarks.contact_shots [--frames 5] [--whole] [--level 2] [--form ours] [--shot NAME]
         [--way-out 3] [--device cuda] [FOLDER]
 
 Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
-Prints a row a shot: the sums over frames and garments. The paper's form stands without our last projection, but with
-our mending of what newly crosses. With --way-out cloth between overlapping parts of a body is pushed out by ways so
-many cage edges long, in place of half of one.
+Prints a row a shot: the sums over frames and garments. With --way-out cloth between overlapping parts of a body is
+pushed out by so many cage edges, in place of half of one.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from physgraph_usd.usd.read.reader import Shot, open_shot
 
 FORMS = {
     "ours": ContactSettings(),
-    "paper": ContactSettings(form="linear", cloth="spheres", projections=0, lifts=0),
     "elastic": ContactSettings(form="off", cloth="off"),
 }
 SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "crossing": 1, "skirt": 20, "tshirt": 30}
@@ -116,7 +114,7 @@ def _plus(pair: tuple[int, int], before: int, after: int) -> tuple[int, int]:
 @click.option("--frames", default=5, show_default=True)
 @click.option("--whole", is_flag=True, help="All frames of each shot.")
 @click.option("--level", default=2, show_default=True)
-@click.option("--form", "forms", multiple=True, type=click.Choice(list(FORMS)), default=["ours", "paper"])
+@click.option("--form", "forms", multiple=True, type=click.Choice(list(FORMS)), default=["ours"])
 @click.option("--shot", "shots", multiple=True, help="Only these.")
 @click.option("--way-out", default=ContactSettings().way_out, show_default=True)
 @click.option("--device", default="cpu", show_default=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from energies import evaluate
-from folds import EDGE, crumpled, curved, flat, folded, levels_of, named, placed, square, strip, view_of
+from folds import EDGE, curved, flat, folded, levels_of, named, placed, square, strip, view_of
 from test_tangles import pair
 
 from physgraph_usd.solver.contact.cloth import ClothView
@@ -50,13 +50,6 @@ class TestOneSheet:
             of = [[c for c, w in zip(corners, weights, strict=True) if side * w > 1e-6] for side in (1.0, -1.0)]
             nearest.append(min(1 if beside[a, b] else 2 for a in of[0] for b in of[1]))
         assert {1, 2} <= set(nearest)
-
-    def test_the_papers_spheres_where_no_two_vertices_are_near(self):
-        garment = named(square(4))
-        levels = levels_of(garment)
-        view = view_of(levels, [garment], form="spheres")
-        assert view.term(levels[-1].rest) is None
-        assert view.term(placed(levels[-1], lambda p: crumpled(p, 3, size=0.8))) is not None
 
 
 class TestCrossing:

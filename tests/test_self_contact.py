@@ -12,7 +12,7 @@ from sheets import irregular, level_of, rotation
 from test_force_hessians import dense
 from test_forces import crumple
 
-from physgraph_usd.solver.forces.self_contact import Gaps, SelfContact, Spheres
+from physgraph_usd.solver.forces.self_contact import Gaps, SelfContact
 
 POINTS, TRIANGLES = irregular(0.4, 0.3, 0.1)
 LEVEL = level_of(POINTS, TRIANGLES)
@@ -39,31 +39,12 @@ def gaps_of(x: torch.Tensor, count: int = 40, *, lack: float | None = None, seed
     return replace(made, offset=offset + short, stiffness=torch.as_tensor(rng.uniform(10, 1000, count)))
 
 
-def pairs_of(x: torch.Tensor, count: int = 30, seed: int = 0) -> torch.Tensor:
-    """Random pairs of vertices, each once."""
-    rng = np.random.default_rng(seed)
-    a, b = np.triu_indices(len(x), 1)
-    kept = rng.choice(len(a), count, replace=False)
-    return torch.as_tensor(np.stack([a[kept], b[kept]], axis=1), dtype=torch.int32)
-
-
-def spheres(x: torch.Tensor, scale: float | None = None) -> Spheres:
-    """Spheres whose pairs are as far apart as their radius over a scale; half of them within it when None."""
-    pairs = pairs_of(x)
-    distance = (x[pairs[:, 0].long()] - x[pairs[:, 1].long()]).norm(dim=1)
-    radius = torch.full_like(distance, float(distance.median())) if scale is None else scale * distance
-    return Spheres(LEVEL, pairs, radius=radius, stiffness=5.0, area=0.03)
-
-
 TERMS = {
     "gaps": lambda: SelfContact(LEVEL, gaps_of(X)),
     "gaps, just open": lambda: SelfContact(LEVEL, gaps_of(X, lack=-1e-5)),
     "gaps, just short": lambda: SelfContact(LEVEL, gaps_of(X, lack=1e-3)),
-    "spheres": lambda: spheres(X),
-    "spheres, just apart": lambda: spheres(X, 0.999),
-    "spheres, just within": lambda: spheres(X, 1.05),
 }
-OPEN = ("gaps, just open", "spheres, just apart")
+OPEN = ("gaps, just open",)
 
 
 @pytest.mark.parametrize("name", TERMS)
@@ -81,8 +62,6 @@ def test_it_moves_nothing_as_a_whole(name: str):
     _, force = evaluate(TERMS[name](), X)
     size = float(force.abs().max())
     assert float(force.sum(dim=0).abs().max()) <= 1e-12 * size
-    if name.startswith("spheres"):
-        assert float(torch.linalg.cross(X, force).sum(dim=0).abs().max()) <= 1e-12 * size
 
 
 def test_a_gap_between_the_points_closest_to_one_another_turns_nothing():
@@ -98,30 +77,16 @@ def test_they_turn_with_the_cloth():
     turn, shift = torch.as_tensor(rotation(4)), torch.tensor([0.3, -0.2, 5.0], dtype=X.dtype)
     moved = X @ turn.T + shift
     gaps = gaps_of(X)
-    pairs = (
-        (SelfContact(LEVEL, gaps), SelfContact(LEVEL, replace(gaps, normal=gaps.normal @ turn.T))),
-        (spheres(X), spheres(X)),
-    )
-    for here, there in pairs:
-        energy, force = evaluate(here, X)
-        energy_there, force_there = evaluate(there, moved)
-        assert energy_there == pytest.approx(energy, rel=1e-9)
-        assert apart(force_there, force @ turn.T) < 1e-9
+    energy, force = evaluate(SelfContact(LEVEL, gaps), X)
+    turned = SelfContact(LEVEL, replace(gaps, normal=gaps.normal @ turn.T))
+    energy_there, force_there = evaluate(turned, moved)
+    assert energy_there == pytest.approx(energy, rel=1e-9)
+    assert apart(force_there, force @ turn.T) < 1e-9
 
 
-@pytest.mark.parametrize("name", ["gaps", "spheres"])
-def test_the_diagonal_is_a_third_of_the_trace_of_what_pushes(name: str):
-    """Of spheres without the part across the way, which is negative."""
-    term = TERMS[name]()
-    if name == "gaps":
-        expected = np.einsum("vava->v", dense(term, X)) / 3
-    else:
-        ends, radius = term._pairs.numpy(), term._radius
-        within = ((X[ends[:, 0]] - X[ends[:, 1]]).norm(dim=1) < radius).numpy()
-        area = LEVEL.vertex_area.numpy()
-        weight = 5.0 / 0.03 * area[ends].sum(axis=1) * within
-        expected = np.zeros(len(X))
-        np.add.at(expected, ends, 2 / 3 * weight[:, None])
+def test_the_diagonal_is_a_third_of_the_trace_of_what_pushes():
+    term = TERMS["gaps"]()
+    expected = np.einsum("vava->v", dense(term, X)) / 3
     np.testing.assert_allclose(term.diagonal(X).numpy(), expected, rtol=1e-5, atol=1e-9)
 
 
@@ -133,33 +98,8 @@ def test_gaps_are_a_convex_quadratic():
     assert energies[0] + energies[2] >= 2 * energies[1]
 
 
-def test_spheres_that_coincide_push_nowhere_and_stay_finite():
-    x = X.clone()
-    pairs = torch.tensor([[0, 1], [2, 3]], dtype=torch.int32)
-    x[1] = x[0]
-    term = Spheres(LEVEL, pairs, radius=torch.full((2,), 0.3, dtype=x.dtype), stiffness=5.0, area=0.03)
-    energy, force = evaluate(term, x)
-    assert np.isfinite(energy)
-    assert bool(force.isfinite().all())
-    assert not force[:2].any()
-    assert bool(force[2:4].any())
-
-
-def test_two_spheres_as_in_the_paper():
-    """(k_sc / A) (a_u + a_v) psi^2 with A the pair's own area is k_sc psi^2; the force 2 k_sc psi."""
-    pairs = torch.tensor([[0, 1]], dtype=torch.int32)
-    area = float(LEVEL.vertex_area[:2].sum())
-    distance = float((X[1] - X[0]).norm())
-    radius = torch.tensor([distance + 0.004], dtype=X.dtype)
-    energy, force = evaluate(Spheres(LEVEL, pairs, radius=radius, stiffness=7.0, area=area), X)
-    assert energy == pytest.approx(7.0 * 0.004**2)
-    assert float(force[1].norm()) == pytest.approx(2 * 7.0 * 0.004)
-    assert float(force[1] @ (X[1] - X[0])) > 0
-
-
-@pytest.mark.parametrize("name", ["gaps", "spheres"])
-def test_what_is_named_near_is_what_may_be_pushed(name: str):
-    term = TERMS[name]()
+def test_what_is_named_near_is_what_may_be_pushed():
+    term = TERMS["gaps"]()
     _, force = evaluate(term, X)
     near = term.near(LEVEL)[:, 0]
     assert not force[~near].any()

@@ -120,12 +120,6 @@ class TestSolve:
         fold = Fold()
         assert torch.equal(fold.solved(fold.goal, fold.x, steps=0)[0], fold.x)
 
-    def test_the_papers_spheres_promise_nothing(self):
-        fold = Fold(cloth="spheres")
-        x, _ = fold.solved(fold.goal, fold.x)
-        torch.testing.assert_close(x, fold.goal, rtol=0.0, atol=1e-5)
-        assert fold.crossings(x) > 0
-
 
 class TestPlanes:
     def test_those_of_vertices_that_stay_are_not_looked_for_again(self, monkeypatch):

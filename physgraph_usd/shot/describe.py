@@ -250,8 +250,8 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
         bodies = ", ".join(_touching(opened))
         modelled["contact"] = f"{options.contact} form, with {bodies}, in frames where it is near"
     if options.self_contact != "off":
-        form = {"auto": "pairs of points", "paper": "spheres"}[options.self_contact]
-        modelled["self contact"] = f"{form}, where parts come near one another; garments that do are solved together"
+        where = "where parts come near one another; garments that do are solved together"
+        modelled["self contact"] = f"pairs of points, {where}"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled

@@ -25,9 +25,6 @@ INTEGRATORS = (
     AUTO, "quasi-newton", "quasi-newton-flat", "lbfgs", "adam", "gd", "newton", "physgraph", "physgraph-paper",
 )  # fmt: skip
 """Names of `integrate.METHODS`, which imports torch."""
-CONTACTS = {"quadratic": "quadratic", "paper": "linear", "off": "off"}
-SELF_CONTACTS = {"auto": "pairs", "paper": "spheres", "off": "off"}
-"""Forms of contact, with bodies and of cloth with cloth, by their names on the command line."""
 REPORT_NAME, PAGE_NAME = "report.json", "report.html"
 """Names of the report and its page in a folder of their own."""
 LIST = "; repeatable"
@@ -112,10 +109,8 @@ class RefineOptions:
     mode: str = _layer("over", "Refine in place, or beside the coarse mesh.", choices=("over", "sibling"))
     temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
     potential: str = _solver("continuum", "Which form of the energy.", choices=("continuum", "paper"))
-    contact: str = _solver("quadratic", "How bodies push the cloth; paper: linearly.", choices=tuple(CONTACTS))
-    self_contact: str = _solver(
-        "auto", "How cloth pushes cloth; auto: by pairs; paper: by spheres.", choices=tuple(SELF_CONTACTS)
-    )
+    contact: str = _solver("quadratic", "How bodies push the cloth.", choices=("quadratic", "off"))
+    self_contact: str = _solver("auto", "How cloth pushes cloth.", choices=("auto", "off"))
     workers: int = _solver(
         1,
         "Processes, each beginning 6 frames early; of several shots, so many at a time; with --scheduler, chunks.",
@@ -186,9 +181,8 @@ class RefineOptions:
         """The part that concerns contact."""
         from ..solver.contact.settings import ContactSettings
 
-        return ContactSettings(
-            CONTACTS[self.contact], cloth=SELF_CONTACTS[self.self_contact], measured=self.report is not None
-        )
+        cloth = "off" if self.self_contact == "off" else "pairs"
+        return ContactSettings(self.contact, cloth=cloth, measured=self.report is not None)
 
     def solve_settings(self) -> SolveSettings:
         """The part that concerns the solver."""

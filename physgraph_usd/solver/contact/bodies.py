@@ -76,7 +76,7 @@ class LevelBodies:
         tracks, sights = tuple(track for track, _ in looks), tuple(sight for _, sight in looks)
         planes = [each.planes() for sight in sights for each in (sight.closest, sight.crease)]
         there = any(len(each.vertex) for each in planes)
-        force = Contact(self.level, planes, self.settings.stiffness, form=self.settings.form) if there else None
+        force = Contact(self.level, planes, self.settings.stiffness) if there else None
         return replace(self, tracks=tracks, sights=sights), force
 
     def _look(self, track: Track, known: Sight, x: Tensor) -> tuple[Track, Sight]:

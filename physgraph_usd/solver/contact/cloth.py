@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..collide.crossings import Crossings, crossings
@@ -22,7 +20,7 @@ from ..collide.near import near_pairs
 from ..collide.parts import Parts
 from ..collide.sweep import Listed, Reach
 from ..forces.seam import Seam
-from ..forces.self_contact import Gaps, SelfContact, Spheres
+from ..forces.self_contact import Gaps, SelfContact
 from ..level import Level
 from ..scene import Garment
 from .broad_phase import touch_one_another
@@ -31,8 +29,6 @@ from .layers import Layers
 from .settings import ContactSettings
 from .tangles import Tangles, gaps_out
 
-SPHERE = 0.8
-"""R of the paper's form, in mean edges (PAPER A13)."""
 HALF, MARGIN = 0.5, 0.1
 """The part of their distance at rest that pairs of one garment keep at most, so that a flat sheet pushes nothing; and
 how much farther than the thickness pairs are asked for, in edges."""
@@ -168,7 +164,7 @@ class ClothView:
 
     def term(
         self, x: Float[Tensor, "vertices 3"], listed: Listed | None = None, *, order: bool = False
-    ) -> SelfContact | Spheres | None:
+    ) -> SelfContact | None:
         """The force between parts that are near one another, or None where no parts are; what crosses is drawn out.
 
         Args:
@@ -176,8 +172,6 @@ class ClothView:
             listed: Pairs among which those are that are near, or None.
             order: Whether garments are brought in their order, and even what is hopeless is drawn out.
         """
-        if self._settings.cloth == "spheres":
-            return self._spheres(x)
         found, tangles = self.crossings(x), self.tangles(x)
         gaps = self._gaps(x, found, listed, order=order)
         found = found if tangles is None or order else tangles.hopeful(found)
@@ -212,26 +206,6 @@ class ClothView:
         normal = torch.nn.functional.normalize(way[kept], dim=1, eps=1e-30).contiguous()
         stiffness = self._settings.cloth_stiffness * share
         return Gaps(near.corners[kept], near.weight[kept], normal, offset[kept].contiguous(), stiffness)
-
-    def _spheres(self, x: Tensor) -> Spheres | None:
-        """The paper's form: every two vertices nearer than R that are no near neighbours (PAPER P10, A13, A27)."""
-        level, points = self._level, x.double().cpu().numpy()
-        radius = SPHERE * float(level.spacing.mean())
-        pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
-        if not len(pairs):
-            return None
-        garment = level.vertex_garment.cpu().numpy()[pairs]
-        kept = self._lasting.meets[garment[:, 0], garment[:, 1]]
-        beside = self.mesh.beside
-        within_two = sp.csr_matrix(beside @ beside + beside)
-        kept &= ~np.asarray(within_two[pairs[:, 0], pairs[:, 1]]).ravel().astype(bool)
-        pairs = pairs[kept]
-        if not len(pairs):
-            return None
-        area = float(level.vertex_area[torch.as_tensor(pairs, device=x.device).reshape(-1)].sum())
-        ends = torch.as_tensor(pairs.astype(np.int32), device=x.device)
-        limit = torch.full((len(pairs),), radius, dtype=x.dtype, device=x.device)
-        return Spheres(level, ends, radius=limit, stiffness=self._settings.sphere_stiffness, area=area)
 
     def measure(
         self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]

@@ -14,7 +14,7 @@ from ..collide.sweep import Listed
 from ..deadline import is_over
 from ..forces.contact import Contact
 from ..forces.seam import Seam
-from ..forces.self_contact import SelfContact, Spheres
+from ..forces.self_contact import SelfContact
 from ..integrate.base import Preconditioner
 from ..integrate.metric import Metric
 from ..level import Level, Placed, unhindered
@@ -34,7 +34,7 @@ BLENDED = 4
 """Rings round a tangle that does not come apart in which cloth goes over to where it was."""
 PUSHES = 4
 """How often cloth is pushed out of bodies and moved there in turn."""
-Touch = Contact | SelfContact | Spheres
+Touch = Contact | SelfContact
 """A term that stands for something near."""
 
 

@@ -12,12 +12,10 @@ class ContactSettings:
     """How contact is solved.
 
     Attributes:
-        form: Against bodies: "quadratic", "linear" as in the paper, or "off".
-        cloth: Of cloth with cloth: "pairs" of points, faces and edges, "spheres" as in the paper, or "off".
-        stiffness: k_c of the quadratic form, in stretch stiffnesses over the square of the cage's mean edge.
+        form: Against bodies: "quadratic" or "off".
+        cloth: Of cloth with cloth: "pairs" of points, faces and edges, or "off".
+        stiffness: k_c, in stretch stiffnesses over the square of the cage's mean edge.
         cloth_stiffness: The same of pairs.
-        sphere_stiffness: k_sc of spheres, in stretch stiffnesses (PAPER A13).
-        pressure: k_c over the garment's area of the linear form, in weights of the cloth.
         clearance: Part of the offset that the last projection leaves at least.
         projections: Most passes of the last projection.
         lifts: How often it moves faces outwards that a body comes through.
@@ -30,8 +28,6 @@ class ContactSettings:
     cloth: str = "pairs"
     stiffness: float = 15.0
     cloth_stiffness: float = 15.0
-    sphere_stiffness: float = 1.5
-    pressure: float = 5.0
     clearance: float = 0.25
     projections: int = 10
     lifts: int = 40
@@ -50,19 +46,13 @@ class ContactSettings:
         on = ContactSettings()
         return replace(self, form=on.form, cloth=on.cloth)
 
-    def scaled(self, cage: Level, *, stretch: float, weight: float) -> ContactSettings:
-        """The same settings with their stiffnesses in SI: [N/m^3], of the linear form [N], of spheres [N/m].
+    def scaled(self, cage: Level, *, stretch: float) -> ContactSettings:
+        """Settings with stiffnesses in SI [N/m^3].
 
         Args:
             cage: The cage.
             stretch: Stretch stiffness of the cloth [N/m].
-            weight: Its weight per area [N/m^2].
         """
         per_area = stretch / float(cage.spacing.mean()) ** 2
-        linear = self.pressure * weight * float(cage.vertex_area.sum())
-        return replace(
-            self,
-            stiffness=linear if self.form == "linear" else self.stiffness * per_area,
-            cloth_stiffness=self.cloth_stiffness * per_area,
-            sphere_stiffness=self.sphere_stiffness * stretch,
-        )
+        stiffness, cloth = self.stiffness * per_area, self.cloth_stiffness * per_area
+        return replace(self, stiffness=stiffness, cloth_stiffness=cloth)

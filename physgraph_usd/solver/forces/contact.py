@@ -1,16 +1,14 @@
 """Contact: pushes vertices out of bodies, each body seen as a plane near each vertex.
 
-    E = 1/2 sum_v k_c a_v phi_v^2                        (form="quadratic")
-    E = (k_c / A) sum_v a_v phi_v,  A = sum_{phi_v > 0} a_v   (form="linear")
+    E = 1/2 sum_v k_c a_v phi_v^2
 
 | symbol | here | meaning |
 |---|---|---|
 | phi_v | max(offset - n_v . (x_v - c_v), 0) | how far v is inside the body grown by the offset [m] |
 | c_v, n_v | ``Planes`` | closest point of the body and its outward normal, found by whoever makes this term |
-| k_c | ``stiffness`` | [N/m^3]; of the linear form [N] |
+| k_c | ``stiffness`` | [N/m^3] |
 
-The planes stay while the term lives, so it is a function of x alone. A is piecewise constant; its jumps are no forces
-and are left out of the linear form's.
+The planes stay while the term lives, so it is a function of x alone.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -32,8 +30,6 @@ from ..mesh.stencil import SCALAR, VECTOR, vectors
 from ..mesh.threads import Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
-
-FORMS = ("quadratic", "linear")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +93,16 @@ class Contact:
 
     name = "contact"
 
-    def __init__(self, level: Level, planes: Sequence[Planes], stiffness: float, *, form: str = "quadratic") -> None:
+    def __init__(self, level: Level, planes: Sequence[Planes], stiffness: float) -> None:
         """Weigh the planes.
 
         Args:
             level: The level.
             planes: One entry a body.
             stiffness: k_c.
-            form: "quadratic" or "linear".
         """
         self.planes = tuple(each for each in planes if len(each.vertex))
-        self._level, self._form, self._stiffness = level, form, stiffness
+        self._level = level
         self._areas = [level.vertex_area[each.vertex.long()] for each in self.planes]
         self._buffers = [torch.zeros_like(each) for each in self._areas]
         self._weights = [stiffness * area for area in self._areas]
@@ -125,28 +120,14 @@ class Contact:
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        if self._form == "linear":
-            return self._add_linear(x, force)
         energy = torch.zeros((), dtype=torch.float64, device=x.device)
         for launch, buffer in zip(self._launches, self._buffers, strict=True):
             launch({0: vectors(x), 6: vectors(force)})
             energy = energy + 0.5 * buffer.sum(dtype=torch.float64)
         return energy
 
-    def _add_linear(self, x: Tensor, force: Tensor) -> Float[Tensor, ""]:
-        depths = self.depths(x)
-        touching = [area * (depth > 0) for area, depth in zip(self._areas, depths, strict=True)]
-        area = sum((each.sum() for each in touching), torch.zeros_like(x[0, 0]))
-        stiffness = torch.where(area > 0, self._stiffness / area, torch.zeros_like(area))
-        energy = torch.zeros((), dtype=torch.float64, device=x.device)
-        for planes, depth, share in zip(self.planes, depths, touching, strict=True):
-            weight = stiffness * share
-            force[planes.vertex.long()] += weight.unsqueeze(1) * planes.normal
-            energy = energy + (weight * depth).sum(dtype=torch.float64)
-        return energy
-
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each plane [J] where the force was added last, and its garment; of the quadratic form."""
+        """Energy of each plane [J] where the force was added last, and its garment."""
         owners = [self._level.vertex_garment[each.vertex.long()] for each in self.planes]
         return 0.5 * torch.cat(self._buffers), torch.cat(owners)
 
@@ -162,11 +143,10 @@ class Contact:
         return seen
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
-        """k_c a_v / 3 where a plane pushes [N/m]; the linear form has none."""
+        """k_c a_v / 3 where a plane pushes [N/m]."""
         out = torch.zeros_like(x[:, 0])
-        if self._form == "quadratic":
-            for planes, weight, depth in zip(self.planes, self._weights, self.depths(x), strict=True):
-                out[planes.vertex.long()] += torch.where(depth > 0, weight / 3.0, torch.zeros_like(weight))
+        for planes, weight, depth in zip(self.planes, self._weights, self.depths(x), strict=True):
+            out[planes.vertex.long()] += torch.where(depth > 0, weight / 3.0, torch.zeros_like(weight))
         return out
 
     def rest_matrix(self) -> sp.csr_matrix | None:

@@ -1,14 +1,12 @@
 """Contact of cloth with cloth: springs that keep parts apart, each pair seen as a plane.
 
-    E = 1/2 sum_g k_g phi_g^2,   phi_g = max(offset_g - n_g . sum_i w_gi x_i, 0)          (`SelfContact`)
-    E = (k_sc / A) sum_uv (a_u + a_v) psi_uv^2,   psi_uv = max(R - |x_u - x_v|, 0)         (`Spheres`)
+    E = 1/2 sum_g k_g phi_g^2,   phi_g = max(offset_g - n_g . sum_i w_gi x_i, 0)
 
 | symbol | here | meaning |
 |---|---|---|
 | sum_i w_gi x_i | ``Gaps`` | way from one point to another: vertex, face (1, -b0, -b1, -b2), edges (1-s, s, t-1, -t) |
 | n_g | ``Gaps.normal`` | the side on which the first point lies, a unit vector |
 | k_g | ``Gaps.stiffness`` | k_c times the pair's area [N/m] |
-| A | sum of a_u + a_v over pairs nearer than R | [m^2]; its jumps are no forces |
 
 Pairs, weights and normals stay while the term lives, so it is a function of x alone, and a convex one.
 """
@@ -126,79 +124,6 @@ class SelfContact:
         """Which vertices belong to a pair."""
         seen = torch.zeros_like(level.free)
         seen[self.gaps.corners.long().reshape(-1)] = True
-        return seen
-
-    def rest_matrix(self) -> sp.csr_matrix | None:
-        """None: at rest nothing touches."""
-        return None
-
-
-@wp.kernel
-def _spheres(
-    first: wp.int32,
-    x: wp.array(dtype=Any),
-    corners: wp.array(dtype=wp.vec2i),
-    weight: wp.array(dtype=Any),
-    radius: wp.array(dtype=Any),
-    energy: wp.array(dtype=Any),
-    corner_force: wp.array(dtype=Any),
-):
-    i = first + wp.tid()
-    way = x[corners[i][1]] - x[corners[i][0]]
-    distance = wp.length(way)
-    lack = wp.max(radius[i] - distance, radius.dtype(0.0))
-    push = way * (radius.dtype(2.0) * weight[i] * lack / wp.max(distance, radius[i] * radius.dtype(1.0e-6)))
-    energy[i] = weight[i] * lack * lack
-    corner_force[2 * i] = -push
-    corner_force[2 * i + 1] = push
-
-
-_SPHERES = element_overloads(_spheres, width=2, parameters=2)
-
-
-class Spheres:
-    """The paper's self contact: vertices are spheres that push one another apart."""
-
-    name = "self_contact"
-
-    def __init__(
-        self,
-        level: Level,
-        pairs: Int[Tensor, "pairs 2"],
-        *,
-        radius: Float[Tensor, " pairs"],
-        stiffness: float,
-        area: float,
-    ) -> None:
-        """Weigh the pairs.
-
-        Args:
-            level: The level.
-            pairs: Vertices of each pair, once, int32.
-            radius: R of each pair [m].
-            stiffness: k_sc [N/m].
-            area: Sum of a_u + a_v over pairs nearer than R when the pairs were found [m^2]; its jumps are no forces.
-        """
-        ends = pairs.long()
-        self._pairs, self._radius = ends, radius
-        self._weight = stiffness / max(area, 1e-30) * (level.vertex_area[ends[:, 0]] + level.vertex_area[ends[:, 1]])
-        self._elements = Elements(_SPHERES, pairs, [self._weight, radius], level=level)
-
-    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
-        """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(x, force)
-
-    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
-        """2 w / 3 of the pairs that push, summed at both ends [N/m]."""
-        distance = (x[self._pairs[:, 1]] - x[self._pairs[:, 0]]).norm(dim=1)
-        value = torch.where(distance < self._radius, 2.0 / 3.0 * self._weight, torch.zeros_like(distance))
-        out = torch.zeros_like(x[:, 0])
-        return out.index_put_((self._pairs.reshape(-1),), value.repeat_interleave(2), accumulate=True)
-
-    def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
-        """Which vertices belong to a pair."""
-        seen = torch.zeros_like(level.free)
-        seen[self._pairs.reshape(-1)] = True
         return seen
 
     def rest_matrix(self) -> sp.csr_matrix | None:

@@ -154,8 +154,7 @@ class Group:
         if cloth is None and not touching and seams is None:
             return None
         fabrics = [frame.fabric for frame in given.garments]
-        weight = float(np.linalg.norm(self.gravity)) * max(each.density for each in fabrics)
-        settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics), weight=weight)
+        settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics))
         bodies = None
         if touching:
             bodies = FrameBodies.begin(self.levels, touching, cage.points, origin=cage.origin, settings=settings)
