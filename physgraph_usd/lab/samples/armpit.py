@@ -18,7 +18,6 @@ from .tshirt import SHIRT, dress, trim
 
 ARMPIT = (0.202, 0.403)
 """Where the left arm turns, just below the seam: distance from the middle and height [m]."""
-
 TORSO = np.array(
     [
         [0.560, 0.080, 0.040],
@@ -35,19 +34,14 @@ TORSO = np.array(
     ]
 )
 """The torso: height, half axes across and deep [m]."""
-
 ARM = np.array([[0.14, 0.068], [0.22, 0.071], [0.34, 0.070], [0.42, 0.054], [0.56, 0.040]])
 """An arm, level: distance from the middle and radius [m]."""
-
 RAISED, HANGING, WORN = 18.0, 86.0, 45.0
 """How far the arm points down at the ends of the shot, in its middle, and in the rest shape [degrees]."""
-
 PRESSED = 7.0
 """How much farther down the hanging arm points than its sleeve, which it presses to the side [degrees]."""
-
 SUNK = 0.24
 """By how much the shoulder comes closer to the armpit when the arm hangs."""
-
 FRAMES = 30
 
 

@@ -13,16 +13,12 @@ from .shapes import box, mesh, off_box, square
 
 SIDE, CELLS = 0.72, 32
 """Side of the sheet [m] and its quads along a side."""
-
 HALF = np.array([0.15, 0.19, 0.12])
 """Half sizes of the block, which stands on y = 0 [m]."""
-
 GAP, ROUND, ABOVE = 0.005, 0.012, 0.03
 """Distance that the coarse sheet keeps from the block, by how much it cuts its corners, and its height at first [m]."""
-
 TURNED = np.radians(17.0)
 """How far the sheet is turned against the block [rad]."""
-
 FRAMES, STEPS = 24, 2
 
 

@@ -10,10 +10,8 @@ from .shapes import flipped, grid_uv, mesh, quad_grid
 
 CELL = 0.021
 """Side of a quad at rest [m]."""
-
 APART, THROUGH = 0.028, 0.016
 """Half the distance between the rods, and half of that by which the lower edges have passed one another [m]."""
-
 FRAMES = 12
 
 

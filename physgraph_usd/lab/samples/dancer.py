@@ -15,11 +15,10 @@ from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
 from .panel import Cut, sew
-from .shapes import Solid, ease
+from .shapes import Solid, ease, mesh
 
 FRAMES, RATE = 60, 24.0
 """Samples in the shot, which is one turn, and their number a second."""
-
 BONES = {
     "hips": (None, (0.0, 0.96, 0.0)),
     "chest": ("hips", (0.0, 1.10, 0.0)),
@@ -31,7 +30,6 @@ BONES = {
     "foot": ("shin", (0.105, 0.085, -0.01)),
 }
 """Joints: parent and place at rest [m]; those off the middle stand for the left one of a pair."""
-
 CONES = (
     ("head", (0.0, 1.600, 0.020), 0.082, "head", (0.0, 1.545, 0.030), 0.064),
     ("head", (0.0, 1.590, -0.018), 0.086, "chest", (0.0, 1.43, -0.010), 0.050),
@@ -49,32 +47,22 @@ CONES = (
     ("foot", (0.105, 0.050, -0.030), 0.034, "foot", (0.113, 0.030, 0.120), 0.022),
 )
 """Round cones: joint, place [m] and radius [m] of either end. Those off the middle come with their mirror image."""
-
 BLEND = 0.016
 """Width over which cones run into one another [m]."""
-
 CELL = 0.02
 """Size of the body's faces [m]."""
-
 DRESS = Cut(0.196, 1.285, 1.470, 0.56, 0.15, 0.078, (22, 5, 23, 7), depth=(0.70, 0.90))
 """The dress before it is shaped [m]."""
-
 WAIST, SHOULDER, GAP = 1.075, (0.165, 1.385), 0.012
 """Height of the waist, where a sleeve turns, and distance of the coarse dress from the body [m]."""
-
 GIRTH, HEM, LENGTH, FOLDS = (0.146, 0.108), 0.37, 0.515, 6
 """Half axes of the waist, radius of the hem and length of the skirt [m], and its folds."""
-
 STEPS = 2
 """Simulated steps a frame."""
 
 
 def build() -> PlainStage:
-    """Build the shot.
-
-    Returns:
-        A dress that hangs from the shoulders and is held at the waist, and a closed body that dances; 60 samples.
-    """
+    """A dress that hangs from the shoulders and is held at the waist, and a closed body that dances."""
     body = rig()
     solid = surface(body)
     weights = skin(solid.points, body)
@@ -82,15 +70,7 @@ def build() -> PlainStage:
     for frame in range(FRAMES):
         matrices = pose(body, frame / RATE)
         samples.append(move_out(blend(solid.points, weights, matrices), posed_cones(body, matrices), body.radii))
-    form = PlainMesh(
-        name="Body",
-        counts=solid.counts,
-        indices=solid.indices,
-        points=solid.points,
-        look=Look("Canvas", (0.60, 0.56, 0.50)),
-        role="collider",
-        samples=np.stack(samples),
-    )
+    form = solid.collider("Body", Look("Canvas", (0.60, 0.56, 0.50)), samples=np.stack(samples))
     doc = "A dancer in a dress with a wide skirt, who turns once on one foot"
     return PlainStage("DancerShot", doc, (_dress(body), form), 1.0 + np.arange(FRAMES))
 
@@ -100,12 +80,11 @@ def _dress(body: Rig) -> PlainMesh:
     cut = sew(DRESS)
     rest = move_out(_shape(cut.points), body.cones, body.radii, gap=GAP)
     held = _held(cut.points)
-    return PlainMesh(
-        name="Dress",
-        counts=np.full(len(cut.quads), 4),
-        indices=cut.quads.ravel(),
-        points=rest,
-        look=Look("Cotton", (0.50, 0.10, 0.13)),
+    return mesh(
+        "Dress",
+        cut.quads,
+        rest,
+        Look("Cotton", (0.50, 0.10, 0.13)),
         samples=_simulate(body, rest, cut.quads, np.flatnonzero(held)),
         uv=cut.uv,
         pin=held.astype(float),
@@ -230,12 +209,7 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 
 def pose(body: Rig, time: float) -> np.ndarray:
-    """Matrices that take joints from rest to a time, shape (J, 4, 4); the right foot stays where it stands.
-
-    Args:
-        body: The skeleton.
-        time: Time since a turn began [s].
-    """
+    """Matrices that take joints from rest to a time since a turn began [s], shape (J, 4, 4); the right foot stays."""
     angles = motion(time)
     matrices = np.tile(np.eye(4), (len(body.names), 1, 1))
     for i, (name, parent, place) in enumerate(zip(body.names, body.parents, body.places, strict=True)):
@@ -272,25 +246,18 @@ def motion(time: float) -> dict[str, np.ndarray]:
 
 
 def level(points: np.ndarray, cones: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from the smooth union of the cones and its gradient.
+    """Distance from the smooth union of cones [m], shape (V,), and its gradient, shape (V, 3).
 
-    With the distance d to each cone this is -BLEND log(sum(exp(-d / BLEND))).
-
-    Args:
-        points: Positions [m], shape (V, 3).
-        cones: Both ends of the cones [m], shape (C, 2, 3).
-        radii: Their radii [m], shape (C, 2).
-
-    Returns:
-        Distances [m], shape (V,), and gradients, shape (V, 3).
+    With the distance d to each cone this is -BLEND log(sum(exp(-d / BLEND))). Points [m] have shape (V, 3), the ends of
+    cones [m] (C, 2, 3) and their radii [m] (C, 2), here as below.
     """
     distance, along, length = apart(points, cones, radii)
     least = distance.min(axis=1, keepdims=True)
     near = np.exp((least - distance) / BLEND)
     total = near.sum(axis=1, keepdims=True)
-    share = near / total / length
-    axes = share @ cones[:, 0] + (share * along) @ (cones[:, 1] - cones[:, 0])
-    return (least - BLEND * np.log(total))[:, 0], points * share.sum(axis=1, keepdims=True) - axes
+    weight = near / total / length
+    axes = weight @ cones[:, 0] + (weight * along) @ (cones[:, 1] - cones[:, 0])
+    return (least - BLEND * np.log(total))[:, 0], points * weight.sum(axis=1, keepdims=True) - axes
 
 
 def apart(points: np.ndarray, cones: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -305,17 +272,7 @@ def apart(points: np.ndarray, cones: np.ndarray, radii: np.ndarray) -> tuple[np.
 
 
 def move_out(points: np.ndarray, cones: np.ndarray, radii: np.ndarray, *, gap: float = 0.0) -> np.ndarray:
-    """Move points that are nearer to the cones than a gap out to it; without a gap, move all onto the surface.
-
-    Args:
-        points: Positions [m], shape (V, 3).
-        cones: Both ends of the cones [m], shape (C, 2, 3).
-        radii: Their radii [m], shape (C, 2).
-        gap: The distance [m].
-
-    Returns:
-        The positions [m], shape (V, 3).
-    """
+    """Positions [m] with those nearer to the cones than a gap [m] moved out; without a gap, all on the surface."""
     points, moved = points.copy(), np.arange(len(points))
     for _ in range(4):
         value, slope = level(points[moved], cones, radii)

@@ -18,7 +18,6 @@ from .shapes import springs
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
 """Gravity of the samples' simulations [m/s^2]; they are made with Y up."""
-
 RENEWALS = 3
 """Iterations of a step after which it is settled which points touch something."""
 

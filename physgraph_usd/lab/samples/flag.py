@@ -11,9 +11,7 @@ from .shapes import grid_uv, mesh, quad_grid
 ROWS, COLUMNS = 28, 42
 WIDTH, HEIGHT = 1.5, 1.0
 """Size of the flag [m]."""
-
 FRAMES = 48
-
 SAILCLOTH = Fabric(stretch=60.0, bend=60e-6, density=0.18)
 """A flag's cloth is finished with resin: some ten times stiffer in bending than clothes."""
 

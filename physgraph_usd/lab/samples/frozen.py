@@ -11,10 +11,8 @@ from .shapes import Solid, mesh, quad_grid, rings, square
 
 SIDE, CELLS = 1.1, 36
 """Side of the cloth [m] and its quads along a side."""
-
 TABLE_RADIUS, ROUND, TABLE_HEIGHT, THICK = 0.30, 0.02, 0.55, 0.16
 """Radius of the table, of its rounded edge, height and thickness of its top [m]."""
-
 FRAMES, SETTLE = 12, 50
 
 

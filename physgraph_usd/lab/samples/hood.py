@@ -13,17 +13,13 @@ from .shapes import ease, ellipsoid, grid_uv, join, mesh, quad_grid
 
 UP, DEEP, FOLD = 20, 15, (3, 5)
 """Quads from the neckline up one side to the top, from the face to the seam behind, and to the fold's two bends."""
-
 ROUND = 0.6
 """How round an arch is on top: 1 for an ellipse, less for a broader one."""
-
 FOLDED = np.radians(160.0)
 """How far the cloth turns back on itself in the fold [rad]."""
-
 HEAD, HEAD_AT = np.array([0.078, 0.118, 0.098]), np.array([0.0, 0.175, 0.0])
 BUST, BUST_AT = np.array([0.215, 0.080, 0.130]), np.array([0.0, -0.090, -0.010])
 """Half axes and middles of the head and of the shoulders [m]; the neckline is at y = 0."""
-
 FRAMES = 24
 
 

@@ -10,13 +10,10 @@ from .shapes import ease, mesh
 from .walker import Cage, Cells, body, trousers, tube, walk
 
 FRAMES, RATE = 30, 24.0
-
 GAPS = (0.005, 0.010, 0.0152)
 """Distance of trousers, shirt and belt from the body, where all three lie over one another [m]."""
-
 WAIST = 1.02
 """Height of the belt's middle [m]."""
-
 LONGER, WIDER = 1.08, 1.04
 """Size of the trousers and the shirt at rest over the size in which they are worn: they are pushed together."""
 

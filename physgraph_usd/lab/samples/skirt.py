@@ -11,12 +11,9 @@ from .shapes import Solid, ease, grid_uv, lathe, mesh, quad_grid, rings
 
 ROWS, AROUND, FOLDS = 23, 76, 8
 """Rows from waist to hem, columns around, and folds at the hem."""
-
 WAIST, HEM, LENGTH = (0.146, 0.116), 0.36, 0.52
 """Half axes of the waist, radius of the hem at rest and length down the side [m]."""
-
 FRAMES, WARM_UP, STEPS = 48, 40, 2
-
 PROFILE = np.array(
     [
         [0.1225, 0.06, 0.045],

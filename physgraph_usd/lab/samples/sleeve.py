@@ -11,10 +11,8 @@ from .shapes import ease, mesh
 
 AROUND, ROWS, EXTRA = 32, 52, 4
 """Vertices around an end, rows of vertices, and vertices added inside: 1,668, so that two splits give 26,304."""
-
 LENGTH, RADIUS_TOP, RADIUS_CUFF = 0.53, 0.068, 0.052
 """Size of the sleeve at rest [m]."""
-
 FRAMES = 24
 
 

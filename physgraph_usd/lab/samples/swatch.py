@@ -10,10 +10,8 @@ from .shapes import ease, flipped, grid_uv, mesh, quad_grid
 
 ROWS, COLUMNS, FRAMES = 20, 16, 24
 """Vertices down and across, and samples."""
-
 WIDTH, LENGTH = 0.24, 0.30
 """Size of the swatch [m]."""
-
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Turns Y up into Z up."""
 

@@ -12,16 +12,12 @@ from .shapes import Solid, ease, mesh, quad_grid, rings
 SHIRT = Cut(0.200, 0.405, 0.575, 0.0, 0.16, 0.078, (18, 6, 18, 8))
 BODY = Cut(0.172, 0.440, 0.556, -0.10, 0.36, 0.0, (16, 12, 16, 8), closed=True)
 """Measures of the shirt and of the body in it [m]."""
-
 SLOPE = np.radians(28.0)
 """How far the arms point down at bind time [rad]."""
-
 SHOULDER = (0.150, 0.505)
 """Where an arm turns: distance from the middle and height [m]."""
-
 SPINE = 0.17
 """Height at which the chest bends on the hips [m]."""
-
 FRAMES = 36
 
 

@@ -27,7 +27,6 @@ TRUNK = np.array(
     ]
 )
 """The trunk: height, half axes across and deep [m]."""
-
 LEG = np.array(
     [
         [0.78, 0.0905, 0.0825, 0.112, 3.4],
@@ -38,10 +37,8 @@ LEG = np.array(
     ]
 )
 """A leg: height, distance of its axis from the middle, half axes across and deep [m], and how square it is."""
-
 CROTCH, HIP, KNEE = 0.768, 0.86, 0.47
 """Heights of the crotch and of the joints [m]."""
-
 PERIOD = 1.25
 """Time of two steps [s]."""
 
