@@ -91,7 +91,7 @@ def test_a_collapsed_frame_is_told_of_and_counts_as_unsettled(tmp_path: Path, wh
     report = refine(shot, tmp_path / "fine.usdc", strict=True)
     assert perf_counter() - began < 60.0
     (warning,) = (each for each in report.warnings if each.startswith(f"<{CLOTH}> at time code {when:g}: "))
-    assert "0.001 of its rest shape's size" in warning
+    assert "0.1% of its rest shape's size" in warning
     assert "--frames" in warning
     assert [(entry["path"], entry["time"]) for entry in report.unsettled] == [(CLOTH, when)]
     assert (report.exit_code, faults(tmp_path / "fine.usdc", shot)) == (3, [])

@@ -34,7 +34,7 @@ def test_a_frame_over_its_limit_is_written_and_named(tmp_path: Path):
         (CLOTH, 1.0, "time limit"),
         (CLOTH, 2.0, "time limit"),
     ]
-    said = "was not solved to its end: it reached its limit of time; see --frame-limit; nor was it time code 2"
+    said = "was not solved to its end: it reached its limit of time; see --frame-limit; also at time code 2"
     assert [warning for warning in report.warnings if said in warning]
     assert report.exit_code == 3
     assert [frame["garments"][0]["time_limit"] for frame in report.frames] == [1e-6, 1e-6]

@@ -14,6 +14,7 @@ import pytest
 from pxr import UsdGeom, Vt
 from stages import GARMENT_API, add_sheet, new_stage, save
 
+from benchmarks import trouble
 from physgraph_usd.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -116,6 +117,11 @@ def test_advice_names_what_there_is(name: str):
     assert asked or name != "symptoms"
     for attribute in asked:
         assert f"| `{attribute}` |" in attributes
+
+
+def test_the_table_of_warnings_is_the_one_of_the_code():
+    page = trouble.PAGE.read_text("utf-8")
+    assert trouble.page_with_table(page) == page, "run python -m benchmarks.trouble"
 
 
 def test_the_gallery_has_its_films_and_they_are_short():

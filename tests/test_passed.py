@@ -139,7 +139,7 @@ def test_the_report_warns_of_it(tmp_path: Path):
     report = refine(shot, tmp_path / "fine.usdc")
     said = [warning for warning in report.warnings if "right through" in warning]
     assert said == [
-        f"<{CLOTH}>: the coarse cloth passes right through </World/wall> before time code 4, at most 35 points at "
-        "once; the refined cloth follows it to the other side"
+        f"<{CLOTH}> at time code 4: the coarse cloth has passed right through </World/wall> since the frame before, "
+        "with at most 35 points at once; the refined cloth follows it to the other side"
     ]
     assert faults(tmp_path / "fine.usdc", shot) == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from cloth import DOWN, FABRIC, frame_of, sheet
 from meshes import grid, mesh_of
 from sheets import garment_of
 
+from physgraph_usd.shot.warnings import of_folds, of_levels
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.level import build_levels
 from physgraph_usd.solver.mesh.subdivide import fine_count, subdivide_times
@@ -24,12 +26,10 @@ from physgraph_usd.solver.resolution import (
     MOST,
     SHARP_SHARE,
     LevelChoice,
-    carries_none,
     choose_levels,
     finer,
     sample_frames,
     sharp_folds,
-    too_coarse,
 )
 from physgraph_usd.solver.scene import Frame, Scene
 
@@ -106,7 +106,7 @@ def test_what_is_said_of_a_level_names_the_one_that_would_do_and_its_cost(level:
 @pytest.mark.parametrize("bend", np.geomspace(1e-7, 1e-3, 9))
 def test_a_warning_where_two_edges_are_longer_than_a_wave(bend: float):
     choice, _ = choose(0.1, level=1, fabric=replace(FABRIC, bend=bend))
-    said = carries_none("/coat", choice)
+    said = "".join(of_levels(["/coat"], [choice]))
     assert bool(said) == (choice.wavelength < 2 * choice.edge)
     assert not said or f"use --level {min(choice.needed, LIMIT)}," in said
 
@@ -142,11 +142,15 @@ def test_sharp_folds_are_counted():
     assert 0.2 < pleated(np.radians(70.0)) < 0.5
 
 
+def folds(coat: dict[str, Any], shares: dict[float | None, float]) -> str:
+    return "".join(of_folds(coat, {time: {"sharp_folds": share} for time, share in shares.items()}))
+
+
 def test_a_word_when_folds_are_too_sharp_for_the_mesh():
     coat = {"path": "/coat", "level": 2, "level_needed": 2, "fine_edge_mm": 8.0, "wavelength_mm": 40.0}
-    assert not too_coarse(coat, {})
-    assert not too_coarse(coat, {1.0: SHARP_SHARE})
-    said = too_coarse(coat, {1.0: 0.0, 7.0: 0.034, 9.0: 0.02})
+    assert not folds(coat, {})
+    assert not folds(coat, {1.0: SHARP_SHARE})
+    said = folds(coat, {1.0: 0.0, 7.0: 0.034, 9.0: 0.02})
     assert "</coat> at time code 7: 3% of the edges fold by more than 45 degrees: edges of 8.0 mm" in said
     assert said.endswith(finer(2, 2, 8e-3))
     assert "--level 3, with edges of 4.0 mm, for up to 4 times the time" in said
@@ -156,12 +160,12 @@ def test_a_word_when_folds_are_too_sharp_for_the_mesh():
 def test_before_and_after_the_run_one_level_is_named(level: int, needed: int, wave: float):
     coat = {"path": "/coat", "level": level, "level_needed": needed, "fine_edge_mm": 8.0, "wavelength_mm": wave}
     choice = LevelChoice(level, "", 1e-3 * wave, 8e-3, needed, (0, 0))
-    said = [choice.advice, too_coarse(coat, {1.0: 0.1}), too_coarse(coat | {"wavelength_mm": 9.0}, {1.0: 0.1})]
+    said = [choice.advice, folds(coat, {1.0: 0.1}), folds(coat | {"wavelength_mm": 9.0}, {1.0: 0.1})]
     levels = {found for each in said for found in re.findall(r"--level (\d)", each)}
     assert levels <= {str(min(max(needed, level + 1), LIMIT))}
     assert ("raise bendStiffness: level 5 is the finest" in said[0]) == (level == LIMIT)
     if needed > level:
-        assert "raise" not in said[2]  # What `carries_none` said before the run is not said again.
+        assert "raise" not in said[2]  # What `of_levels` said before the run is not said again.
 
 
 def test_few_frames_are_read_first_and_last_among_them():

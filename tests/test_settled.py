@@ -9,7 +9,8 @@ import pytest
 from shots import CLOTH, cloth_shot, command, refine
 
 from physgraph_usd.shot.report import RefineReport
-from physgraph_usd.shot.settled import told_contact, told_energy, unsettled
+from physgraph_usd.shot.settled import unsettled
+from physgraph_usd.shot.warnings import Entries, of_contact, of_energy
 
 
 def told(level: int, remaining: float, stopped: str = "steps") -> dict[str, Any]:
@@ -80,14 +81,12 @@ def entry(side: str, before: int, after: int) -> dict[str, Any]:
 
 class TestContact:
     def test_what_is_left_in_bodies_is_told_of_as_in_cloth_with_what_there_was(self):
-        said = told_contact(
-            "/A", {1.0: entry("/Body", 1196, 174), 2.0: entry("/Body", 10, 1), 3.0: entry("/Body", 9, 0)}
-        )
-        assert said == [
-            "</A> at time code 1: 174 edges left through </Body> (1,196 in the input), and fewer in 1 other frame"
+        entries: Entries = {1.0: entry("/Body", 10, 1), 2.0: entry("/Body", 1196, 174), 3.0: entry("/Body", 9, 0)}
+        assert list(of_contact({"path": "/A"}, entries)) == [
+            "</A> at time code 2: crossings with </Body>: 1,196 in the cage, 174 refined; also at time code 1"
         ]
-        assert told_contact("/A", {1.0: entry("cloth", 3, 1)}) == [
-            "</A> at time code 1: 1 edge left through cloth (3 in the input)"
+        assert list(of_contact({"path": "/A"}, {1.0: entry("cloth", 3, 1)})) == [
+            "</A> at time code 1: crossings of cloth: 3 in the cage, 1 refined"
         ]
 
     @pytest.mark.parametrize(("after", "code"), [(0, 0), (10, 0), (11, 3)])
@@ -109,12 +108,12 @@ def test_a_frame_above_its_input_is_told_of():
     def energies(before: float, after: float) -> dict[str, Any]:
         return {"energy_joules": {"input": {"stretch": before}, "output": {"stretch": after}}}
 
-    entries: dict[float | None, dict[str, Any]] = {
+    entries: Entries = {
         1.0: energies(1e-3, 1e-3),
         2.0: energies(1.9e-5, 3.2e-4),
         3.0: energies(1e-3, 1.1e-3),
         4.0: {},
     }
-    (said,) = told_energy("/A", entries)
+    (said,) = of_energy({"path": "/A"}, entries)
     assert said.startswith("</A> at time code 2: its energy is 0.00032 J, its upsampled cage's 1.9e-05 J")
-    assert said.endswith("so it is in 1 other frame")
+    assert said.endswith("more --steps may help; also at time code 3")

@@ -68,7 +68,7 @@ def test_stretched_parts_are_told_with_place_amount_and_remedy(tmp_path: Path):
     (said,) = [warning for warning in found["warnings"] if "--rest auto" in warning]
     assert f"<{SLEEVE}>" in said
     assert "(default points)" in said
-    assert f"{part['area_ratio']:.2f} times on {part['faces']} faces at x 50% y 7" in said
+    assert f"{part['area_ratio']:.0%} of its area on {part['faces']} faces in its upper part" in said
 
 
 def test_a_subset_that_covers_a_part_names_it(tmp_path: Path):

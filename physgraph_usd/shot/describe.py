@@ -13,9 +13,9 @@ from ..errors import GarmentError, StageError
 from ..solver.contact.crowding import Crowding, CrowdingMeter
 from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects
-from ..solver.resolution import LevelChoice, carries_none, choose_levels, sample_frames
+from ..solver.resolution import LevelChoice, choose_levels, sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
-from ..solver.strain import strained_parts, stretched
+from ..solver.strain import strained_parts
 from ..usd.read.reader import Shot
 from ..usd.read.survey import survey
 from ..usd.stage import GarmentSource
@@ -24,7 +24,8 @@ from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
 from .options import RefineOptions
 from .report import RefineReport, of_a_kind
-from .untagged import bodies_beside, command_of, proposal, told_beside
+from .untagged import bodies_beside, command_of, proposal
+from .warnings import of_levels, of_strain, of_unfelt
 
 
 def begin_report(
@@ -53,13 +54,13 @@ def begin_report(
     ]
     looked = _crowding(opened, frames, options) if before_a_run else ()
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=looked).plain()
-    known = [carries_none(garment.path, choice) for garment, choice in zip(opened.scene.garments, choices, strict=True)]
+    known = of_levels([garment.path for garment in opened.scene.garments], choices)
     known += _strained(opened, report, frames)
-    known += [_unfelt(opened, report, frames)] if options.contact != "off" else []
+    known += _unfelt(opened, report, frames) if options.contact != "off" else []
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
-    return [str(notice) for notice in opened.warnings] + [warning for warning in known if warning]
+    return [str(notice) for notice in opened.warnings] + known
 
 
 def say_what_was(report: RefineReport) -> None:
@@ -220,21 +221,21 @@ def _crowding(opened: Shot, frames: Sequence[Frame], options: RefineOptions) -> 
     return found
 
 
-def _unfelt(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> str:
-    """Add to the report the closed meshes that garments touch and do not feel; returns a warning, or ""."""
+def _unfelt(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
+    """Add to the report the closed meshes that garments touch and do not feel; returns a warning of them."""
     beside = bodies_beside(opened, frames)
     for garment in report.garments:
         garment["unfelt"] = [each.path for each in beside if garment["path"] in each.shares]
-    return told_beside(beside)
+    return of_unfelt(beside)
 
 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
-    """Add to the report the parts of garments that are not of their rest shape's size; returns warnings, or ""."""
-    said = []
+    """Add to the report the parts of garments that are not of their rest shape's size; returns warnings."""
+    said, up = [], -opened.scene.gravity
     for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
-        parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets)
+        parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets, up=up)
         report.garments[index]["strained"] = [dataclasses.asdict(part) for part in parts]
-        said.append(stretched(garment.path, source.sources["rest"], parts))
+        said += of_strain(garment.path, source.sources["rest"], parts)
     return said
 
 

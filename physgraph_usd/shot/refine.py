@@ -15,14 +15,11 @@ import torch
 
 from ..errors import NOTICE, LayerError, PhysGraphError, SolveError, StageError, UsageError, counted
 from ..interrupts import SIGNALLED, exit_code_of, signals_raise
-from ..solver.contact.passed import told
-from ..solver.frame.history import told_broken, told_jumped
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.integrate.metric import FACTOR
 from ..solver.level import refine_garments
 from ..solver.mesh.threads import kernels_are_kept, start_warp
-from ..solver.resolution import too_coarse
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED, is_result_of, write_root
 from ..usd.read.reader import Shot
@@ -41,8 +38,9 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .processes import call_each, memory_is_named
 from .report import LOG, RefineReport, is_of_failure
-from .settled import told_contact, told_energy, told_unsettled, unsettled_frames
+from .settled import unsettled_frames
 from .untagged import AUTO, open_with_colliders
+from .warnings import WARNINGS, of_frames
 
 try:
     import resource
@@ -50,7 +48,6 @@ except ImportError:  # Windows has none.
     resource = None
 MOST_THREADS = 4
 """Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
-SLOWER = "cholespy is not installed: matrices are factorised by scipy, which is slower"
 TIMED_FRAMES, LONG_RUN = 3, 60.0
 """Frames after which a run says when it will end, where that is so far away [s]."""
 DEFAULTS = RefineOptions()
@@ -149,7 +146,7 @@ def _run(
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
                 raise large
-            report.warn(*warnings, *([] if FACTOR == "cholespy" else [SLOWER]))
+            report.warn(*warnings, *([] if FACTOR == "cholespy" else [WARNINGS["slower"]()]))
             yield opened, report
     except PhysGraphError as error:
         report.error = str(error)
@@ -430,7 +427,7 @@ def _write_frames(
     writer.close(lacking=lacking)
     report.seconds["close"] = clock.perf_counter() - start
     report.seconds["write"] = written
-    report.warn(*map(str, writer.notices), *_of_frames(report))
+    report.warn(*map(str, writer.notices), *of_frames(report))
     say_what_was(report)
 
 
@@ -504,15 +501,13 @@ def _begin_after(outcome: Outcome, writer: LayerWriter) -> None:
 def _resumed(frames: FrameFolder, count: int, preroll: int) -> list[str]:
     """A warning where frames of an earlier run are used, or could have been."""
     if frames.dropped:
-        one, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
+        are, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
         dropped = counted(frames.dropped, "finished frame")
-        return [f"{dropped} of a run that was interrupted {one} solved anew; --resume would have used {them}"]
+        return [WARNINGS["solved_anew"](dropped=dropped, are=are, them=them)]
     if not frames.kept:
         return []
     again = f", each stretch after {counted(preroll, 'frame')} solved again" if preroll else ""
-    how = f"{again}; folds that can lie in several ways may lie otherwise there than in an undisturbed run"
-    kept = f"{len(frames.kept)} of {counted(count, 'frame')}"
-    return [f"{kept} are those of a run that was interrupted; the others are solved{how}"]
+    return [WARNINGS["resumed"](kept=f"{len(frames.kept)} of {counted(count, 'frame')}", again=again)]
 
 
 def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
@@ -521,7 +516,7 @@ def _take(outcome: Outcome, writer: LayerWriter, report: RefineReport) -> float:
     if not outcome.points:
         name = _time_name(outcome.time)
         report.failed[name] = str(outcome.record["error"])
-        report.warn(f"no sample is written at time code {name}: {report.failed[name]}")
+        report.warn(WARNINGS["failed"](name=name, error=report.failed[name]))
         return 0.0
     start = clock.perf_counter()
     writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused], heat=outcome.heat)
@@ -537,39 +532,6 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
         report.write(path)
     else:
         write_folder(report, path, opened)
-
-
-def _of_frames(report: RefineReport) -> list[str]:
-    """What frames say that the user should know."""
-    return [
-        *_coarse_garments(report),
-        *_of_garments(report, told, "passed_through"),
-        *_of_garments(report, told_broken, "broken_before"),
-        *_of_garments(report, told_jumped, "jumped_from"),
-        *_of_garments(report, told_contact),
-        *_of_garments(report, told_energy),
-        *told_unsettled(report.unsettled),
-    ]
-
-
-def _coarse_garments(report: RefineReport) -> list[str]:
-    """A warning for each garment whose level was too coarse for its folds."""
-    said = []
-    for index, garment in enumerate(report.garments):
-        entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
-        shares = {time: entry["sharp_folds"] for time, entry in entries.items() if "sharp_folds" in entry}
-        said.append(too_coarse(garment, shares))
-    return [warning for warning in said if warning]
-
-
-def _of_garments(report: RefineReport, tell: Callable[[str, Any], list[str]], name: str | None = None) -> list[str]:
-    """What a function of a garment's path and entries by time code warns of; of the entries with a name, that of it."""
-    said = []
-    for index, garment in enumerate(report.garments):
-        entries = {f["time"]: f["garments"][index] for f in report.frames if "garments" in f}
-        given = entries if name is None else {time: each[name] for time, each in entries.items() if name in each}
-        said += tell(garment["path"], given)
-    return said
 
 
 def _write_failure(report: RefineReport, options: RefineOptions) -> None:

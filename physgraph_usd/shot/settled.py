@@ -1,17 +1,13 @@
-"""Which frames the solver left unsettled, unsolved, crossed or in bodies: what warnings, `--strict` and reports say."""
+"""Which frames the solver left unsettled, unsolved, crossed or in bodies: for warnings, `--strict` and reports."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from itertools import groupby
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from ..errors import counted
 from ..solver.integrate.solve import FAR
 
-ROUNDING = 1e-3
-"""Part of an energy that counts for nothing: sums are in single precision."""
 COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
 
 
@@ -38,7 +34,7 @@ class Unsettled:
         if self.error:
             return self.error
         if self.size is not None:
-            return f"the cage has shrunk to {self.size:.2g} of its rest shape's size"
+            return f"the cage has shrunk to {100.0 * self.size:.2g}% of its rest shape's size"
         why = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
         return f"level {self.level} would still move by {self.remaining_move:.2g} edges ({why})"
 
@@ -89,95 +85,3 @@ def unsettled_frames(
         for frame in frames
         if "garments" in frame and (found := unsettled(frame["garments"][index], tolerance))
     ]
-
-
-def told_unsettled(found: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Warnings of each garment: its frame that is farthest from rest, its first that collapsed, and all other ones."""
-    said = []
-    for path, each in groupby(found, key=lambda entry: str(entry["path"])):
-        entries = list(each)
-        named = {kind: [e for e in entries if e["stopped"] == kind] for kind in (COLLAPSED, LIMITED, UNSOLVED)}
-        moving = [entry for entry in entries if entry["stopped"] not in named]
-        moving.sort(key=lambda entry: -entry["remaining_move"])
-        said += _told(path, moving, "the frame did not settle: {}; more --steps may help", others="nor did")
-        reached = "the frame was not solved to its end: it reached its limit of time; see --frame-limit"
-        said += _told(path, named[LIMITED], reached, others="nor was it")
-        remedy = "cache that frame again, or leave it out with --frames"
-        said += _told(
-            path, named[COLLAPSED], f"{{}}; the frame is upsampled, not solved: {remedy}", others="so it is at"
-        )
-        said += _told(
-            path, named[UNSOLVED], f"{{}}; it follows its cage there, not solved: {remedy}", others="so it is at"
-        )
-    return said
-
-
-def told_contact(path: str, entries: Mapping[float | None, Mapping[str, Any]]) -> list[str]:
-    """A warning for each kind of contact that a garment's result does not keep, with its worst frame.
-
-    Args:
-        path: The garment.
-        entries: Its telemetry by time code.
-    """
-    found: dict[tuple[str, str], dict[float | None, tuple[int, int]]] = {}
-    for time, entry in entries.items():
-        contact = entry.get("contact", {})
-        found.setdefault(("edge", "through cloth"), {})[time] = _counts(contact.get("cloth", {}), "crossings")
-        for body, told in contact.get("bodies", {}).items():
-            found.setdefault(("edge", f"through <{body}>"), {})[time] = _counts(told, "crossings")
-            found.setdefault(("vertex", f"inside <{body}>"), {})[time] = _counts(told, "inside")
-            passing = f"inside <{body}>, which lies between cloth and where the cage has it"
-            found.setdefault(("vertex", passing), {})[time] = _counts(told, "passing")
-    said = []
-    for (noun, where), counts in found.items():
-        left = {time: count for time, count in counts.items() if count[1]}
-        if left:
-            worst = max(left, key=lambda time: left[time][1])
-            (before, after), code = left[worst], "default" if worst is None else f"{worst:g}"
-            what = counted(after, noun, "vertices" if noun == "vertex" else "")
-            others = f", and fewer in {counted(len(left) - 1, 'other frame')}" if len(left) > 1 else ""
-            said.append(f"<{path}> at time code {code}: {what} left {where} ({before:,} in the input){others}")
-    return said
-
-
-def told_energy(path: str, entries: Mapping[float | None, Mapping[str, Any]]) -> list[str]:
-    """A warning where refined cloth has more energy than its upsampled cage, with the worst frame.
-
-    No descent ends above its start, but warm frames start from the last one's detail, and what is pushed out of bodies
-    or drawn apart pays for it.
-
-    Args:
-        path: The garment.
-        entries: Its telemetry by time code.
-    """
-    worse: dict[float | None, tuple[float, float]] = {}
-    for time, entry in entries.items():
-        if entry.get("together", [path])[0] != path:  # Garments that are solved together have one energy.
-            continue
-        before, after = (sum((entry.get("energy_joules") or {}).get(side, {}).values()) for side in ("input", "output"))
-        if after > (1.0 + ROUNDING) * before:
-            worse[time] = before, after
-    if not worse:
-        return []
-    worst = max(worse, key=lambda time: worse[time][1] - worse[time][0])
-    (before, after), code = worse[worst], "default" if worst is None else f"{worst:g}"
-    others = f"; so it is in {counted(len(worse) - 1, 'other frame')}" if len(worse) > 1 else ""
-    said = f"its energy is {after:.3g} J, its upsampled cage's {before:.3g} J; more --steps may help"
-    return [f"<{path}> at time code {code}: {said}{others}"]
-
-
-def _counts(told: Mapping[str, Any], name: str) -> tuple[int, int]:
-    """A count of what touches in the upsampled input and in the result; 0 where it was not measured."""
-    before, after = (int(told.get(side, {}).get(name, 0)) for side in ("before", "after"))
-    return before, after
-
-
-def _told(path: str, entries: Sequence[Mapping[str, Any]], said: str, *, others: str) -> list[str]:
-    """A warning of the first entry, with the time codes of the others; none of no entries."""
-    if not entries:
-        return []
-    first, *codes = ["default" if entry["time"] is None else f"{entry['time']:g}" for entry in entries]
-    how = Unsettled(**{own.name: entries[0][own.name] for own in fields(Unsettled)})
-    more = f"; {others} time code {', '.join(codes)}" if codes else ""
-    place = f"<{path}> at time code {first}: "
-    return [place + said.format(str(how).removeprefix(place)) + more]

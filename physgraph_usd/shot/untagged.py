@@ -26,7 +26,8 @@ from ..usd.view import Stage
 
 AUTO = "auto"
 """In place of a collider: all that the shot names, and closed meshes that garments touch."""
-MOST_NAMED, MOST_ASKED = 4, 32
+MOST_ASKED = 32
+"""Most open meshes that are looked at for garments."""
 
 
 @dataclass(frozen=True)
@@ -98,20 +99,6 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     return open_shot(shot, colliders=named, **given)
 
 
-def told_beside(found: Sequence[Beside]) -> str:
-    """One warning that says what touches cloth unfelt and what to type, or ""."""
-    if not found:
-        return ""
-    each = [f"<{each.path}> ({each.shares[each.garment]:.0%} of <{each.garment}>)" for each in found[:MOST_NAMED]]
-    each += [f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
-    several = len(found) > 1
-    return (
-        f"cloth is inside or within {1e3 * NEAR:.0f} mm of {'closed meshes' if several else 'a closed mesh'} that it "
-        f"does not feel, for {'they are no colliders' if several else 'it is no collider'}: {', '.join(each)}; "
-        f"give --collider {AUTO}, or by name {join(_options('--collider', [one.path for one in found[:MOST_NAMED]]))}"
-    )
-
-
 def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:
     """The command for a shot in which nothing is marked: open meshes that lie on closed ones are its garments.
 
@@ -137,8 +124,9 @@ def command_of(shot: str, garments: Iterable[str], colliders: Iterable[str]) -> 
     """The command that refines a shot's garments with colliders."""
     out = str(Path(shot).with_suffix(".refined.usdc"))
     words = ["physgraph-usd", "refine", shot, "-o", out]
-    return join([*words, *_options("--garment", garments), *_options("--collider", colliders)])
+    return join([*words, *options_of("--garment", garments), *options_of("--collider", colliders)])
 
 
-def _options(name: str, values: Iterable[str]) -> list[str]:
+def options_of(name: str, values: Iterable[str]) -> list[str]:
+    """An option for each of some values, as words of a command."""
     return [word for value in values for word in (name, value)]

@@ -10,9 +10,8 @@ fold sharply (S39).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -157,22 +156,6 @@ def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame])
     return max(float(np.percentile(1.0 - ratios, 90)), LEAST_STRAIN)
 
 
-def carries_none(path: str, choice: LevelChoice) -> str:
-    """A warning where a garment can fold in waves of which its level carries nothing, or "".
-
-    Args:
-        path: The garment.
-        choice: Its level.
-    """
-    if choice.needed <= choice.level or choice.wavelength >= FEWEST_EDGES * choice.edge:
-        return ""
-    wave, edge = 1e3 * choice.wavelength, 1e3 * choice.edge
-    return (
-        f"<{path}>: its fabric can fold in waves of {wave:.1f} mm; level {choice.level} has edges of {edge:.1f} mm, "
-        f"a fifth of a wave is {wave / EDGES_PER_WAVE:.1f} mm: folds may be of the mesh's own size; {choice.advice}"
-    )
-
-
 def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
     """Share of the hinges that fold by more than 45 degrees; every fourth hinge is looked at."""
     hinges = level.hinges[::4].cpu().numpy()
@@ -180,26 +163,6 @@ def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
         return 0.0
     angle = hinge_geometry(x.double().cpu().numpy(), hinges)[0]
     return float((np.abs(angle) > SHARP_FOLD).mean())
-
-
-def too_coarse(garment: Mapping[str, Any], shares: Mapping[float | None, float]) -> str:
-    """A warning where the mesh was too coarse for the folds, or "".
-
-    Args:
-        garment: Its entry in a report: path, level, the level needed, wavelength and edge.
-        shares: Share of sharp folds at each time code.
-    """
-    if not shares or max(shares.values()) <= SHARP_SHARE:
-        return ""
-    worst = max(shares, key=lambda time: shares[time])
-    at = "" if worst is None else f" at time code {worst:g}"
-    path, level, needed, edge = (garment[name] for name in ("path", "level", "level_needed", "fine_edge_mm"))
-    known = needed > level and garment["wavelength_mm"] < FEWEST_EDGES * edge  # `carries_none` has said what to do.
-    remedy = "" if known else f"; {finer(level, needed, 1e-3 * edge)}"
-    return (
-        f"<{path}>{at}: {shares[worst]:.0%} of the edges fold by more than 45 degrees: edges of {edge:.1f} mm, level "
-        f"{level}, are too coarse for this fabric and show wrinkles of the mesh's own size{remedy}"
-    )
 
 
 def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:

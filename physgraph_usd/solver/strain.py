@@ -22,7 +22,8 @@ LEAST_SHARE = 0.01
 """Of the garment's rest area; smaller parts, such as single faces in a fold, are passed over."""
 COVERED = 0.9
 """Share of a part's faces inside a subset that gives it its name."""
-MOST_NAMED = 3
+THIRD = 1.0 / 6.0
+"""How far from the middle of a box its middle third ends, in its sizes."""
 LARGEST = 4.0
 """Times its cage's size that refined cloth may have, or its cage may have of it: the validator refuses more."""
 COLLAPSED = 0.01
@@ -35,7 +36,7 @@ class StrainedPart:
     """Connected faces whose area differs from their rest area in most frames.
 
     Attributes:
-        where: Which part, in words: its subset, or its place in the rest shape's bounding box.
+        where: Which part, in words: its subset, or the part of the rest shape.
         faces: Number of faces.
         area_ratio: Area over rest area, median over the frames.
         share: Of the garment's rest area.
@@ -48,7 +49,7 @@ class StrainedPart:
 
 
 def strained_parts(
-    garment: Garment, frames: Sequence[np.ndarray], subsets: Mapping[str, np.ndarray]
+    garment: Garment, frames: Sequence[np.ndarray], subsets: Mapping[str, np.ndarray], *, up: np.ndarray
 ) -> list[StrainedPart]:
     """Find the parts that are larger, or smaller, than at rest by more than a tenth in most frames.
 
@@ -56,6 +57,7 @@ def strained_parts(
         garment: The garment.
         frames: Positions of its cage [m], each of shape (V, 3).
         subsets: Faces of each named subset of the cage.
+        up: Away from where gravity pulls, shape (3,), of any length.
 
     Returns:
         The parts, largest first.
@@ -71,21 +73,9 @@ def strained_parts(
             share = float(rest[faces].sum() / rest.sum())
             if share >= LEAST_SHARE:
                 size = float(np.median(areas[:, faces].sum(axis=1)) / rest[faces].sum())
-                parts.append(StrainedPart(_where(garment, faces, subsets), len(faces), round(size, 3), round(share, 4)))
+                where = _where(garment, faces, subsets, up)
+                parts.append(StrainedPart(where, len(faces), round(size, 3), round(share, 4)))
     return sorted(parts, key=lambda part: -part.share)
-
-
-def stretched(path: str, source: str, parts: Sequence[StrainedPart]) -> str:
-    """A warning where parts are larger than their rest shape in most frames, or far smaller, or ""."""
-    large = [part for part in parts if part.area_ratio > 1.0 or part.area_ratio < SHRUNK]
-    if not large:
-        return ""
-    named = "; ".join(f"{part.area_ratio:.2f} times on {part.faces} faces {part.where}" for part in large[:MOST_NAMED])
-    more = f"; and {len(large) - MOST_NAMED} smaller parts" if len(large) > MOST_NAMED else ""
-    return (
-        f"<{path}>: in most frames the cage has not its rest shape's size ({source}), to which refined cloth goes: "
-        f"{named}{more}; give --rest auto or --rest FRAME, or author primvars:rest"
-    )
 
 
 def size_left(garment: Garment, points: np.ndarray) -> float:
@@ -137,12 +127,18 @@ def _connected(garment: Garment, faces: np.ndarray) -> list[np.ndarray]:
     return [faces[label == each] for each in np.unique(label)]
 
 
-def _where(garment: Garment, faces: np.ndarray, subsets: Mapping[str, np.ndarray]) -> str:
-    """The smallest subset that covers the faces, or where their centre is in the rest shape's bounding box."""
+def _where(garment: Garment, faces: np.ndarray, subsets: Mapping[str, np.ndarray], up: np.ndarray) -> str:
+    """The smallest subset that covers the faces, or in which part of the rest shape's bounding box they are."""
     covering = [name for name, own in subsets.items() if np.isin(faces, own).mean() >= COVERED]
     if covering:
         return f"in GeomSubset {min(covering, key=lambda name: len(subsets[name]))}"
+    if 4 * len(faces) > 3 * garment.mesh.face_count:
+        return "all over it"
     corners = garment.mesh.indices[np.isin(garment.mesh.corner_face, faces)]
     low, size = garment.rest.min(axis=0), np.ptp(garment.rest, axis=0)
-    at = (garment.rest[corners].mean(axis=0) - low) / np.maximum(size, np.finfo(float).tiny)
-    return "at " + " ".join(f"{axis} {part:.0%}" for part, axis in zip(at, "xyz", strict=True)) + " of its box"
+    at = (garment.rest[corners].mean(axis=0) - low) / np.maximum(size, np.finfo(float).tiny) - 0.5
+    height = int(np.abs(up).argmax())
+    upper = "upper part" if at[height] * up[height] > 0 else "lower part"
+    part = f"in its {upper if abs(at[height]) > THIRD and up.any() else 'middle'}"
+    sides = [("-", "+")[at[k] > 0] + "XYZ"[k] for k in range(3) if abs(at[k]) > THIRD and (k != height or not up.any())]
+    return part + (f", towards {' and '.join(sides)}" if sides else "")

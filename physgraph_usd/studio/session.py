@@ -20,7 +20,8 @@ import numpy as np
 
 from ..errors import UsageError
 from ..shot.refine import prepare_device
-from ..shot.untagged import AUTO, bodies_beside, open_with_colliders, told_beside
+from ..shot.untagged import AUTO, bodies_beside, open_with_colliders
+from ..shot.warnings import of_unfelt
 from ..solver.fabric import PRESETS
 from ..solver.mesh.subdivide import Refinement
 from ..solver.resolution import choose_levels, sample_frames
@@ -103,7 +104,7 @@ class TuneSession:
         self.times: tuple[float | None, ...] = scene.times or (None,)
         self.time, self.contact = self.times[0], True
         frames = sample_frames(scene, self.shot.frame)
-        self.warning = told_beside(bodies_beside(self.shot, frames))
+        self.warning = "".join(of_unfelt(bodies_beside(self.shot, frames)))
         self.levels = [choice.level for choice in choose_levels(scene, frames)]
         # A level that is chosen from the fabric would be chosen anew from what is tried.
         chosen = zip(scene.garments, self.levels, strict=True)

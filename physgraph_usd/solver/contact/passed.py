@@ -7,11 +7,10 @@ cloth follows its cage there, and this says so.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from ...errors import counted
 from ..colliders.orient import pieces_of
 from ..colliders.pose import Collider, MeshPose, ShapePose
 from ..colliders.sweep import Sweep, through_shape
@@ -86,20 +85,3 @@ def _meet(body: np.ndarray, cloth: np.ndarray) -> bool:
     boxes = [(each.min(axis=(0, 1)), each.max(axis=(0, 1))) for each in (body, cloth)]
     # Points that are not finite make every comparison false.
     return bool((boxes[0][0] <= boxes[1][1]).all() and (boxes[1][0] <= boxes[0][1]).all())
-
-
-def told(garment: str, found: Mapping[float | None, Mapping[str, int]]) -> list[str]:
-    """A warning for each body that passed through a garment.
-
-    Args:
-        garment: The garment's path.
-        found: What `Passed.look` gave, by time code.
-    """
-    said = []
-    for body in sorted({body for counts in found.values() for body in counts}):
-        times = [time for time, counts in found.items() if body in counts]
-        most = max(counts.get(body, 0) for counts in found.values())
-        when = f"before time code {times[0]:g}" + (f" and {len(times) - 1} more" if len(times) > 1 else "")
-        passes = f"<{garment}>: the coarse cloth passes right through <{body}> {when}, at most {counted(most, 'point')}"
-        said.append(f"{passes} at once; the refined cloth follows it to the other side")
-    return said

@@ -6,7 +6,7 @@ back, what was solved there is no start for what follows. Then the frame before 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -227,34 +227,3 @@ def jumped_in(
     near = sorted({*near, *first.near, *second.near})
     away = max(cage_moved(first, second.frame), bodies_moved(first, second.colliders, near))
     return away > edge and max(cage_moved(second, now), bodies_moved(second, colliders, near)) < BACK * away
-
-
-def told_jumped(path: str, jumped: Mapping[float | None, float | None]) -> list[str]:
-    """A warning where a garment's input jumps from the first frame to the second.
-
-    Args:
-        path: The garment.
-        jumped: Time code of the first frame, by that of the third.
-    """
-    return [
-        f"<{path}> at time code {first:g}: the garment or a body jumps from this first frame to the next; if it is "
-        f"broken, leave it out with --frames and take the rest shape from another with --rest FRAME. "
-        f"Time code {time:g} starts anew"
-        for time, first in jumped.items()
-        if time is not None and first is not None
-    ]
-
-
-def told_broken(path: str, broken: Mapping[float | None, float | None]) -> list[str]:
-    """A warning for each frame in which a garment's input left its place.
-
-    Args:
-        path: The garment.
-        broken: Time code of the broken frame, by that of the frame after it.
-    """
-    return [
-        f"<{path}> at time code {last:g}: the garment or a body leaves its place for this frame alone; mend it. "
-        f"Time code {time:g} starts from the frame before it"
-        for time, last in broken.items()
-        if time is not None and last is not None
-    ]

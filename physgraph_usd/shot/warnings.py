@@ -1,0 +1,333 @@
+"""Every kind of warning that a run gives, its sentence and its remedy in one table, of which docs/trouble.md is made.
+
+What a stage holds that is odd or repaired is named by its reader, as `usd.stage.Notice`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import groupby
+from shlex import join
+from typing import Any
+
+from ..errors import counted
+from ..solver.resolution import EDGES_PER_WAVE, FEWEST_EDGES, SHARP_SHARE, LevelChoice, finer
+from ..solver.strain import SHRUNK, StrainedPart
+from .report import RefineReport
+from .settled import COLLAPSED, LIMITED, UNSOLVED, Unsettled
+from .untagged import AUTO, NEAR, Beside, options_of
+
+ENERGY_ROUNDING = 1e-3
+"""Part of an energy that counts for nothing: sums are in single precision."""
+MOST_NAMED = 3
+"""Most prims, parts or time codes that one warning names."""
+Entries = Mapping[float | None, Mapping[str, Any]]
+"""A garment's telemetry by time code."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of warning.
+
+    Attributes:
+        title: What docs/trouble.md calls it.
+        advice: What docs/trouble.md says to do.
+        sentence: What is so, with figures in braces.
+        remedy: What to do, in brief, or "".
+    """
+
+    title: str
+    advice: str
+    sentence: str
+    remedy: str = ""
+
+    def __call__(self, path: str = "", times: Sequence[float | None] = (), **figures: Any) -> str:
+        """The warning.
+
+        Args:
+            path: The garment, or "".
+            times: The time code that the figures are of, and others that it is so at.
+            figures: What the sentence and the remedy name.
+        """
+        first, *others = times or (None,)
+        place = f"<{path}>" if path else ""
+        place += "" if first is None else f" at time code {first:g}"
+        said = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
+        return (f"{place}: " if place else "") + "; ".join(filter(None, said))
+
+
+_MEND = "cache that frame again, or leave it out with --frames"
+_CROSSED = "`physgraph:contact:layer` orders garments; mend a cage that crosses itself; `--heat-map` shows where"
+WARNINGS = {
+    "failed": Kind(
+        "no sample is written at time code",
+        "that frame failed, the reason follows; mend the input, run again",
+        "no sample is written at time code {name}: {error}",
+    ),
+    "unsettled": Kind(
+        "the frame did not settle",
+        "`--steps 24`; `--strict` makes it exit code 3",
+        "the frame did not settle: {how}",
+        "more --steps may help",
+    ),
+    LIMITED: Kind(
+        "the frame reached its limit of time",
+        "it took over 20 times as long as the shot's other frames (and over two minutes and 10 ms a fine vertex), and "
+        "stands where it was stopped: valid, not at rest, and the one result that depends on the machine's speed. Look "
+        "at that frame's cage and bodies; `--frame-limit SECONDS` sets the limit",
+        "the frame was not solved to its end: it reached its limit of time",
+        "see --frame-limit",
+    ),
+    COLLAPSED: Kind(
+        "the cage has shrunk",
+        "the animation collapses the garment in that frame; it is upsampled there",
+        "{how}; the frame is upsampled, not solved",
+        _MEND,
+    ),
+    UNSOLVED: Kind(
+        "it follows its cage there, not solved",
+        "the reason stands before it: a body pushes the garment farther than it is large, or it cannot be solved; mend "
+        "the animation there",
+        "{how}; it follows its cage there, not solved",
+        _MEND,
+    ),
+    "crossings": Kind(
+        "crossings in the cage and refined",
+        _CROSSED,
+        "crossings {where}: {before:,} in the cage, {after:,} refined",
+    ),
+    "inside": Kind(
+        "vertices inside a body",
+        "a wrong side of the body (`physgraph:collider:side`), or cloth that other cloth holds there",
+        "vertices {where}: {before:,} in the cage, {after:,} refined",
+    ),
+    "energy": Kind(
+        "more energy than the upsampled cage",
+        "`--steps 24`, or a lower `physgraph:guide:stiffness`",
+        "its energy is {after:.3g} J, its upsampled cage's {before:.3g} J",
+        "more --steps may help",
+    ),
+    "passed_through": Kind(
+        "the coarse cloth passes right through a body",
+        "the body is too fast for the samples: add samples, or `physgraph:contact:exclude`",
+        "the coarse cloth has passed right through <{body}> since the frame before, with at most {points} at once",
+        "the refined cloth follows it to the other side",
+    ),
+    "broken_before": Kind(
+        "leaves its place for this frame alone",
+        "mend the cage or the body in that frame; the next frame starts from the one before it",
+        "the garment or a body leaves its place for this frame alone",
+        "mend it. Time code {next:g} starts from the frame before it",
+    ),
+    "jumped_from": Kind(
+        "jumps from this first frame to the next",
+        "if the first frame is broken: `--frames` without it, and `--rest` for another frame's shape",
+        "the garment or a body jumps from this first frame to the next",
+        "if it is broken, leave it out with --frames and take the rest shape from another with --rest FRAME. "
+        "Time code {next:g} starts anew",
+    ),
+    "coarse": Kind(
+        "folds may be of the mesh's own size",
+        "a finer `--level`, or accept it: the layer is whole",
+        "its fabric can fold in waves of {wave:.1f} mm; level {level} has edges of {edge:.1f} mm, a fifth of a wave is "
+        "{fifth:.1f} mm: folds may be of the mesh's own size",
+        "{finer}",
+    ),
+    "sharp_folds": Kind(
+        "edges fold by more than 45 degrees",
+        "as above",
+        "{share:.0%} of the edges fold by more than 45 degrees: edges of {edge:.1f} mm, level {level}, are too coarse "
+        "for this fabric and show wrinkles of the mesh's own size",
+        "{finer}",
+    ),
+    "strained": Kind(
+        "in most frames the cage has not its rest shape's size",
+        "`--rest auto`, `--rest FRAME` or `primvars:rest`: refined cloth goes to its rest shape's size",
+        "in most frames the cage has not its rest shape's size ({source}), to which refined cloth goes: {parts}",
+        "give --rest auto or --rest FRAME, or author primvars:rest",
+    ),
+    "unfelt": Kind(
+        "cloth is inside or near a closed mesh that it does not feel",
+        "`--collider auto`, or the command that the warning names",
+        "cloth is inside or within {near:.0f} mm of {meshes} that it does not feel, for {why}: {named}",
+        "give --collider {auto}, or by name {options}",
+    ),
+    "solved_anew": Kind(
+        "finished frames are solved anew",
+        "`--resume` in place of `--overwrite` uses them",
+        "{dropped} of a run that was interrupted {are} solved anew",
+        "--resume would have used {them}",
+    ),
+    "resumed": Kind(
+        "frames are those of a run that was interrupted",
+        "nothing; a run in one piece may fold a little otherwise",
+        "{kept} are those of a run that was interrupted; the others are solved{again}",
+        "folds that can lie in several ways may lie otherwise there than in an undisturbed run",
+    ),
+    "slower": Kind(
+        "cholespy is not installed",
+        "install it, where it has a wheel: solves take less time",
+        "cholespy is not installed: matrices are factorised by scipy, which is slower",
+    ),
+}
+
+
+def advice_table() -> str:
+    """All kinds with what to do, as a table in Markdown."""
+    rows = [f"| {kind.title} | {kind.advice} |" for kind in WARNINGS.values()]
+    return "\n".join(["| it says | do |", "|---|---|", *rows]) + "\n"
+
+
+def of_levels(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[str]:
+    """A warning for each garment that can fold in waves of which its level carries nothing.
+
+    Args:
+        garments: Their paths.
+        choices: Their levels.
+    """
+    return [
+        WARNINGS["coarse"](
+            path,
+            wave=1e3 * choice.wavelength,
+            level=choice.level,
+            edge=1e3 * choice.edge,
+            fifth=1e3 * choice.wavelength / EDGES_PER_WAVE,
+            finer=choice.advice,
+        )
+        for path, choice in zip(garments, choices, strict=True)
+        if choice.needed > choice.level and choice.wavelength < FEWEST_EDGES * choice.edge
+    ]
+
+
+def of_strain(path: str, source: str, parts: Sequence[StrainedPart]) -> list[str]:
+    """A warning where parts are larger than their rest shape in most frames, or far smaller.
+
+    Args:
+        path: The garment.
+        source: Where its rest shape is from.
+        parts: Its strained parts, largest first.
+    """
+    large = [part for part in parts if part.area_ratio > 1.0 or part.area_ratio < SHRUNK]
+    named = [f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}" for part in large]
+    named[MOST_NAMED:] = [counted(len(named) - MOST_NAMED, "smaller part")] if len(named) > MOST_NAMED else []
+    return [WARNINGS["strained"](path, source=source, parts=", ".join(named))] if named else []
+
+
+def of_unfelt(found: Sequence[Beside]) -> list[str]:
+    """A warning of the meshes that touch cloth unfelt, with what to type."""
+    if not found:
+        return []
+    named = [f"<{each.path}> ({each.shares[each.garment]:.0%} of <{each.garment}>)" for each in found[:MOST_NAMED]]
+    named += [f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
+    options = join(options_of("--collider", [each.path for each in found[:MOST_NAMED]]))
+    one = len(found) == 1
+    meshes, why = ("a closed mesh", "it is no collider") if one else ("closed meshes", "they are no colliders")
+    figures = {"named": ", ".join(named), "options": options, "near": 1e3 * NEAR, "auto": AUTO}
+    return [WARNINGS["unfelt"](meshes=meshes, why=why, **figures)]
+
+
+def of_frames(report: RefineReport) -> list[str]:
+    """Warnings of what frames tell, kind by kind."""
+    by_garment = [
+        (garment, {frame["time"]: frame["garments"][index] for frame in report.frames if "garments" in frame})
+        for index, garment in enumerate(report.garments)
+    ]
+    checks = (of_folds, _of_bodies_that_passed, _of_jumps, of_contact, of_energy)
+    said = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
+    return [*said, *_of_unsettled(report.unsettled)]
+
+
+def of_folds(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
+    """A warning where a garment's mesh was too coarse for its folds, with its worst frame."""
+    shares = {time: entry.get("sharp_folds", 0.0) for time, entry in entries.items()}
+    worst = max(shares, key=lambda time: shares[time], default=None)
+    if not shares or shares[worst] <= SHARP_SHARE:
+        return
+    path, level, needed, edge = (garment[name] for name in ("path", "level", "level_needed", "fine_edge_mm"))
+    known = needed > level and garment["wavelength_mm"] < FEWEST_EDGES * edge  # "coarse" has said what to do.
+    remedy = "" if known else finer(level, needed, 1e-3 * edge)
+    yield WARNINGS["sharp_folds"](path, [worst], share=shares[worst], edge=edge, level=level, finer=remedy)
+
+
+def _of_bodies_that_passed(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
+    """A warning for each body that passed through a garment."""
+    found = {time: entry.get("passed_through") or {} for time, entry in entries.items()}
+    for body in sorted({body for counts in found.values() for body in counts}):
+        times = [time for time, counts in found.items() if body in counts]
+        points = counted(max(found[time][body] for time in times), "point")
+        yield WARNINGS["passed_through"](garment["path"], times, body=body, points=points)
+
+
+def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
+    """A warning for each frame in which a garment's input left its place, and where it jumps from the first frame."""
+    for name in ("broken_before", "jumped_from"):
+        for time, entry in entries.items():
+            if entry.get(name) is not None and time is not None:
+                yield WARNINGS[name](garment["path"], [entry[name]], next=time)
+
+
+def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
+    """A warning for each kind of contact that a garment's result does not keep, with its worst frame."""
+    found: dict[tuple[str, str], dict[float | None, tuple[int, int]]] = {}
+    for time, entry in entries.items():
+        for kind, where, measured, name in _measured(entry.get("contact", {})):
+            before, after = (int(measured.get(side, {}).get(name, 0)) for side in ("before", "after"))
+            if after:
+                found.setdefault((kind, where), {})[time] = before, after
+    for (kind, where), counts in found.items():
+        times = sorted(counts, key=lambda time: -counts[time][1])  # The worst first, then in order.
+        before, after = counts[times[0]]
+        yield WARNINGS[kind](garment["path"], times, where=where, before=before, after=after)
+
+
+def of_energy(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
+    """A warning where refined cloth has more energy than its upsampled cage, with the worst frame.
+
+    No descent ends above its start, but warm frames start from the last one's detail, and what is pushed out of bodies
+    or untangled pays for it.
+    """
+    worse: dict[float | None, tuple[float, float]] = {}
+    for time, entry in entries.items():
+        if entry.get("together", [garment["path"]])[0] != garment["path"]:  # Solved together, they have one energy.
+            continue
+        before, after = (sum((entry.get("energy_joules") or {}).get(side, {}).values()) for side in ("input", "output"))
+        if after > (1.0 + ENERGY_ROUNDING) * before:
+            worse[time] = before, after
+    if worse:
+        times = sorted(worse, key=lambda time: worse[time][0] - worse[time][1])
+        before, after = worse[times[0]]
+        yield WARNINGS["energy"](garment["path"], times, before=before, after=after)
+
+
+def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any], str]]:
+    """What contact is measured by: the kind of warning, where, the measurements, and the count's name in them."""
+    yield "crossings", "of cloth", contact.get("cloth") or {}, "crossings"
+    for body, measured in contact.get("bodies", {}).items():
+        yield "crossings", f"with <{body}>", measured, "crossings"
+        yield "inside", f"inside <{body}>", measured, "inside"
+        yield "inside", f"inside <{body}>, which lies between cloth and where the cage has it", measured, "passing"
+
+
+def _of_unsettled(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Warnings of each garment: its frame that is farthest from rest, its first that collapsed, and all other ones."""
+    for path, each in groupby(found, key=lambda entry: str(entry["path"])):
+        entries = list(each)
+        kinds = {kind: [e for e in entries if e["stopped"] == kind] for kind in (LIMITED, COLLAPSED, UNSOLVED)}
+        moving = [entry for entry in entries if entry["stopped"] not in kinds]
+        kinds = {"unsettled": sorted(moving, key=lambda entry: -entry["remaining_move"])} | kinds
+        for kind, alike in kinds.items():
+            times = [entry["time"] for entry in alike]
+            for entry in alike[:1]:
+                how = str(Unsettled(**{each.name: entry[each.name] for each in fields(Unsettled)}))
+                place = f"<{path}> at time code {entry['time']:g}: " if entry["time"] is not None else f"<{path}>: "
+                yield WARNINGS[kind](path, times, how=how.removeprefix(place))
+
+
+def _also(times: Sequence[float | None]) -> str:
+    """At what other time codes it is so, or ""."""
+    if len(times) > MOST_NAMED:
+        return f"also in {counted(len(times), 'other frame')}"
+    names = ["default" if time is None else f"{time:g}" for time in times]
+    listed = " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
+    return f"also at time code{'s' if len(names) > 1 else ''} {listed}" if names else ""
