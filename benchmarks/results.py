@@ -1,8 +1,8 @@
-"""The paper's results, each with its command, its figure and ours: writes docs/results.md and docs/notes/results.md.
+"""The paper's results, each with its command, its figure and ours: writes docs/notes/results.md.
 
-    python -m benchmarks.results [--short] [-o docs/results.md] [--only NAME] [--fresh]
+    python -m benchmarks.results [--short] [--whole] [-o docs/notes/results.md] [--only NAME] [--fresh]
 
-The first has every figure with its target; the second, in the folder notes beside it, also what was done, and tables.
+With --whole the page also says what was done, with tables.
 
 Each part is measured by a command of its own, which stands beside its figures. What was measured lies in a journal, a
 part the moment it is known: a run that was stopped goes on where it was, while the code is the same. The short form
@@ -42,7 +42,7 @@ from physgraph_usd import __version__
 from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.solver.integrate.weights import FOLDER
 
-PAGE = Path("docs/results.md")
+PAGE = Path("docs/notes/results.md")
 CACHE = Path("build")
 """Folder of the journals."""
 PARTS = (
@@ -69,7 +69,6 @@ nothing was aimed at.
 
 **{met} of {counted} figures with a target meet it.** Weights of the learned integrators: {weights}.
 """
-IN_FULL = "What stands in for the paper's data, and the tables behind: [in full](notes/results.md).\n"
 
 
 class Journal:
@@ -116,7 +115,7 @@ def run(parts: Sequence[Part], journal: Journal, *, short: bool) -> dict[str, di
 
 
 def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool, whole: bool = True) -> str:
-    """The page in Markdown; whole has what was done and tables too, and lies in a folder below the other."""
+    """The page in Markdown; whole has what was done and tables too."""
     shown = [(part, known[part.name]) for part in parts if part.name in known]
     rows = [row for _, each in shown for row in Found.of(each["found"]).rows if row.met is not None]
     seconds = sum(each["seconds"] for _, each in shown)
@@ -132,7 +131,7 @@ def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool
         weights=", ".join(hashes()) or "none",
     )
     sections = (line for part, each in shown for line in section(part, each, short=short, whole=whole))
-    return "\n".join([head, *([] if whole else [IN_FULL]), *sections])
+    return "\n".join([head, *sections])
 
 
 def section(part: Part, known: dict[str, Any], *, short: bool, whole: bool = True) -> Iterator[str]:
@@ -173,10 +172,11 @@ def _children() -> float:
 
 @click.command()
 @click.option("--short", is_flag=True, help="Less than 15 minutes on two cores.")
+@click.option("--whole", is_flag=True, help="Say what was done, with tables.")
 @click.option("-o", "--out", type=click.Path(dir_okay=False, path_type=Path), default=PAGE, help="Page to write.")
 @click.option("--only", multiple=True, type=click.Choice([part.name for part in PARTS]), help="Measure only these.")
 @click.option("--fresh", is_flag=True, help="Measure everything anew.")
-def main(short: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:
+def main(short: bool, whole: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:
     """Measure what is not yet known and write the page."""
     prepare_device("cpu")
     form = "short" if short else "long"
@@ -188,11 +188,8 @@ def main(short: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:
     journal = Journal(CACHE / f"results.{form}.jsonl", key, fresh=fresh)
     with torch.no_grad():
         known = run([part for part in PARTS if not only or part.name in only], journal, short=short)
-    notes = out.parent / "notes" / out.name
-    notes.parent.mkdir(parents=True, exist_ok=True)
-    for file, whole in ((out, False), (notes, True)):
-        file.write_text(page(PARTS, known, short=short, whole=whole), encoding="utf-8")
-        click.echo(file)
+    out.write_text(page(PARTS, known, short=short, whole=whole), encoding="utf-8")
+    click.echo(out)
 
 
 if __name__ == "__main__":

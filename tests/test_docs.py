@@ -19,14 +19,14 @@ from physgraph_usd.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
 FOR_USERS = (
-    "index", "attributes", "batch", "contact", "fabrics", "farm", "gallery", "hooks", "layers", "symptoms", "trouble",
-    "tune",
+    "index", "api", "attributes", "batch", "contact", "fabrics", "farm", "gallery", "hooks", "layers", "symptoms",
+    "trouble", "tune",
 )  # fmt: skip
 FOR_RESEARCHERS = ("chart", "collisions", "frames", "learned", "solver")
-PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in FOR_USERS)]
-MOST_WORDS = 12_000
+PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in (*FOR_USERS, *FOR_RESEARCHERS))]
+MOST_WORDS, MOST_WORDS_OF_NOTES = 14_000, 8_000
 MOST_WORDS_OF_README, MOST_WORDS_OF_A_PAGE = 1_200, 2_000
-MOST_BYTES_OF_A_FILM, MOST_BYTES_OF_FILMS = 600_000, 3_000_000
+MOST_BYTES_OF_A_FILM, MOST_BYTES_OF_FILMS = 1_600_000, 6_000_000
 BLOCK = re.compile(
     r"(?:<!-- not run: (?P<why>[^>]+) -->\n)?^```(?P<kind>\w*)\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL
 )
@@ -94,14 +94,18 @@ def test_the_blocks_are_found():
     assert len(blocks(ROOT / "docs" / "farm.md")) == 3
 
 
-def test_pages_for_users_are_short():
-    assert sum(len(page.read_text("utf-8").split()) for page in PAGES) < MOST_WORDS
+def words(page: Path) -> int:
+    """Number of words of a page; the bars of its tables are none."""
+    return sum(any(letter.isalnum() for letter in word) for word in page.read_text("utf-8").split())
 
 
-def test_every_page_is_read_in_ten_minutes():
-    for name in (*FOR_USERS, *FOR_RESEARCHERS):
-        assert len((ROOT / "docs" / f"{name}.md").read_text("utf-8").split()) <= MOST_WORDS_OF_A_PAGE, name
-    assert len((ROOT / "README.md").read_text("utf-8").split()) <= MOST_WORDS_OF_README
+def test_pages_are_short():
+    """A page is read in ten minutes, all of them in a long evening."""
+    assert sum(map(words, PAGES)) <= MOST_WORDS
+    assert sum(map(words, (ROOT / "docs" / "notes").glob("*.md"))) <= MOST_WORDS_OF_NOTES
+    assert max(map(words, PAGES)) <= MOST_WORDS_OF_A_PAGE
+    assert words(ROOT / "README.md") <= MOST_WORDS_OF_README
+    assert len((ROOT / "CHANGELOG.md").read_text("utf-8").splitlines()) <= 60
 
 
 @pytest.mark.parametrize("name", ["symptoms", "trouble"])

@@ -71,6 +71,9 @@ def test_wheel_carries_schemas_weights_and_licence(tmp_path: Path) -> None:
         assert f"physgraph_usd/{name}" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "schemas/"))]
+    metadata = zipfile.ZipFile(wheel).read(next(name for name in names if name.endswith("METADATA"))).decode()
+    assert "A coarse animated garment" in metadata
+    assert not re.findall(r"\]\((?!https?:)", metadata), "links and pictures that lead nowhere on a package index"
 
 
 def test_contributing_names_each_module_and_none_that_is_not_there() -> None:

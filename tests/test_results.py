@@ -92,7 +92,6 @@ def test_the_page_counts_what_is_met_and_shows_what_is_missed(tmp_path: Path):
     brief = page(made, known, short=True, whole=False)
     assert "| what of two | 2 | at most 3 | 1 | **missed** |" in brief
     assert "note of two" not in brief
-    assert "notes/results.md" in brief
 
 
 def test_every_part_has_its_name_and_command_once():
