@@ -73,18 +73,6 @@ def between(x: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> int:
     return total
 
 
-def contour_length(soup: Soup) -> float:
-    """Length of the lines along which faces that share no vertex pass through one another."""
-    edge, face, point = crossing_points(soup.x, soup.edges, soup.faces)
-    ends: dict[tuple[int, int], list[np.ndarray]] = {}
-    for e, f, where in zip(edge, face, point, strict=True):
-        owners = np.flatnonzero((np.isin(soup.faces, soup.edges[e])).sum(axis=1) == 2)
-        for owner in owners:
-            if not np.isin(soup.faces[owner], soup.faces[f]).any():
-                ends.setdefault((min(owner, f), max(owner, f)), []).append(where)
-    return float(sum(np.linalg.norm(pair[0] - pair[1]) for pair in ends.values() if len(pair) == 2))
-
-
 def on_segments(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Place along segments that is closest to points, 0 to 1."""
     along = b - a
@@ -115,10 +103,3 @@ def between_edges(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) ->
     det = uu * vv - uv * uv
     det = np.where(det > 1e-10 * uu * vv, det, np.nan)
     return (uv * wv - vv * wu) / det, (uu * wv - uv * wu) / det
-
-
-def beside(soup: Soup) -> np.ndarray:
-    """Which vertices are the same or joined by an edge, shape (V, V)."""
-    out = np.eye(len(soup.x), dtype=bool)
-    out[soup.edges[:, 0], soup.edges[:, 1]] = out[soup.edges[:, 1], soup.edges[:, 0]] = True
-    return out

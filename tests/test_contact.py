@@ -10,6 +10,7 @@ import pytest
 import torch
 from bodies import Soup, ball, box, distances, flipped, together, tube
 from cloth import FABRIC, sheet
+from folds import frame_with, named, refiner_with, square
 from sheets import level_of
 from touching import frame, measured, mesh_pose, refiner
 
@@ -117,13 +118,17 @@ class TestRest:
             assert (above[:, 1] > height).all()
         assert distances(soup, points).min() > 2e-4
 
-    def test_energy_falls_in_every_round(self):
-        soup, height = MESHES["ball"]
-        state = refiner((MESH, REST)).solve(frame(draped(height), mesh_pose(soup)))
-        levels = state.telemetry[0]["levels"]
-        assert isinstance(levels, list)
-        assert len(levels) > 3
-        assert all(entry["energy_after"] <= entry["energy_before"] for entry in levels)
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    def test_a_sheet_over_a_block_is_lifted_over_its_corners(self, level: int):
+        """Through the upsampled input the block's corners and edges come in dozens of places."""
+        cloth = square(8)
+        cage = cloth[1] + np.array([0.004, 0.102, 0.003])
+        cage[:, 1] -= 0.8 * (np.abs(cage[:, [0, 2]] - [0.004, 0.003]).max(axis=1).clip(0.1) - 0.1)
+        state = refiner_with([named(cloth)], ["mesh"], level=level).solve(frame_with([cage], box((0.22, 0.2, 0.22))))
+        told = next(iter(state.telemetry[0]["contact"]["bodies"].values()))
+        assert told["before"]["crossings"] > 10
+        assert told["after"]["inside"] == 0
+        assert told["after"]["crossings"] == 0
 
     def test_the_offset_is_kept(self):
         """Under its own weight alone the sheet sinks into the 2 mm by less than a tenth."""
@@ -211,12 +216,6 @@ class TestLeftOut:
         alone = refiner((MESH, REST), felt=()).solve(frame(draped(0.0)))
         state = refiner((MESH, REST)).solve(frame(draped(0.0), None))
         np.testing.assert_array_equal(alone.points[0], state.points[0])
-
-
-def test_the_same_frame_twice_is_the_same_to_the_bit():
-    soup, height = MESHES["two"]
-    made = [refiner((MESH, REST)).solve(frame(draped(height), mesh_pose(soup))).points[0] for _ in range(2)]
-    np.testing.assert_array_equal(made[0], made[1])
 
 
 def test_stiffer_cloth_is_pushed_harder():

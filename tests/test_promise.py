@@ -10,7 +10,6 @@ from folds import EDGE, levels_of, named, promise_of, square
 from physgraph_usd.solver.collide.near import weights
 from physgraph_usd.solver.collide.sweep import Pairs
 from physgraph_usd.solver.contact.along import COMES, along
-from physgraph_usd.solver.contact.carry import carried
 from physgraph_usd.solver.level import Placed
 
 GAP = 0.2 * EDGE
@@ -43,21 +42,6 @@ class TestLayersThatMoveTogether:
         c, s = np.cos(1.0), np.sin(1.0)
         wanted = x @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=x.dtype)
         assert torch.allclose(promise_of(levels, garments).move(Placed(x), wanted), wanted, atol=1e-9)
-
-
-class TestCarried:
-    def test_one_way_is_carried_as_it_is(self):
-        x = torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        way = torch.tensor([[1.0, -2.0, 3.0]], dtype=torch.float64).expand(500, 3)
-        assert torch.allclose(carried(x, way, width=0.2), way)
-
-    def test_what_lies_together_is_carried_together(self):
-        x = torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        both = torch.cat([x, x + 1e-6])
-        way = torch.randn(1000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-        out = carried(both, way, width=0.2)
-        assert float((out[:500] - out[500:]).abs().max()) < 1e-4
-        assert float(out.norm(dim=1).max()) <= float(way.norm(dim=1).max())
 
 
 class TestAlong:

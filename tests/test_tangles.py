@@ -1,22 +1,17 @@
-"""Tangles: what hangs together of what crosses, the way out of it, and that no move makes more of it."""
+"""Moves of cloth that crosses: whatever is wanted, no move makes more crossings."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
-from brute import Soup, contour_length, crossings
-from energies import evaluate
-from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
+from brute import Soup, crossings
+from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip
 
 from physgraph_usd.solver.collide.crossings import Crossings
 from physgraph_usd.solver.collide.crossings import crossings as crossings_of
 from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
 from physgraph_usd.solver.contact.promise import Promise
-from physgraph_usd.solver.contact.tangles import Tangles, gaps_out, ways_out
-from physgraph_usd.solver.forces.self_contact import SelfContact
 from physgraph_usd.solver.level import Level, Placed
 
 BOTH = np.ones((2, 2), bool)
@@ -64,100 +59,6 @@ def found_in(level: Level, x: torch.Tensor) -> tuple[ClothMesh, Crossings]:
     found = crossings_of(mesh.parts, x)
     assert found.count > 5
     return mesh, found
-
-
-class TestWaysOut:
-    @pytest.mark.parametrize("name", UPPER)
-    def test_the_place_is_where_edge_and_face_meet(self, name: str):
-        level, x = pair(name)
-        mesh, found = found_in(level, x)
-        _, place = ways_out(mesh, found, x)
-        ends, face = level.edges.long()[found.edge], mesh.triangles[found.face]
-        on_edge = (1 - place[:, :1]) * x[ends[:, 0]] + place[:, :1] * x[ends[:, 1]]
-        on_face = (place[:, 1:].unsqueeze(2) * x[face]).sum(dim=1)
-        torch.testing.assert_close(on_edge, on_face, atol=1e-9, rtol=0)
-
-    @pytest.mark.parametrize("name", ["dented", "cornered", "on edge"])
-    def test_moved_along_it_the_contour_is_shorter(self, name: str):
-        """Edges by the ways and faces against them, weighed as the springs weigh them."""
-        level, x = pair(name)
-        mesh, found = found_in(level, x)
-        lengths = [contour_length(Soup.of(level, x))]
-        for _ in range(5):
-            _, force = evaluate(SelfContact(level, gaps_out(mesh, found, x, step=0.01, stiffness=1.0)), x)
-            x = x + 0.04 * EDGE * force / force.norm(dim=1).max()
-            lengths.append(contour_length(Soup.of(level, x)))
-        assert all(after < before for before, after in pairwise(lengths)), lengths
-        assert lengths[-1] < 0.97 * lengths[0]
-
-    @pytest.mark.parametrize("name", ["dented", "cornered", "on edge"])
-    def test_a_garment_moved_as_a_whole_along_their_sum_comes_out(self, name: str):
-        level, x = pair(name)
-        mesh, found = found_in(level, x)
-        way, _ = ways_out(mesh, found, x)
-        second = level.vertex_garment[level.edges.long()[found.edge, 0]] == 1
-        total = torch.where(second.unsqueeze(1), way, -way).sum(dim=0)
-        before = contour_length(Soup.of(level, x))
-        x[level.vertex_garment == 1] += 0.05 * EDGE * total / total.norm()
-        assert contour_length(Soup.of(level, x)) < before
-
-    def test_its_length_is_the_contours_derivative(self):
-        """A corner through a plane: the contour grows by G . d when all that is above moves by d."""
-        level, x = pair("cornered")
-        mesh, found = found_in(level, x)
-        way, _ = ways_out(mesh, found, x)
-        second = level.vertex_garment[level.edges.long()[found.edge, 0]] == 1
-        clipped = way.norm(dim=1) > 0.999
-        total = torch.where(second.unsqueeze(1), way, -way).sum(dim=0)
-        slope = torch.zeros(3, dtype=x.dtype)
-        for axis in range(3):
-            sides = []
-            for step in (1e-5, -1e-5):
-                moved = x.clone()
-                moved[level.vertex_garment == 1, axis] += step
-                sides.append(contour_length(Soup.of(level, moved)))
-            slope[axis] = (sides[0] - sides[1]) / 2e-5
-        assert float(torch.nn.functional.cosine_similarity(-total, slope, dim=0)) > (0.7 if clipped.any() else 0.99)
-
-    def test_a_straight_contour_from_rim_to_rim_has_no_way_out(self):
-        """Moved across the other sheet it stays as long: at the cage the piece that is cut off goes back."""
-        level, x = pair("tilted")
-        mesh, found = found_in(level, x)
-        way, _ = ways_out(mesh, found, x)
-        ends = level.edges.long()[found.edge]
-        inner = (x[ends].abs() < 0.08).all(dim=2).all(dim=1)
-        assert float(way[inner].norm(dim=1).max()) < 0.35
-
-
-class TestTangles:
-    """Two pairs of sheets, far apart, each pair crossing in one corner."""
-
-    def scene(self, rings: int) -> tuple[Level, torch.Tensor, Tangles, Crossings, ClothMesh]:
-        garments = [named(square(4), name) for name in "ABCD"]
-        level = levels_of(*garments, dtype=torch.float64)[-1]
-        x = pair("cornered")[1]
-        x = torch.cat([x, x + torch.tensor([1.0, 0.0, 0.0], dtype=x.dtype)])
-        mesh = ClothMesh(level, np.ones((4, 4), bool), np.zeros((0, 2), np.int64))
-        found = crossings_of(mesh.parts, x)
-        return level, x, Tangles.find(mesh, mesh.corners_of(found), rings=rings), found, mesh
-
-    @pytest.mark.parametrize("rings", [0, 1, 2])
-    def test_what_hangs_together_or_crosses_is_one(self, rings: int):
-        level, _, tangles, found, mesh = self.scene(rings)
-        assert len(tangles.before) == 2
-        first = level.vertex_garment < 2
-        inside = tangles.label >= 0
-        assert len(tangles.label[inside & first].unique()) == len(tangles.label[inside & ~first].unique()) == 1
-        assert torch.equal(inside, mesh.grown(mesh.crossed(found), rings))
-
-    def test_each_is_counted_alone(self):
-        level, _, tangles, found, mesh = self.scene(1)
-        assert tangles.before.tolist() == [found.count // 2] * 2
-        assert not tangles.worse(found).any()
-        first = (level.vertex_garment[mesh.corners_of(found)[:, 0]] < 2).nonzero().squeeze(1)
-        twice = Crossings(*(torch.cat([each, each[first]]) for each in (found.edge, found.face)))
-        worse = tangles.worse(twice)
-        assert torch.equal(worse, (tangles.label >= 0) & (level.vertex_garment < 2))
 
 
 def crossed_strip(name: str) -> tuple[Level, Promise, torch.Tensor]:
@@ -241,19 +142,3 @@ class TestMoves:
         assert after[0, 1] <= before[0, 1]
         assert after[2, 3] == asked[2, 3] < before[2, 3]
         assert torch.equal(x[number >= 2], wanted[number >= 2])
-
-
-class TestRemembered:
-    def test_a_view_looks_again_where_its_tensor_was_written_to(self):
-        garments = [named(square(4))]
-        levels = levels_of(*garments)
-        view = view_of(levels, garments)
-        x = placed(levels[-1], SHAPES["crumpled more"])
-        first = view.crossings(x)
-        assert view.crossings(x) is first
-        x[:] = levels[-1].rest
-        assert first.count > 0
-        assert view.crossings(x).count == 0
-        view.remember(x)
-        x[:] = placed(levels[-1], SHAPES["crumpled more"])
-        assert view.crossings(x).count == first.count
