@@ -27,8 +27,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.write.chunk import read_chunk
-from physgraph_usd.usd.write.stitch import mean_edge, points_at
+from physgraph_usd.usd.write.chunk import mean_edge, points_at, read_chunk
 
 CASES: tuple[tuple[str, int, dict[str, Any]], ...] = (("sleeve", 1, {}), ("swatch", 1, {}), ("flag", 1, {}))
 MORE = (

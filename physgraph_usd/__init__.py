@@ -27,10 +27,10 @@ if TYPE_CHECKING:
         StageError,
         UsageError,
     )
-    from .shot.joined import stitch
     from .shot.options import RefineOptions
     from .shot.refine import inspect_shot, refine_shot, refine_shots, refine_stage
     from .shot.report import RefineReport
+    from .shot.stitch import stitch
     from .solver.fabric import PRESETS, Fabric
     from .usd.check.validate import validate_layer
     from .usd.read.reader import Shot, open_shot
@@ -79,7 +79,7 @@ _ROOMS = {
     "shot.refine": ("inspect_shot", "refine_shot", "refine_shots", "refine_stage"),
     "usd.read.reader": ("Shot", "open_shot"),
     "usd.schema": ("schema_path",),
-    "shot.joined": ("stitch",),
+    "shot.stitch": ("stitch",),
     "usd.write.tag": ("tag",),
     "usd.check.validate": ("validate_layer",),
 }

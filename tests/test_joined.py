@@ -12,10 +12,9 @@ import pytest
 from shots import cloth_shot
 
 from physgraph_usd.shot.frames import Lead, Outcome
-from physgraph_usd.shot.joined import Looking, joined
+from physgraph_usd.shot.joined import SafeMover, joined
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.write.seams import between
 
 
 def outcome(time: float, height: float, *, kept: bool = False) -> Outcome:
@@ -39,8 +38,8 @@ class Passing:
     def __init__(self, why: str = "") -> None:
         self.why = why
 
-    def __call__(self, _: object, pairs: Any, weight: float) -> tuple[list[np.ndarray | None], str]:
-        return [a + weight * (b - a) for a, b in pairs], self.why
+    def __call__(self, time: object, near: Any, far: Any, wanted: Any) -> tuple[list[np.ndarray | None], str]:
+        return wanted, self.why
 
 
 def heights(found: list[Outcome]) -> list[float]:
@@ -83,7 +82,7 @@ def test_a_frame_that_failed_on_one_side_is_taken_as_it_is():
 def test_folds_that_change_sides_stop_before_they_cross(tmp_path: Path):
     """Half way between a half that lies over the other one, and under it, they would pass through each other."""
     with closing(open_shot(str(cloth_shot(tmp_path / "shot.usdc", times=(1.0,), size=(4, 3))))) as opened:
-        look = Looking(opened, RefineOptions(), [0])
+        move = SafeMover(opened, RefineOptions(), [0])
         flat = opened.frame(1.0).garments[0].points * [1.0, 1.0, 0.0]
         middle = flat.mean(axis=0)
         turned = np.flatnonzero(flat[:, 0] > middle[0] + 0.01)
@@ -94,12 +93,12 @@ def test_folds_that_change_sides_stop_before_they_cross(tmp_path: Path):
             points[turned, 2] = height + 0.2 * (flat[turned, 1] - middle[1])
             return points
 
-        for weight in (0.49, 0.51):
-            (points,), why = look(1.0, [(folded(0.02), folded(-0.02))], weight)
+        for near, far, wanted in ((0.02, -0.02, 0.0004), (-0.02, 0.02, -0.0004)):
+            (points,), why = move(1.0, [folded(near)], [folded(far)], [folded(wanted)])
             assert why == ""
             assert points is not None
-            assert np.abs(points - between(folded(0.02), folded(-0.02), weight)).max() > 0.001
-        (points,), why = look(1.0, [(folded(0.02), folded(0.03))], 0.5)
+            assert np.abs(points - folded(wanted)).max() > 0.001
+        (points,), why = move(1.0, [folded(0.02)], [folded(0.03)], [folded(0.025)])
         assert why == ""
         assert points is not None
         assert np.allclose(points, folded(0.025), atol=1e-6)

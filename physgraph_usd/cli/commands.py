@@ -52,15 +52,15 @@ def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, sea
 
     A folder stands for all layers in it. How far each seam moves goes to stderr.
     """
-    from ..shot import joined
+    from ..shot import stitch as chunk
 
     if check_seams:
-        for seam in joined.check_seams(chunks, seam_bound=seam_bound):
+        for seam in chunk.check_seams(chunks, seam_bound=seam_bound):
             click.echo(seam, err=True)
         return
     if out is None:
         raise UsageError("give a layer to write by -o, or --check-seams")
-    for seam in joined.stitch(chunks, out, seam_bound=seam_bound, **options):
+    for seam in chunk.stitch(chunks, out, seam_bound=seam_bound, **options):
         click.echo(seam, err=True)
     click.echo(out)
 

@@ -80,7 +80,7 @@ def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -
     """Say how far the seams of chunks to those beside them move, and fail where one moves too far."""
     if bound is None:
         return
-    from ..shot.joined import check_seams
+    from ..shot.stitch import check_seams
 
     for layer in filter(Path.exists, layers):
         for seam in check_seams([layer.parent], of=layer, seam_bound=bound):

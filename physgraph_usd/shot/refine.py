@@ -33,7 +33,7 @@ from .describe import begin_report, describe, describe_meshes, say_what_was, too
 from .farm import connected, shots_at_once
 from .finished import Job, check_jobs, finished, in_order, made_from, may_be_done, skipped, taken_as_done
 from .frames import FrameFolder, Outcome, frames_folder, kept_for
-from .joined import Looking, joined
+from .joined import SafeMover, joined
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .processes import call_each, memory_is_named
@@ -469,11 +469,11 @@ def _solved(
     """Frames in order, those of an interrupted run among them, joined where several processes solved them."""
     preroll = _preroll(options)
     report.warn(*_resumed(frames, len(times), preroll))
-    look = Looking(opened, options, solver.levels)
+    mover = SafeMover(opened, options, solver.levels)
     with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
         solved = solve_in_chunks(solver, times, frames, workers=options.workers, preroll=preroll, start=farm)
         with closing(solved):
-            yield from joined(solved, look, report.warn)
+            yield from joined(solved, mover, report.warn)
 
 
 def _preroll(options: RefineOptions) -> int:

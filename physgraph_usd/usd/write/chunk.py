@@ -1,4 +1,4 @@
-"""A part of a shot's frames as a layer of its own, a chunk, and what its record says so that `stitch` can join it.
+"""Chunks: parts of a shot's frames as layers of their own, which `stitch` joins.
 
 A chunk opens the whole shot, so that what all frames decide is the same in every chunk, and writes some of its frames.
 Those that it solves before them, the pre-roll, are no samples; where the cloth was in them stays in the record, for
@@ -9,18 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pxr import Sdf
 
-from ...errors import StageError
-from ..provenance import read_record
+from ...errors import LayerError, StageError
+from ..provenance import FAILED, read_record
+from ..stage import check_there
 from ..times import within
+from .track import HEAT, PREFIX
 
 CHUNK = "chunk"
 """The chunk's entry of a layer's record."""
 _TIMES, _ALL, _PREROLL = "frames", "all_frames", "preroll"
+
+Points = Mapping[str, np.ndarray]
+"""Local points by the path of the fine mesh, each of shape (V, 3), float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +37,12 @@ class Chunk:
     Attributes:
         times: Time codes that it has, or failed to solve.
         every: Time codes of the whole shot, in order.
-        preroll: Where the cloth was in the frames before them: by time code, local points by the path of the fine mesh,
-            shape (V, 3), float32.
+        preroll: Where the cloth was in the frames before them, by time code.
     """
 
     times: tuple[float, ...]
     every: tuple[float, ...]
-    preroll: Mapping[float, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    preroll: Mapping[float, Points] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """The entry for the layer's record."""
@@ -45,6 +51,95 @@ class Chunk:
             _ALL: list(self.every),
             _PREROLL: {repr(time): dict(points) for time, points in self.preroll.items()} or None,
         }
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a layer holds of one time code.
+
+    Attributes:
+        time: The time code.
+        points: Positions of the garments that have a sample there.
+        heat: Their heat maps by name, each of shape (V,), by the path of the fine mesh.
+    """
+
+    time: float
+    points: Points
+    heat: Mapping[str, Mapping[str, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkLayer:
+    """A chunk's layer, opened.
+
+    Attributes:
+        file: Where it is.
+        layer: It.
+        record: Its record.
+        chunk: Which frames it holds.
+    """
+
+    file: Path
+    layer: Sdf.Layer
+    record: Mapping[str, Any]
+    chunk: Chunk
+
+    @cached_property
+    def garments(self) -> list[str]:
+        """Paths of its fine meshes."""
+        return [str(path) for path in self.record.get("garments", ())]
+
+    @cached_property
+    def options(self) -> dict[str, Any]:
+        """Options that it was made with, arrays as lists."""
+        return {
+            name: list(value) if hasattr(value, "__len__") and not isinstance(value, str | dict) else value
+            for name, value in dict(self.record["options"]).items()
+        }
+
+    def has(self, time: float) -> bool:
+        """Whether a frame is one of its own and did not fail."""
+        failed = {float(each) for each in self.record.get(FAILED, ())}
+        return time in self.chunk.times and time not in failed
+
+    def frame(self, time: float, *, repeated: bool = False) -> Frame:
+        """The garments that have a sample at a time code.
+
+        Args:
+            time: The time code.
+            repeated: Also those whose sample there was left out because it equals the ones beside it.
+        """
+        points, heat = {}, {}
+        for path in self.garments:
+            names = [f"{path}.points", *(f"{path}.{PREFIX}{name}" for name in HEAT)]
+            if not repeated and not any(time in self._sampled[name] for name in names):
+                continue
+            found = points_at(self.layer, path, time)
+            if found is not None:
+                maps = ((name, _latest(self.layer, f"{path}.{PREFIX}{name}", time)) for name in HEAT)
+                points[path], heat[path] = found, {name: values for name, values in maps if values is not None}
+        return Frame(time, points, heat)
+
+    @cached_property
+    def _sampled(self) -> dict[str, frozenset[float]]:
+        """Time codes of the samples of points and heat maps, by property."""
+        names = [f"{path}.{name}" for path in self.garments for name in ("points", *(PREFIX + each for each in HEAT))]
+        return {name: frozenset(self.layer.ListTimeSamplesForPath(name)) for name in names}
+
+
+def open_chunk(file: Path) -> ChunkLayer:
+    """Open a chunk.
+
+    Raises:
+        StageError: The file is not there.
+        LayerError: It is no chunk.
+    """
+    check_there(file)
+    layer = Sdf.Layer.FindOrOpen(str(file))
+    chunk, record = (read_chunk(layer), read_record(layer)) if layer else (None, None)
+    if chunk is None or record is None:
+        raise LayerError(f"{file} is no chunk of a shot; refine with --preroll writes one")
+    return ChunkLayer(file, layer, record, chunk)
 
 
 def chunk_of(every: Sequence[float], frames: tuple[float, float] | None) -> Chunk:
@@ -59,23 +154,67 @@ def chunk_of(every: Sequence[float], frames: tuple[float, float] | None) -> Chun
     """
     times = within(every, frames)
     if not times and frames is not None:
-        said = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
+        message = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
         ends = f"; its {len(every)} samples run from {every[0]:g} to {every[-1]:g}" if every else ""
-        raise StageError(said + ends)
+        raise StageError(message + ends)
     return Chunk(times, tuple(every))
 
 
 def read_chunk(layer: Sdf.Layer) -> Chunk | None:
-    """What a layer's record says of it as a chunk; None where it is none."""
-    told = (read_record(layer) or {}).get(CHUNK)
-    if not isinstance(told, Mapping):
+    """A layer's record of itself as a chunk; None where it is none."""
+    entry = (read_record(layer) or {}).get(CHUNK)
+    if not isinstance(entry, Mapping):
         return None
     try:
         preroll = {
             float(time): {str(path): np.asarray(value) for path, value in dict(points).items()}
-            for time, points in dict(told.get(_PREROLL, {})).items()
+            for time, points in dict(entry.get(_PREROLL, {})).items()
         }
-        times, every = (tuple(float(time) for time in told.get(name, ())) for name in (_TIMES, _ALL))
+        times, every = (tuple(float(time) for time in entry.get(name, ())) for name in (_TIMES, _ALL))
     except (TypeError, ValueError):  # Somebody else wrote it.
         return None
     return Chunk(times, every, preroll)
+
+
+def points_at(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
+    """Points of a fine mesh in a frame, shape (V, 3); None where it has none.
+
+    A layer without velocities has only the first and the last of a run of equal samples.
+    """
+    name = f"{path}.points"
+    found, low, high = layer.GetBracketingTimeSamplesForPath(name, time)
+    if not found or (low != time and (low == high or layer.GetAttributeAtPath(f"{path}.velocities"))):
+        return None
+    value, after = (layer.QueryTimeSample(name, each) for each in (low, high))
+    if isinstance(value, Sdf.ValueBlock) or (low != time and value != after):
+        return None
+    return np.asarray(value)
+
+
+def _latest(layer: Sdf.Layer, name: str, time: float) -> np.ndarray | None:
+    """An attribute's sample at a time code, or the last before it."""
+    found, low, _ = layer.GetBracketingTimeSamplesForPath(name, time)
+    return np.asarray(layer.QueryTimeSample(name, low)) if found else None
+
+
+def mean_edge(layer: Sdf.Layer, path: str, points: np.ndarray) -> float:
+    """Mean length of the edges of a fine mesh's faces, in its own units."""
+    counts, indices = topology_of(layer, path)
+    ends = np.cumsum(counts)
+    following = np.arange(1, len(indices) + 1)
+    following[ends - 1] = ends - counts
+    return float(np.linalg.norm(points[indices[following]].astype(np.float64) - points[indices], axis=1).mean())
+
+
+def topology_of(layer: Sdf.Layer, path: str) -> tuple[np.ndarray, np.ndarray]:
+    """Corners per face, shape (F,), and vertices of the corners, shape (C,), of a fine mesh."""
+    names = ("faceVertexCounts", "faceVertexIndices")
+    counts, indices = (np.asarray(layer.GetAttributeAtPath(f"{path}.{name}").default) for name in names)
+    return counts, indices
+
+
+def vertex_count(layer: Sdf.Layer, path: str) -> int:
+    """Number of a fine mesh's vertices."""
+    name = f"{path}.points"
+    times = layer.ListTimeSamplesForPath(name)
+    return len(layer.QueryTimeSample(name, times[0]) if times else layer.GetAttributeAtPath(name).default)

@@ -82,24 +82,28 @@ class PointTrack:
             place = f"<{self._paths['points'].GetPrimPath()}>" + at_time(time)
             raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {self._count} vertices")
 
-    def write(self, time: float | None, world: np.ndarray, to_metres: np.ndarray, *, changed: bool = True) -> None:
+    def write(
+        self, time: float | None, points: np.ndarray, to_metres: np.ndarray | None, *, changed: bool = True
+    ) -> None:
         """Write one time code.
 
         Args:
             time: Time code, or None for the default of a shot without samples.
-            world: Fine points [m], world space, shape (V, 3).
-            to_metres: Local space to world metres, shape (4, 4), for column vectors.
+            points: Fine points [m], world space, shape (V, 3).
+            to_metres: Local space to world metres, shape (4, 4), for column vectors; None where the points are local
+                ones, float32.
             changed: False when the world points are known to equal the last ones.
 
         Raises:
             LayerError: The points are not finite, or the matrix cannot be inverted.
         """
-        same_matrix = self._matrix is not None and np.array_equal(self._matrix, to_metres)
+        same_matrix = self._matrix is not None and to_metres is not None and np.array_equal(self._matrix, to_metres)
         if not changed and same_matrix and self._last is not None and time is not None:
             self._repeat(_Sample(time, self._last.points))
             return
         self._matrix = to_metres
-        points = to_local(world, to_metres, str(self._paths["points"].GetPrimPath()), time)
+        if to_metres is not None:
+            points = to_local(points, to_metres, str(self._paths["points"].GetPrimPath()), time)
         if not self._has_default:
             self._author(None, points if self._rest is None else self._rest)
             self._has_default, self._rest = True, None
