@@ -19,6 +19,7 @@ from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageEr
 from physgraph_usd.shot.stitch import SEAM_BOUND, check_seams, stitch
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record
+from physgraph_usd.usd.stage import paths_in
 from physgraph_usd.usd.write.chunk import read_chunk
 
 TIMES = tuple(float(time) for time in range(1, 49))
@@ -259,15 +260,15 @@ def odd_shot(tmp_path: Path) -> Path:
 
 def authored(file: Path) -> dict[str, object]:
     """Default and samples of each attribute, by its path."""
-    layer, found = Sdf.Layer.FindOrOpen(str(file)), {}
-
-    def add(path: Sdf.Path) -> None:
-        if path.IsPropertyPath() and (attribute := layer.GetAttributeAtPath(path)):
-            times = layer.ListTimeSamplesForPath(path)
-            found[str(path)] = attribute.default, [(time, layer.QueryTimeSample(path, time)) for time in times]
-
-    layer.Traverse(Sdf.Path.absoluteRootPath, add)
-    return found
+    layer = Sdf.Layer.FindOrOpen(str(file))
+    return {
+        str(path): (
+            attribute.default,
+            [(time, layer.QueryTimeSample(path, time)) for time in layer.ListTimeSamplesForPath(path)],
+        )
+        for path in paths_in(layer)
+        if path.IsPropertyPath() and (attribute := layer.GetAttributeAtPath(path))
+    }
 
 
 @pytest.mark.parametrize("velocities", [True, False])
