@@ -70,6 +70,23 @@ class Garment:
     layer: int | None = None
     apart_from: tuple[str, ...] = ()
 
+    @staticmethod
+    def of(
+        path: str, faces: np.ndarray, rest: np.ndarray, *, level: int = 2, colliders: tuple[int, ...] = ()
+    ) -> Garment:
+        """A garment without paint or pins, its hinges flat at rest.
+
+        Args:
+            path: Its name.
+            faces: Corner vertices of triangles or quads, counter-clockwise seen from outside, shape (F, 3) or (F, 4).
+            rest: Rest positions of the cage [m], shape (V, 3).
+            level: Number of subdivisions.
+            colliders: Numbers of the scene's colliders that it feels.
+        """
+        one, corners = np.ones(len(rest)), np.asarray(faces)
+        mesh = PolygonMesh(np.full(len(corners), corners.shape[1]), corners.ravel(), len(rest))
+        return Garment(path, mesh, np.asarray(rest, float), level, False, False, one, one, one, one, 0 * one, colliders)
+
 
 @dataclass(frozen=True, eq=False)
 class GarmentFrame:
@@ -118,7 +135,7 @@ class Scene:
 
     garments: tuple[Garment, ...]
     gravity: np.ndarray
-    times: tuple[float, ...]
+    times: tuple[float, ...] = ()
     colliders: tuple[Collider, ...] = ()
 
 
