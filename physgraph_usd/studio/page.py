@@ -94,7 +94,7 @@ class TunePage:
         self._command = gui.add_html("")
 
     def _build_view(self) -> None:
-        """Garment, frame, and what is drawn."""
+        """Controls of garment, frame and picture."""
         gui, session = self._server.gui, self._session
         if len(session.garments) > 1:
             choice = gui.add_dropdown("Garment", session.garments, initial_value=self._garment)
@@ -160,7 +160,7 @@ class TunePage:
             session.set_preset(self._garment, self._preset.value)
 
     def _write_value(self, tunable: Tunable, text: Any, slider: Any) -> None:
-        """Write what a value is, and put its slider there, if given."""
+        """Write a value, and put its slider there unless that is None."""
         value = self._session.value(self._garment, tunable.name)
         text.content = _row(tunable.label, tunable.text(value))
         if slider is not None:

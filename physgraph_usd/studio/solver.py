@@ -25,7 +25,7 @@ class FrameSolver:
     """Solves frames of a shot at fixed levels.
 
     While values move, the finest level is solved from the cloth's present shape: quick, but the result depends on the
-    way there. At rest a frame is solved as ``refine`` does: cold, or from the frame before it where that was.
+    path there. At rest a frame is solved as ``refine`` does: cold, or from the frame before it where that was.
 
     Attributes:
         run: Time codes that have been solved in a row as ``refine`` does, up to now; empty after a quick solve.

@@ -97,7 +97,7 @@ class ChartOptions:
     progress: Callable[[float, float, str], None] | None = field(default=None, compare=False)
 
     def check(self) -> None:
-        """Refuse what no chart could be made with.
+        """Refuse options that no chart can be made with.
 
         Raises:
             UsageError: An option is wrong.
@@ -159,9 +159,9 @@ def make_plan(
         size: What is wanted.
         curves: Number of methods.
         default_ms: Time of a frame by refine's default, as the chart counts it [ms].
-        elapsed_ms: Wall time of the same and of what goes with it [ms].
+        elapsed_ms: Wall time of such a frame and of all that goes with it [ms].
         judge_ms: Time of judging a result [ms].
-        least_ms: Wall time of a solve of a single step: what no fewer steps save [ms].
+        least_ms: Wall time of a solve of a single step, which fewer steps do not save [ms].
     """
     frames, reach, repeats, growth = size.frames, size.reach, size.repeats, size.growth
 

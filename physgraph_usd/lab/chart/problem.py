@@ -251,7 +251,7 @@ def with_garments(frame: Frame, change: Callable[[Any], Any]) -> Frame:
 
 
 def _waited() -> float | None:
-    """Milliseconds that this process's threads have been ready to run and had no core; Linux alone tells."""
+    """Milliseconds that this process's threads have been ready to run and had no core; None but on Linux."""
     tasks = Path("/proc/self/task")
     if not tasks.is_dir():
         return None

@@ -33,7 +33,7 @@ STARTS = (
     ("quasi-newton", 3),
     ("quasi-newton", 96),
 )
-"""Integrators and steps: unlike one another, and what found the least first, for a short search ends early."""
+"""Integrators and steps: unlike one another, the most successful first, for a short search ends early."""
 SHORT, LEAST = 3, 2
 """How many of them a short search takes, and one whose time is out: with one alone nobody knows how good it is."""
 ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10

@@ -86,7 +86,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
 
 
 def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
-    """Refuse to write over what the shot is made of, and over a chart whose rows are gone."""
+    """Refuse to write over the shot's files, and over a chart whose rows are gone."""
     files = [folder / name for name in (*WRITTEN, JOURNAL)]
     check_targets([("the chart", file) for file in files], files_of(shot))
     there = next((file for file in files if file.exists()), None)
@@ -97,7 +97,7 @@ def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
 
 
 def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
-    """Measure what is not yet in the folder."""
+    """Measure all that is not yet in the folder."""
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
     levels = tuple(choice.level for choice in choose_levels(opened.scene, sample_frames(opened.scene, opened.frame)))

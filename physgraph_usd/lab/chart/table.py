@@ -59,7 +59,7 @@ class Point:
         tangles: Edges of cloth through faces of cloth, summed over the frames.
         frames: Number of frames.
         repeats: Number of times that the time was taken.
-        note: What a solver outside was given of the problem, "" for ours.
+        note: How much of the problem a solver outside was given, "" for ours.
         apart_mm: RMS distance from the reference's positions [mm], mean over the frames; None where they are not known.
     """
 

@@ -24,7 +24,7 @@ from .table import typical
 
 REPEATS = 5
 RUN = 8
-"""Frames in a row on which what frames owe to one another is measured."""
+"""Frames in a row on which the effect of one frame on the next is measured."""
 Points = tuple[np.ndarray, ...]
 """Fine world positions [m] of each garment, shape (V, 3)."""
 

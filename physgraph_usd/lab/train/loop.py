@@ -99,8 +99,8 @@ class Trainer:
         curve: Measurements on the way.
     """
 
-    def __init__(self, config: TrainConfig, *, device: str = "cpu", like: Trainer | None = None) -> None:
-        """Make patches and an untrained network; ``like`` is a finished run whose patches are taken over if alike."""
+    def __init__(self, config: TrainConfig, *, device: str = "cpu") -> None:
+        """Make patches and an untrained network on "cpu" or a CUDA device."""
         self.config, self.device = config, device
         torch.manual_seed(config.seed)
         self.network = make_network(config.network).to(device)
@@ -108,9 +108,8 @@ class Trainer:
             self.network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
         )
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
-        shared = like is not None and (like.config.patches, like.config.seed) == (config.patches, config.seed)
-        self.patches = like.patches if like and shared else _made(config.patches, config.seed)
-        self._held_out = like._held_out if like and shared else None
+        self.patches = _made(config.patches, config.seed)
+        self._held_out: list[Patch] | None = None
         self._bundles = [
             Bundle(batch, device=device, through_forces=config.through_forces)
             for batch in deal(self.patches, config.batch)
@@ -218,8 +217,7 @@ class Trainer:
     def held_out_ratios(self) -> dict[str, float]:
         """Gap over that of quasi-Newton at the same steps, geometric mean over held-out patches."""
         if self._held_out is None:
-            config = replace(self.config.patches, count=self.config.held_out)
-            self._held_out = _made(config, 10_000 + self.config.seed)
+            self._held_out = _made(replace(self.config.patches, count=self.config.held_out), 10_000 + self.config.seed)
         ours = integrator_of(self.averaged().to("cpu"))
         table = {}
         for schedule in SCHEDULES:
@@ -317,9 +315,7 @@ def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> fl
         for index, count in enumerate(counts):
             level, system = patch.group.levels[index], patch.systems[index]
             x = x if level.from_below is None else level.from_below.apply(x)
-            carry = integrator.start(system, x)
-            for _ in range(count):
-                carry = integrator.step(system, carry)
+            carry = unrolled(integrator, system, integrator.start(system, x), count)
             x, energy = carry.x, carry.energy
     gap = (energy - patch.least[-1]) / (patch.start[-1] - patch.least[-1])
     return gap if math.isfinite(gap) else 1e6

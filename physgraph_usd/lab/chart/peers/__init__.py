@@ -1,1 +1,1 @@
-"""Solvers that nobody here wrote, given the same problem: each by an adapter that runs in an environment of its own."""
+"""Foreign solvers of the same problem, each behind an adapter that runs in its own environment."""

@@ -6,7 +6,7 @@ It minimises an energy of its own, on the finest level alone: edges as springs w
 vertices, forces on the angles between faces, and a goal spring at each vertex where our guide ties averages. A step is
 a frame. Blender's units are no SI units, and forces have a scale of their own:
 
-| Blender | what it does | here |
+| Blender | its effect | here |
 |---|---|---|
 | time | frames; gravity times a thousandth | gravity is what makes ours from the mass |
 | tension, compression, pin stiffness | divided by the mean spring | times that length |
@@ -46,16 +46,16 @@ TIP = 30.0
 
 
 class Finest:
-    """The finest level: what was handed over, and what comes of it."""
+    """The finest level: the arrays that were handed over, and values made of them."""
 
     def __init__(self, problem: Any) -> None:
         """Take it from a problem."""
         self._problem, self._last = problem, int(problem["levels"]) - 1
-        self.base, self.rest, self.edges, self.free = (self.own(name) for name in ("base", "rest", "edges", "free"))
+        self.base, self.rest, self.edges, self.free = (self.array(name) for name in ("base", "rest", "edges", "free"))
         self.length = float(np.linalg.norm(self.sides(self.edges), axis=1).mean())
-        self.scale = DRAG / (PROXIMITY * float(self.own("diagonal").mean()))
+        self.scale = DRAG / (PROXIMITY * float(self.array("diagonal").mean()))
 
-    def own(self, name: str) -> np.ndarray:
+    def array(self, name: str) -> np.ndarray:
         """An array of this level."""
         return self._problem[f"{name}{self._last}"]
 
@@ -65,24 +65,24 @@ class Finest:
 
     def guide(self) -> np.ndarray:
         """Goal springs that cost what the guide costs where all vertices near move alike [N/m]."""
-        rows = np.repeat(np.arange(len(self.base)), np.diff(self.own("starts")))
-        return np.bincount(rows, self.own("values"), len(self.base))
+        rows = np.repeat(np.arange(len(self.base)), np.diff(self.array("starts")))
+        return np.bincount(rows, self.array("values"), len(self.base))
 
     def bending(self) -> np.ndarray:
         """Blender's stiffness at each hinge for our moment: the mean of the two tips."""
-        i, j, k, ell = self.own("hinges").T
+        i, j, k, ell = self.array("hinges").T
         axis = self.sides(np.stack([i, j], axis=1))
         length = np.linalg.norm(axis, axis=1)
         areas = [np.linalg.norm(np.cross(axis, self.rest[tip] - self.rest[i]), axis=1) for tip in (k, ell)]
         height = np.maximum(0.5 * (areas[0] + areas[1]) / length, 1e-3 * length)
-        return TIP * self.own("hinge") / (height * length)
+        return TIP * self.array("hinge") / (height * length)
 
 
 def build(level: Finest) -> Any:
     """The level as an object of Blender with a cloth modifier."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh = bpy.data.meshes.new("cloth")
-    mesh.from_pydata(level.base.tolist(), [], level.own("triangles").tolist())
+    mesh.from_pydata(level.base.tolist(), [], level.array("triangles").tolist())
     thing = bpy.data.objects.new("cloth", mesh)
     bpy.context.scene.collection.objects.link(thing)
     thing.shape_key_add(name="Basis")
@@ -103,15 +103,15 @@ def set_up(thing: Any, settings: Any, level: Finest) -> None:
     """Our values in Blender's units."""
     scale, mass = level.scale, INERTIA * DRAG
     settings.quality, settings.time_scale, settings.air_damping, settings.mass = 1, 1.0, AIR, mass
-    load = level.own("load")
+    load = level.array("load")
     down, weight = load.sum(axis=0), float(np.linalg.norm(load, axis=1).mean())
     unit = down / max(float(np.linalg.norm(down)), 1e-30)
     bpy.context.scene.gravity = (scale * weight / (THOUSANDTH * mass) * unit).tolist()
-    least, most = paint(thing, "springs", level.edges, level.own("spring") * level.length * scale)
+    least, most = paint(thing, "springs", level.edges, level.array("spring") * level.length * scale)
     settings.tension_stiffness = settings.compression_stiffness = least
     settings.tension_stiffness_max = settings.compression_stiffness_max = most
     settings.vertex_group_structural_stiffness = "springs"
-    least, most = paint(thing, "hinges", level.own("hinges")[:, :2], level.bending() * scale)
+    least, most = paint(thing, "hinges", level.array("hinges")[:, :2], level.bending() * scale)
     settings.bending_model, settings.bending_stiffness, settings.bending_stiffness_max = "ANGULAR", least, most
     settings.vertex_group_bending = "hinges"
     settings.shear_stiffness = settings.shear_damping = settings.goal_friction = 0.0
@@ -123,7 +123,7 @@ def set_up(thing: Any, settings: Any, level: Finest) -> None:
 
 
 def paint(thing: Any, name: str, ends: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Paint means of values at their ends on the vertices; returns what weights of 0 and 1 stand for."""
+    """Paint means of values at their ends on the vertices; returns the values of weights 0 and 1."""
     count = len(thing.data.vertices)
     shares = np.bincount(ends.ravel(), minlength=count)
     means = np.bincount(ends.ravel(), np.repeat(values, 2), count) / np.maximum(shares, 1)
@@ -172,16 +172,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--most-ms", type=float, default=1e4)
     parser.add_argument("--clock", choices=["wall", "cpu"], default="wall")
-    given = parser.parse_args()
-    clock = time.process_time if given.clock == "cpu" else time.perf_counter
-    level = Finest(np.load(given.problem))
-    budgets = [int(steps) for steps in given.steps.split(",")]
-    runs = [run(build(level), budgets, clock=clock, most_ms=given.most_ms) for _ in range(given.repeats)]
+    arguments = parser.parse_args()
+    clock = time.process_time if arguments.clock == "cpu" else time.perf_counter
+    level = Finest(np.load(arguments.problem))
+    budgets = [int(steps) for steps in arguments.steps.split(",")]
+    runs = [run(build(level), budgets, clock=clock, most_ms=arguments.most_ms) for _ in range(arguments.repeats)]
     found: dict[str, Any] = {}
     for steps in set.intersection(*(set(each) for each in runs)):
         found[f"x_0_{steps}"] = runs[-1][steps][0]
         found[f"ms_0_{steps}"] = np.array([each[steps][1] for each in runs])
-    np.savez(given.result, **found)
+    np.savez(arguments.result, **found)
 
 
 if __name__ == "__main__":

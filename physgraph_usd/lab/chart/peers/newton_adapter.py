@@ -95,32 +95,32 @@ class Level:
 def build(problem: Any, index: int, solver: str, device: str) -> Level:
     """One level as a Newton model on a device."""
 
-    def own(name: str) -> np.ndarray:
+    def array(name: str) -> np.ndarray:
         return problem[f"{name}{index}"]
 
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    base, free = own("base"), own("free")
+    base, free = array("base"), array("free")
     # In a step of one second a mass is a stiffness: as much as the guide's, so that its lag cannot swing.
-    mass = np.where(free, np.maximum(own("bound"), MASS[solver] * own("diagonal")), 0.0)
+    mass = np.where(free, np.maximum(array("bound"), MASS[solver] * array("diagonal")), 0.0)
     points, still = base.tolist(), np.zeros_like(base).tolist()
     # XPBD pushes particles apart that are nearer than their radii, by default a decimetre.
     builder.add_particles(points, still, mass.tolist(), radius=[0.0] * len(base))
-    builder.spring_indices += own("edges").ravel().tolist()
-    builder.spring_rest_length += own("rest_length").tolist()
-    builder.spring_stiffness += own("spring").tolist()
-    builder.spring_damping += [0.0] * len(own("spring"))
-    builder.spring_control += [0.0] * len(own("spring"))
-    i, j, k, ell = own("hinges").T
-    weight = own("hinge").tolist()
-    builder.add_edges(k, ell, i, j, rest=own("rest_angle").tolist(), edge_ke=weight, edge_kd=[0.0] * len(weight))
+    builder.spring_indices += array("edges").ravel().tolist()
+    builder.spring_rest_length += array("rest_length").tolist()
+    builder.spring_stiffness += array("spring").tolist()
+    builder.spring_damping += [0.0] * len(array("spring"))
+    builder.spring_control += [0.0] * len(array("spring"))
+    i, j, k, ell = array("hinges").T
+    weight = array("hinge").tolist()
+    builder.add_edges(k, ell, i, j, rest=array("rest_angle").tolist(), edge_ke=weight, edge_kd=[0.0] * len(weight))
     builder.edge_rest_length[:] = [1.0] * len(weight)
     builder.color(include_bending=True)
     model = builder.finalize(device=device)
     solvers = {"vbd": newton.solvers.SolverVBD, "xpbd": newton.solvers.SolverXPBD}
     made = solvers[solver](model, iterations=ITERATIONS)
-    pulled = [wp.array(own(name), dtype=wp.int32, device=device) for name in ("starts", "columns")]
-    pulled.append(wp.array(own("values"), dtype=wp.float32, device=device))
-    pulled += [wp.array(own(name), dtype=wp.vec3, device=device) for name in ("load", "base")]
+    pulled = [wp.array(array(name), dtype=wp.int32, device=device) for name in ("starts", "columns")]
+    pulled.append(wp.array(array("values"), dtype=wp.float32, device=device))
+    pulled += [wp.array(array(name), dtype=wp.vec3, device=device) for name in ("load", "base")]
     level = Level(made, (model.state(), model.state()), model.control(), base, pulled)
     if wp.get_device(device).is_cuda:
         level.record()
@@ -149,11 +149,11 @@ def main() -> None:
     parser.add_argument("--most-ms", type=float, default=1e4)
     parser.add_argument("--clock", choices=["wall", "cpu"], default="wall")
     parser.add_argument("--device", default="cpu")
-    given = parser.parse_args()
-    clock = time.process_time if given.clock == "cpu" else time.perf_counter
-    problem = np.load(given.problem)
+    arguments = parser.parse_args()
+    clock = time.process_time if arguments.clock == "cpu" else time.perf_counter
+    problem = np.load(arguments.problem)
     count = int(problem["levels"])
-    levels = [build(problem, index, given.solver, given.device) for index in range(count)]
+    levels = [build(problem, index, arguments.solver, arguments.device) for index in range(count)]
     maps = [sp.identity(len(levels[0].base), format="csr")]
     maps += [
         sp.csr_matrix((problem[f"map_values{i}"], problem[f"map_columns{i}"], problem[f"map_starts{i}"]))
@@ -162,16 +162,16 @@ def main() -> None:
     found: dict[str, Any] = {}
     for nested in (False, True):
         solve(levels, maps, 1, nested=nested)
-        for steps in map(int, given.steps.split(",")):
+        for steps in map(int, arguments.steps.split(",")):
             spent, x = [], levels[-1].base
-            for _ in range(given.repeats):
+            for _ in range(arguments.repeats):
                 began = clock()
                 x = solve(levels, maps, steps, nested=nested)
                 spent.append(1e3 * (clock() - began))
             found[f"x_{nested:d}_{steps}"], found[f"ms_{nested:d}_{steps}"] = x, np.array(spent)
-            if 2.0 * min(spent) > given.most_ms:
+            if 2.0 * min(spent) > arguments.most_ms:
                 break
-    np.savez(given.result, **found)
+    np.savez(arguments.result, **found)
 
 
 if __name__ == "__main__":
