@@ -134,12 +134,17 @@ def fine_points(shot: Shot, refinements: Sequence[Sequence[Refinement]], time: f
 
 def write_layer(path: Path, out: Path, *, level: int = 1, **options: object) -> Path:
     """Refine a shot linearly into a layer."""
-    shot = open_shot(str(path), level=level)
+    write_shot(open_shot(str(path), level=level), out, **options)  # type: ignore[arg-type]
+    return out
+
+
+def write_shot(shot: Shot, out: Path, *, times: Sequence[float | None] = (), **options: object) -> LayerWriter:
+    """Refine an open shot linearly into a layer, at all its times or some."""
     refinements = refine_all(shot)
     with LayerWriter(shot, refinements, out, **options) as writer:  # type: ignore[arg-type]
-        for time in shot.scene.times or (None,):
+        for time in times or shot.scene.times or (None,):
             writer.write(time, fine_points(shot, refinements, time))
-    return out
+    return writer
 
 
 def open_over(path: Path, out: Path) -> Usd.Stage:

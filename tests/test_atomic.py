@@ -225,25 +225,3 @@ def test_a_full_disk_is_a_clear_error(tmp_path: Path, suffix: str) -> None:
     assert "File too large" in done.stdout
     assert "\n" not in done.stdout
     assert names(tmp_path) == []
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="mounting a small disk needs root")
-def test_a_full_file_system_is_a_clear_error(tmp_path: Path) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)], check=False)
-    if mounted.returncode:
-        pytest.skip("this system mounts no tmpfs")
-    try:
-        with pytest.raises(LayerError, match="No space left on device"):
-            overflow(disk / "out.usdc")
-        assert names(disk) == []
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
-
-
-def overflow(target: Path) -> None:
-    """Write more than a small disk holds."""
-    with LayerStream(target) as stream:
-        fill(stream, 100, vertices=1000)
-        stream.commit()

@@ -6,13 +6,12 @@ import hashlib
 from pathlib import Path
 
 import pytest
-from layers import COAT, MIRROR, dress_up, errors, fine_points, make_shot, open_over, refine_all, write_layer
+from layers import COAT, MIRROR, dress_up, errors, make_shot, open_over, write_layer, write_shot
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.usd.provenance import file_hashes, mute_refined, read_record, refined_layers, write_root
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.write.writer import LayerWriter
 
 
 @pytest.fixture
@@ -53,9 +52,7 @@ def test_the_record_says_where_it_comes_from(dressed: Path, tmp_path: Path) -> N
     hashes = file_hashes(shot.stage, tmp_path)
     assert hashes == {"./shot.usda": hashlib.sha256(dressed.read_bytes()).hexdigest()}
     given = {"version": "1", "inputs": hashes, "numbers": (1, 2), "mixed": [1.5, 2], "none": None, "flag": True}
-    steps = refine_all(shot)
-    with LayerWriter(shot, steps, tmp_path / "out.usdc", provenance=given) as writer:
-        writer.write(1.0, fine_points(shot, steps, 1.0))
+    write_shot(shot, tmp_path / "out.usdc", times=(1.0,), provenance=given)
     record = read_record(Sdf.Layer.FindOrOpen(str(tmp_path / "out.usdc")))
     assert record is not None
     assert record["shot"] == "./shot.usda"

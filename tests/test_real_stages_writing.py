@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layers import errors, fine_points, open_over, refine_all, world_metres
+from layers import errors, fine_points, open_over, refine_all, world_metres, write_shot
 from shots import VALID
 
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.write.writer import LayerWriter
 
 
 @pytest.mark.real_data
@@ -21,9 +20,7 @@ def test_a_real_shot(real_data: Path, tmp_path: Path, name: str, mode: str) -> N
     shot = open_shot(str(path), level=1, garments=VALID[name])
     steps = refine_all(shot)
     times = [*shot.scene.times[:2], *shot.scene.times[-1:]] or [None]
-    with LayerWriter(shot, steps, out, mode=mode, velocities=True) as writer:
-        for time in times:
-            writer.write(time, fine_points(shot, steps, time))
+    writer = write_shot(shot, out, times=times, mode=mode, velocities=True)
     assert errors(out, path) == []
     stage = open_over(path, out)
     for time in times:

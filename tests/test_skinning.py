@@ -21,7 +21,6 @@ from stages import (
     skinned_points,
 )
 
-from physgraph_usd.errors import StageError
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 ROOT = "/World/rig"
@@ -132,13 +131,6 @@ def test_joint_influences_without_a_root_are_told(tmp_path: Path) -> None:
     shot = open_shot(save(stage))
     assert not shot.sources[0].skinned
     assert any("no SkelRoot" in notice.message for notice in shot.warnings)
-
-
-def test_a_rate_of_zero_is_refused_and_does_not_hang(tmp_path: Path) -> None:
-    stage = skinned_stage(tmp_path / "s.usda")
-    stage.GetRootLayer().pseudoRoot.SetInfo("timeCodesPerSecond", 0.0)
-    with pytest.raises(StageError, match="timeCodesPerSecond of the stage is 0"):
-        open_shot(save(stage))
 
 
 def test_a_skeleton_without_animation_gives_a_still(tmp_path: Path) -> None:

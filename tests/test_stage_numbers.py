@@ -17,7 +17,7 @@ from shots import CLOTH, cloth_shot
 from physgraph_usd.cli import main
 from physgraph_usd.shot.plain_json import to_json
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.usd.schema import COLLIDER, GARMENT
+from physgraph_usd.usd.schema import GARMENT
 
 NAN, INF = float("nan"), float("inf")
 SMALL = ("--level", "1", "--steps", "2")
@@ -99,7 +99,6 @@ def test_a_sublayer_without_a_rate_is_named(shot: Path):
 )
 def test_every_physical_value_has_an_upper_limit(shot: Path, row: Any):
     assert row.maximum is not None
-    assert row.soft[1] <= row.maximum
     result = run("refine", shot, "-o", shot.with_name("fine.usdc"), "--set", f"{row.short}=1e30", *SMALL)
     assert (result.exit_code, f"{row.maximum:g}]" in result.stderr) == (2, True), result.output
     stage = Usd.Stage.Open(str(shot))
@@ -107,10 +106,6 @@ def test_every_physical_value_has_an_upper_limit(shot: Path, row: Any):
     stage.Save()
     result = run("refine", shot, "-o", shot.with_name("fine.usdc"), *SMALL)
     assert (result.exit_code, f"{row.maximum:g}]" in result.stderr) == (1, True), result.output
-
-
-def test_a_collider_s_distance_has_one_too():
-    assert COLLIDER["collider:offset"].maximum == 10.0
 
 
 def test_a_gravity_of_no_planet_is_the_earth_s(shot: Path):

@@ -20,6 +20,7 @@ from layers import (
     refine_all,
     world_metres,
     write_layer,
+    write_shot,
 )
 from pxr import Usd, UsdGeom
 
@@ -140,10 +141,7 @@ def test_a_primvar_that_fits_no_mesh_is_hidden_and_named(dressed: Path, tmp_path
     stage = Usd.Stage.Open(str(dressed))
     UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT)).GetPrimvar("heat").Set([1.0, 2.0])
     stage.Save()
-    shot = open_shot(str(dressed), level=1)
-    steps = refine_all(shot)
-    with LayerWriter(shot, steps, tmp_path / "out.usdc") as writer:
-        writer.write(1.0, fine_points(shot, steps, 1.0))
+    writer = write_shot(open_shot(str(dressed), level=1), tmp_path / "out.usdc", times=(1.0,))
     assert any("primvars:heat has 2 elements; vertex needs 20" in str(notice) for notice in writer.notices)
     stage = open_over(dressed, tmp_path / "out.usdc")
     prim = stage.GetPrimAtPath(COAT)
@@ -156,8 +154,8 @@ sys.path.insert(0, "tests")
 from pathlib import Path
 from layers import fine_points, make_shot, refine_all
 from pxr import Gf, UsdGeom
-from physgraph_usd.usd.reader import open_shot
-from physgraph_usd.usd.writer import LayerWriter
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.writer import LayerWriter
 folder, frames = Path(sys.argv[1]), int(sys.argv[2])
 stage = make_shot(folder / "shot.usda", size=(158, 158), times=(0.0,))
 operation = UsdGeom.Xform(stage.GetPrimAtPath("/World/rig")).GetOrderedXformOps()[0]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ...errors import GarmentError, StageError
+from ...errors import GarmentError
 from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, Notice, timecode
 from ..times import SAME_TIME, garment_times, merge, transform_times
@@ -120,24 +120,13 @@ def find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
         for query in binding.GetSkinningTargets():
             if query.GetPrim() == prim and (query.HasJointInfluences() or query.HasBlendShapes()):
                 skeleton = cache.GetSkelQuery(binding.GetSkeleton())
-                animation = skeleton.GetAnimQuery()
-                return Skinned(
-                    path,
-                    root.GetPath(),
-                    _skeleton_times(skeleton),
-                    query,
-                    skeleton.GetPrim().GetPath(),
-                    animation.GetPrim().GetPath() if animation else None,
-                )
+                animation, times = skeleton.GetAnimQuery(), transform_times(skeleton.GetPrim())
+                if animation:
+                    times += [*animation.GetJointTransformTimeSamples(), *animation.GetBlendShapeWeightTimeSamples()]
+                moved_by = animation.GetPrim().GetPath() if animation else None
+                skeleton_path = skeleton.GetPrim().GetPath()
+                return Skinned(path, root.GetPath(), merge(times), query, skeleton_path, moved_by)
     return None
-
-
-def _skeleton_times(skeleton: UsdSkel.SkeletonQuery) -> tuple[float, ...]:
-    times = transform_times(skeleton.GetPrim())
-    animation = skeleton.GetAnimQuery()
-    if animation:
-        times += [*animation.GetJointTransformTimeSamples(), *animation.GetBlendShapeWeightTimeSamples()]
-    return merge(times)
 
 
 def _times_of(prim: Usd.Prim, found: Mapping[Sdf.Path, Skinned]) -> Sequence[float]:
@@ -154,17 +143,12 @@ def _bake(
     frames: tuple[float, float] | None,
 ) -> None:
     """Bake each skel root once, with all other skinned prims switched off meanwhile; some at further time codes."""
-    rates = {"timeCodesPerSecond": stage.GetTimeCodesPerSecond(), "framesPerSecond": stage.GetFramesPerSecond()}
-    for name, rate in rates.items():
-        if not rate > 0:  # UsdSkel steps by their ratio and would never come to an end
-            raise StageError(f"{name} is {rate:g}, so skinning cannot be baked; author a positive rate")
-    interval = (
-        Gf.Interval.GetFullInterval() if frames is None else Gf.Interval(frames[0] - SAME_TIME, frames[1] + SAME_TIME)
-    )
+    first, last = frames or (-np.inf, np.inf)
+    interval = Gf.Interval(first - SAME_TIME, last + SAME_TIME)
     keep = [skinned.path for skinned in wanted]
     roots = list(dict.fromkeys(skinned.root for skinned in wanted))
     mask = Sdf.Layer.CreateAnonymous("physgraph-mask.usda")
-    mask.timeCodesPerSecond = rates["timeCodesPerSecond"]
+    mask.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
     for path in _others(stage, roots, keep):
         Sdf.CreatePrimInLayer(mask, path).active = False
     session = stage.GetSessionLayer()
