@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gc
 import weakref
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
 from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.problem import LevelProblem, Problem
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.base import System
@@ -114,10 +117,17 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
     stiff = Fabric(10.0 * FABRIC.stretch, FABRIC.bend, FABRIC.density)
     shown = [(0.0, FABRIC), (0.1, FABRIC), (0.2, FABRIC), (0.2, stiff), (0.3, stiff)]
     frames = [[GarmentFrame(wave(rest, phase=phase), fabric, GUIDE)] for phase, fabric in shown]
+    fresh = Problem.level
+
+    def lasting(problem: Problem, index: int, **options: Any) -> LevelProblem:
+        tie = None if problem.start.detailed is None else (problem.tether, problem.start.detailed)
+        system = problem.forces[index].lasting_system(problem.aim, tie)
+        return replace(fresh(problem, index, **options), alone=system)
+
     results = []
-    for lasting in (False, True):
+    for level in (fresh, lasting):
         group = group_of(mesh, rest, level=2, dtype=torch.float32, integrator=integrator)
-        monkeypatch.setattr(group, "_systems_last", lasting)
+        monkeypatch.setattr(Problem, "level", level)
         state, points = None, []
         for frame in frames:
             solved = solve_frame(group, FrameInput(frame), state)
