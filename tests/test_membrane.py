@@ -23,7 +23,7 @@ from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
-from physgraph_usd.solver.mesh.diagonals import quad_edges
+from physgraph_usd.solver.mesh.topology import quad_edges
 from physgraph_usd.solver.scene import GarmentFrame
 
 SPRINGS, TRIANGLES = Fabric(30.0), Fabric(30.0, shear=7.0)

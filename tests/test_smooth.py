@@ -17,7 +17,6 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from test_subdivide import same_surface
 
-from physgraph_usd.solver.mesh.attributes import edge_subset
 from physgraph_usd.solver.mesh.subdivide import Refinement, smooth, subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -28,10 +27,6 @@ starts = np.concatenate([[0], np.cumsum(given["counts"])])
 faces = [given["indices"][a:b].tolist() for a, b in zip(starts[:-1], starts[1:])]
 mesh = bpy.data.meshes.new("cage")
 mesh.from_pydata(given["points"].tolist(), [], faces)
-creases = {tuple(sorted(edge)) for edge in given["creases"].tolist()}
-layer = mesh.attributes.new("crease_edge", "FLOAT", "EDGE")
-for edge in mesh.edges:
-    layer.data[edge.index].value = float(tuple(sorted(edge.vertices)) in creases)
 cage = bpy.data.objects.new("cage", mesh)
 bpy.context.scene.collection.objects.link(cage)
 modifier = cage.modifiers.new("subdivision", "SUBSURF")
@@ -44,9 +39,9 @@ np.savez(sys.argv[2], points=[list(v.co) for v in fine.vertices], faces=[list(p.
 """
 
 
-def dense(mesh: PolygonMesh, **options: np.ndarray) -> tuple[Refinement, np.ndarray]:
+def dense(mesh: PolygonMesh) -> tuple[Refinement, np.ndarray]:
     refinement = subdivide(mesh)
-    return refinement, smooth(mesh, refinement, **options).toarray()
+    return refinement, smooth(mesh, refinement).toarray()
 
 
 def umbrella(sides: int) -> PolygonMesh:
@@ -59,8 +54,7 @@ def umbrella(sides: int) -> PolygonMesh:
 def test_affine_maps_commute(mesh: PolygonMesh, seed: int):
     rng = np.random.default_rng(seed)
     points, matrix, shift = rng.normal(size=(mesh.vertex_count, 3)), rng.normal(size=(3, 3)), rng.normal(size=3)
-    creases = rng.integers(0, mesh.vertex_count, (3, 2))
-    stencil = smooth(mesh, subdivide(mesh), crease_edges=creases, corner_vertices=creases[:1, 0])
+    stencil = smooth(mesh, subdivide(mesh))
     np.testing.assert_allclose(stencil.sum(axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(stencil @ (points @ matrix + shift), (stencil @ points) @ matrix + shift, atol=1e-11)
 
@@ -154,19 +148,6 @@ def test_boundaries_are_cubic_splines_and_lone_corners_stay():
     assert stencil[12, [0, 1]].tolist() == [0.5, 0.5]
 
 
-def test_creases_corners_and_darts():
-    mesh, _ = grid(4, 4)
-    _, plain = dense(mesh)
-    _, line = dense(mesh, crease_edges=np.array([[11, 12], [13, 12], [0, 24]]))
-    assert line[12, [11, 12, 13]].tolist() == [1 / 8, 3 / 4, 1 / 8]
-    assert np.array_equal(line[11], plain[11])
-    _, three = dense(mesh, crease_edges=np.array([[11, 12], [13, 12], [12, 17]]))
-    assert three[12, 12] == 1.0
-    _, corner = dense(mesh, corner_vertices=np.array([12]))
-    assert corner[12, 12] == 1.0
-    assert np.array_equal(corner[13:25], plain[13:25])
-
-
 def test_non_manifold_places_stay():
     fin = mesh_of([[0, 1, 2], [1, 0, 3], [0, 1, 4], [0, 2, 5], [1, 6, 2]])
     refinement, stencil = dense(fin)
@@ -178,13 +159,13 @@ def test_non_manifold_places_stay():
 
 
 def blender_surface(
-    folder: Path, mesh: PolygonMesh, points: np.ndarray, *, creases: np.ndarray, levels: int
+    folder: Path, mesh: PolygonMesh, points: np.ndarray, *, levels: int
 ) -> tuple[np.ndarray, list[list[int]]]:
     """Subdivide with Blender in a process of its own."""
     python = os.environ.get("PHYSGRAPH_BPY_PYTHON")
     if not python:
         pytest.skip("PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy")
-    cage = {"counts": mesh.counts, "indices": mesh.indices, "points": points, "creases": creases, "levels": levels}
+    cage = {"counts": mesh.counts, "indices": mesh.indices, "points": points, "levels": levels}
     np.savez(folder / "cage.npz", **cage)
     (folder / "subdivide.py").write_text(BLENDER)
     command = [python, "subdivide.py", "cage.npz", "fine.npz"]
@@ -196,16 +177,15 @@ def blender_surface(
 @pytest.mark.slow
 @pytest.mark.blender
 @pytest.mark.parametrize("levels", [1, 2])
-@pytest.mark.parametrize("shape", ["cube", "prism", "grid", "creased"])
+@pytest.mark.parametrize("shape", ["cube", "prism", "grid"])
 def test_catmull_clark_matches_blenders_opensubdiv(tmp_path: Path, shape: str, levels: int):
     mesh, points = {"cube": cube, "prism": lambda: prism(5)}.get(shape, lambda: grid(5, 4))()
     points = points + np.random.default_rng(3).normal(scale=0.2, size=points.shape)
-    creases = np.array([[7, 8], [8, 9], [9, 15], [13, 19]]) if shape == "creased" else np.empty((0, 2), int)
-    theirs, faces = blender_surface(tmp_path, mesh, points, creases=creases, levels=levels)
+    theirs, faces = blender_surface(tmp_path, mesh, points, levels=levels)
     fine: sparse.csr_matrix | np.ndarray = points
     for _ in range(levels):
         refinement = subdivide(mesh)
-        fine = smooth(mesh, refinement, crease_edges=creases) @ fine
-        mesh, creases = refinement.mesh, edge_subset([refinement], creases)
+        fine = smooth(mesh, refinement) @ fine
+        mesh = refinement.mesh
     deviation = same_surface(mesh, fine, theirs, faces)
     assert deviation < 2e-6, f"Blender computes in float32; found {deviation:.2e}"

@@ -15,11 +15,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .mesh.defects import FLAT
-from .mesh.diagonals import quad_edges
 from .mesh.lengths import EdgeLengths, TriangleNormals
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, on_triangles, smooth, subdivide_times
-from .mesh.topology import TriangleSplit, edges_of, find_edges, hinges_of
+from .mesh.topology import TriangleSplit, edges_of, find_edges, hinges_of, quad_edges
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
@@ -350,10 +349,7 @@ def rest_shape(
     corners = rest[triangles]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     length = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
-    keys = edges[:, 0].astype(np.int64) * count + edges[:, 1]
-    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
-    edge_of_side = np.searchsorted(keys, (sides[..., 0] * count + sides[..., 1]).ravel())
-    edge_of_side = np.minimum(edge_of_side, max(len(keys) - 1, 0))
+    edge_of_side = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]])
     edge_area = np.bincount(edge_of_side, np.repeat(area, 3) / 3.0, len(edges)) if len(edges) else np.zeros(0)
     vertex_area = np.bincount(triangles.ravel(), np.repeat(area, 3) / 3.0, count)
     degree = np.bincount(edges.ravel(), minlength=count)

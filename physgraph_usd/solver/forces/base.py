@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.incidence import incidence
-from ..mesh.stencil import SCALAR, VECTOR, vectors
+from ..mesh.stencil import SCALAR, VECTOR, overloads, vectors
 from ..mesh.threads import Launch
 
 wp.set_module_options({"enable_backward": False})
@@ -148,19 +148,7 @@ def _gather_corners(
     force[vertex] = total
 
 
-_GATHER = {
-    dtype: wp.overload(
-        _gather_corners,
-        [
-            wp.int32,
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=VECTOR[dtype]),
-            wp.array(dtype=VECTOR[dtype]),
-        ],
-    )
-    for dtype in VECTOR
-}
+_GATHER = overloads(_gather_corners, wp.int32, wp.int32, VECTOR, VECTOR)
 
 
 class Elements:
@@ -239,18 +227,6 @@ def element_overloads(
     Returns:
         The concrete kernel for each torch scalar type.
     """
-    packed = wp.types.vector(length=width, dtype=wp.int32)
-    return {
-        dtype: wp.overload(
-            kernel,
-            [
-                wp.int32,
-                wp.array(dtype=VECTOR[dtype]),
-                wp.array(dtype=packed),
-                *[wp.array(dtype=VECTOR[dtype])] * vector_parameters,
-                *[wp.array(dtype=SCALAR[dtype])] * (parameters + 1),
-                wp.array(dtype=VECTOR[dtype]),
-            ],
-        )
-        for dtype in VECTOR
-    }
+    corners = wp.types.vector(length=width, dtype=wp.int32)
+    own = [VECTOR] * vector_parameters + [SCALAR] * parameters
+    return overloads(kernel, VECTOR, corners, *own, SCALAR, VECTOR)

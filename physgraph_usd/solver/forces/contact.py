@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.stencil import SCALAR, VECTOR, vectors
+from ..mesh.stencil import SCALAR, VECTOR, overloads, vectors
 from ..mesh.threads import Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
@@ -68,20 +68,7 @@ def _push(
     force[v] = force[v] + pull * normal[i]
 
 
-_PUSH = {
-    dtype: wp.overload(
-        _push,
-        [
-            wp.int32,
-            wp.array(dtype=VECTOR[dtype]),
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=VECTOR[dtype]),
-            *[wp.array(dtype=SCALAR[dtype])] * 3,
-            wp.array(dtype=VECTOR[dtype]),
-        ],
-    )
-    for dtype in VECTOR
-}
+_PUSH = overloads(_push, VECTOR, wp.int32, VECTOR, SCALAR, SCALAR, SCALAR, VECTOR)
 
 
 class Contact:

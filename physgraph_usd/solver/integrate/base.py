@@ -8,8 +8,10 @@ from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
+
+from ..level import Level
 
 Solver = Callable[[Tensor], Tensor]
 """From right-hand sides [N] to solutions [m], shape (V, 3)."""
@@ -55,50 +57,6 @@ class Layered(Preconditioner, Protocol):
         ...
 
 
-@runtime_checkable
-class Surface(Protocol):
-    """What a level shows of its mesh; the fields are those of `Level`."""
-
-    @property
-    def spans(self) -> tuple[slice, ...]:
-        """Vertex range of each garment."""
-        ...
-
-    @property
-    def rest(self) -> Float[Tensor, "vertices 3"]:
-        """Rest positions [m]."""
-        ...
-
-    @property
-    def triangles(self) -> Int[Tensor, "triangles 3"]:
-        """Corner vertices."""
-        ...
-
-    @property
-    def edges(self) -> Int[Tensor, "edges 2"]:
-        """End vertices."""
-        ...
-
-    @property
-    def rest_length(self) -> Float[Tensor, " edges"]:
-        """Rest length of the edges [m]."""
-        ...
-
-    def normals(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
-        """The triangles' normals at x [m], twice their areas long [m^2]."""
-        ...
-
-    @property
-    def vertex_garment(self) -> Int[Tensor, " vertices"]:
-        """Garment number of each vertex."""
-        ...
-
-    @property
-    def threads(self) -> int:
-        """Most threads that a kernel uses on the CPU."""
-        ...
-
-
 class System:
     """One level in one frame, as an integrator sees it.
 
@@ -122,7 +80,7 @@ class System:
         *,
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
-        level: Surface | None = None,
+        level: Level | None = None,
         lasting: bool = False,
     ) -> None:
         """Join a force field with its metric and its mask."""

@@ -26,7 +26,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...errors import SolveError
-from .base import Carry, Surface, System
+from ..level import Level
+from .base import Carry, System
 from .fused import FusedPhysgraph, fused_physgraph
 from .guard import Guard
 from .network import Physgraph
@@ -277,7 +278,7 @@ def vectors_of(
     return [found[name] for name in names]
 
 
-def garment_dot(level: Surface | None, a: Tensor, b: Tensor) -> Tensor:
+def garment_dot(level: Level | None, a: Tensor, b: Tensor) -> Tensor:
     """The scalar product of two fields in each garment, at each of its vertices; (1, 1) for one garment."""
     if level is None or len(level.spans) == 1:
         return torch.dot(a.reshape(-1), b.reshape(-1)).reshape(1, 1)
@@ -287,10 +288,10 @@ def garment_dot(level: Surface | None, a: Tensor, b: Tensor) -> Tensor:
     return each.new_zeros(len(level.spans), 1).index_add_(0, owner, each)[owner]
 
 
-_EDGES: WeakKeyDictionary[Surface, DirectedEdges] = WeakKeyDictionary()
+_EDGES: WeakKeyDictionary[Level, DirectedEdges] = WeakKeyDictionary()
 
 
-def directed_edges(level: Surface) -> DirectedEdges:
+def directed_edges(level: Level) -> DirectedEdges:
     """The edges of a level in both directions, found once."""
     if level not in _EDGES:
         _EDGES[level] = DirectedEdges.of(level.edges, len(level.rest))
@@ -308,7 +309,7 @@ def fast_products(wanted: bool) -> Iterator[None]:
         torch.backends.cuda.matmul.allow_tf32 = before
 
 
-def _level(system: System) -> Surface:
+def _level(system: System) -> Level:
     if system.level is None:
         raise SolveError("this network needs a mesh, and the system has none")
     return system.level

@@ -23,10 +23,10 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from ..level import Level
 from ..mesh.incidence import incidence
-from ..mesh.stencil import VECTOR, Stencil, vectors
+from ..mesh.stencil import VECTOR, Stencil, overloads, vectors
 from ..mesh.threads import Launch
-from .base import Surface
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +36,7 @@ PARTS = ("normal", "smooth")
 class VertexFrame:
     """The surroundings of every vertex at positions x; each part is found when it is asked for first."""
 
-    def __init__(self, level: Surface, x: Float[Tensor, "vertices 3"]) -> None:
+    def __init__(self, level: Level, x: Float[Tensor, "vertices 3"]) -> None:
         """Look from positions x [m]; no gradients flow through what is seen."""
         self._x = x.detach()
         if level not in _KNOWN:
@@ -71,7 +71,7 @@ class VertexFrame:
 class _Tables:
     """Triangles, edges and neighbours of each vertex of a level, ready for the kernels."""
 
-    def __init__(self, level: Surface) -> None:
+    def __init__(self, level: Level) -> None:
         count, device, dtype = len(level.rest), str(level.rest.device), level.rest.dtype
         triangles, edges = level.triangles.cpu().numpy(), level.edges.cpu().numpy()
         (corner_starts, corner), (end_starts, end) = (
@@ -111,7 +111,7 @@ class _Smooth(torch.autograd.Function):
         return ctx.tables._back.apply(gradients[0].contiguous()), None
 
 
-_KNOWN: WeakKeyDictionary[Surface, _Tables] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[Level, _Tables] = WeakKeyDictionary()
 
 
 @wp.func
@@ -140,7 +140,4 @@ def _normals(
     out[i] = normal_of(i, x, starts, others)
 
 
-_NORMALS = {
-    dtype: wp.overload(_normals, [wp.int32, *(wp.array(dtype=kind) for kind in (wp.int32, wp.vec2i, vector, vector))])
-    for dtype, vector in VECTOR.items()
-}
+_NORMALS = overloads(_normals, wp.int32, wp.vec2i, VECTOR, VECTOR)

@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .stencil import SCALAR, VECTOR, vectors
+from .stencil import SCALAR, VECTOR, overloads, vectors
 from .threads import Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
@@ -41,13 +41,7 @@ def _normals(
     normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)
 
 
-def _overloads(kernel: wp.Kernel, corners: type, out: Mapping[torch.dtype, type]) -> dict[torch.dtype, wp.Kernel]:
-    """A kernel of (first, corners, x, out) for float32 and float64."""
-    types = {dtype: [wp.int32, wp.array(dtype=corners), wp.array(dtype=VECTOR[dtype])] for dtype in VECTOR}
-    return {dtype: wp.overload(kernel, [*given, wp.array(dtype=out[dtype])]) for dtype, given in types.items()}
-
-
-_LENGTHS, _NORMALS = _overloads(_lengths, wp.vec2i, SCALAR), _overloads(_normals, wp.vec3i, VECTOR)
+_LENGTHS, _NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
 
 
 class EdgeLengths:

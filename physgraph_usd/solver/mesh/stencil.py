@@ -42,20 +42,22 @@ VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
 SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64}
 """Warp's scalar for each torch scalar type."""
 
-_GATHER = {
-    dtype: wp.overload(
-        _gather_rows,
-        [
-            wp.int32,
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=wp.int32),
-            wp.array(dtype=SCALAR[dtype]),
-            wp.array(dtype=VECTOR[dtype]),
-            wp.array(dtype=VECTOR[dtype]),
-        ],
-    )
-    for dtype in VECTOR
-}
+
+def overloads(kernel: wp.Kernel, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
+    """A generic kernel of (first, *arrays) for float32 and float64.
+
+    Args:
+        kernel: The kernel.
+        kinds: What each array holds: a type, or `SCALAR` or `VECTOR`.
+    """
+
+    def arrays(dtype: torch.dtype) -> list[Any]:
+        return [wp.array(dtype=kind[dtype] if isinstance(kind, dict) else kind) for kind in kinds]
+
+    return {dtype: wp.overload(kernel, [wp.int32, *arrays(dtype)]) for dtype in VECTOR}
+
+
+_GATHER = overloads(_gather_rows, wp.int32, wp.int32, SCALAR, VECTOR, VECTOR)
 
 
 def vectors(tensor: Tensor) -> wp.array:

@@ -13,7 +13,7 @@ from functools import reduce
 import numpy as np
 from scipy import sparse
 
-from .topology import PolygonMesh, TriangleSplit, find_edges
+from .topology import PolygonMesh, TriangleSplit
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,18 +201,12 @@ class _Rules:
     """Which smooth rule holds where."""
 
     smooth_edge: np.ndarray  # (E,) the two faces decide
-    crease: np.ndarray  # (E,) boundary or authored crease
+    boundary: np.ndarray  # (E,) one face only
     smooth_vertex: np.ndarray  # (V,) all faces decide
-    crease_vertex: np.ndarray  # (V,) cubic B-spline along two creases
+    rim_vertex: np.ndarray  # (V,) cubic B-spline along two boundary edges
 
 
-def smooth(
-    mesh: PolygonMesh,
-    refinement: Refinement,
-    *,
-    crease_edges: np.ndarray | None = None,
-    corner_vertices: np.ndarray | None = None,
-) -> sparse.csr_matrix:
+def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
     """Build the smooth placement of the same child vertices.
 
     Among triangles these are Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and among polygons
@@ -221,44 +215,36 @@ def smooth(
     or a fourth: with s the sum of shares the rules are evaluated at valence 6 s and 4 s, and each corner adds its part.
     That is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) where s = 1, and the pure rule among one kind.
 
-    Boundaries and creases are cubic B-splines. Fixed are: vertices with one face, with three or more creases, on
-    non-manifold edges or between several fans, and isolated ones. A single crease ending inside leaves its end smooth.
+    Boundaries are cubic B-splines. Fixed are: vertices with one face, with three or more boundary edges, on
+    non-manifold edges or between several fans, and isolated ones.
 
     Args:
         mesh: The parent.
         refinement: Its subdivision, from :func:`subdivide`.
-        crease_edges: Infinitely sharp edges by their vertices, shape (K, 2); pairs that are no edge are passed over.
-        corner_vertices: Infinitely sharp vertices, shape (K,).
 
     Returns:
         Stencil, shape (V_child, V_parent), float64; rows sum to 1.
     """
-    rules = _rules(mesh, crease_edges, corner_vertices)
-    parts = [_fixed_part(mesh, rules), _edge_part(mesh, rules), _crease_part(mesh, rules), _vertex_part(mesh, rules)]
+    rules = _rules(mesh)
+    parts = [_fixed_part(mesh, rules), _edge_part(mesh, rules), _rim_part(mesh, rules), _vertex_part(mesh, rules)]
     rows, columns, weights = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     size = refinement.mesh.vertex_count
     average = sparse.coo_matrix((weights, (rows, columns)), shape=(size, size)).tocsr()
     return average @ refinement.linear
 
 
-def _rules(mesh: PolygonMesh, crease_edges: np.ndarray | None, corner_vertices: np.ndarray | None) -> _Rules:
+def _rules(mesh: PolygonMesh) -> _Rules:
     """Classify edges and vertices."""
     half, size = mesh.half_edges, mesh.vertex_count
     proper = half.edges[:, 0] != half.edges[:, 1]
     manifold = half.count <= 2
-    crease = half.count == 1
-    if crease_edges is not None:
-        found = find_edges(half.edges, crease_edges)
-        crease[found[found >= 0]] = True
-    crease &= proper & manifold
+    boundary = (half.count == 1) & proper
     faces = np.bincount(mesh.indices, minlength=size)
-    creases = np.bincount(half.edges[crease].reshape(-1), minlength=size)
-    fixed = (faces < 2) | (creases > 2) | (mesh.fan_counts > 1)
+    at_rim = np.bincount(half.edges[boundary].reshape(-1), minlength=size)
+    fixed = (faces < 2) | (at_rim > 2) | (mesh.fan_counts > 1)
     fixed[half.edges[~manifold].reshape(-1)] = True
-    if corner_vertices is not None:
-        fixed[np.asarray(corner_vertices, np.int64)] = True
-    crease_vertex = (creases == 2) & ~fixed
-    return _Rules(proper & manifold & ~crease, crease, ~fixed & ~crease_vertex, crease_vertex)
+    rim_vertex = (at_rim == 2) & ~fixed
+    return _Rules(proper & manifold & ~boundary, boundary, ~fixed & ~rim_vertex, rim_vertex)
 
 
 _Part = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -272,10 +258,10 @@ def _stack(rows: np.ndarray, columns: list[np.ndarray], weights: list[np.ndarray
 
 
 def _fixed_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
-    """Vertices that stay, midpoints of sharp edges, and face points."""
+    """Vertices that stay, midpoints of boundary and non-manifold edges, and face points."""
     edges = mesh.vertex_count + np.flatnonzero(~rules.smooth_edge)
     faces = face_points(mesh)
-    kept = np.concatenate([np.flatnonzero(~rules.smooth_vertex & ~rules.crease_vertex), edges, faces[faces >= 0]])
+    kept = np.concatenate([np.flatnonzero(~rules.smooth_vertex & ~rules.rim_vertex), edges, faces[faces >= 0]])
     return kept, kept, np.ones(len(kept))
 
 
@@ -290,11 +276,11 @@ def _edge_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     return _stack(mesh.vertex_count + mesh.half_edges.edge[corners], [here, there, far], [near, near, across])
 
 
-def _crease_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
-    """Cubic B-spline vertices, one half per crease."""
-    ends = mesh.half_edges.edges[rules.crease]
+def _rim_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
+    """Cubic B-spline vertices, one half per boundary edge."""
+    ends = mesh.half_edges.edges[rules.boundary]
     ends = np.concatenate([ends, ends[:, ::-1]])
-    here, there = ends[rules.crease_vertex[ends[:, 0]]].T
+    here, there = ends[rules.rim_vertex[ends[:, 0]]].T
     return _stack(here, [here, there], [3 / 8, 1 / 8])
 
 
