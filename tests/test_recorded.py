@@ -120,7 +120,8 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
     fresh = Problem.level
 
     def lasting(problem: Problem, index: int, **options: Any) -> LevelProblem:
-        tie = None if problem.start.detailed is None else (problem.tether, problem.start.detailed)
+        detailed, stiffness = problem.start.detailed, problem.tether
+        tie = None if detailed is None or stiffness is None else (stiffness, detailed)
         system = problem.forces[index].lasting_system(problem.aim, tie)
         return replace(fresh(problem, index, **options), alone=system)
 
