@@ -61,8 +61,8 @@ SHOWN = {
     "tshirt": Shown((1.0, 36.0), (15.0, 8.0), 17.0, QUADS),
     "layers": Shown((1.0, 30.0), (30.0, 6.0), 20.0, QUADS),
     "sleeve": Shown((1.0, 24.0), (25.0, 10.0), 22.0),
-    "skirt": Shown((1.0, 48.0), (25.0, 6.0), 24.0),
-    "flag": Shown((1.0, 48.0), (25.0, 10.0), 24.0, QUADS),
+    "skirt": Shown((1.0, 32.0), (25.0, 6.0), 24.0),
+    "flag": Shown((1.0, 30.0), (25.0, 10.0), 24.0, QUADS),
     "block": Shown((1.0, 24.0), (40.0, 22.0), 16.0, QUADS),
 }
 """The films by sample."""
