@@ -70,7 +70,7 @@ def test_a_folder_with_files_that_are_not_ours_is_left(shot: Path, tmp_path: Pat
         (folder / name).write_text("mine")
     before = {file.name: None if file.is_dir() else file.read_bytes() for file in folder.iterdir()}
     result = run("refine", shot, "-o", tmp_path / "fine.usdc", "--overwrite", *SMALL)
-    assert (result.exit_code, f"{name} is none of ours" in result.stderr) == (2, True), result.output
+    assert (result.exit_code, f"{name} is not a file of ours" in result.stderr) == (2, True), result.output
     assert {file.name: None if file.is_dir() else file.read_bytes() for file in folder.iterdir()} == before
 
 

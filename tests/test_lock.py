@@ -70,7 +70,7 @@ def test_windows_holds_a_byte_in_place_of_the_file(tmp_path: Path, monkeypatch: 
     monkeypatch.setitem(sys.modules, "fcntl", None)
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))
     monkeypatch.setattr(sys, "platform", "win32")
-    spec = importlib.util.spec_from_file_location("physgraph_usd.lock_of_windows", lock.__file__)
+    spec = importlib.util.spec_from_file_location("physgraph_usd.shot.lock_of_windows", lock.__file__)
     assert spec is not None
     assert spec.loader is not None
     there = importlib.util.module_from_spec(spec)

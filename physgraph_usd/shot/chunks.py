@@ -2,14 +2,14 @@
 
 Each process opens the shot for itself and begins a few frames before its chunk (the pre-roll), so that warm starts have
 settled when the chunk begins; over these frames, which two processes solve, `joined` goes from one result to the
-other. Results go through files, so memory does not grow with the frames and what is finished
-outlives an interruption; frames that an earlier run finished are not solved again.
+other. Results go through files, so memory does not grow with the frames and what is finished outlives an interruption;
+frames that an earlier run finished are not solved again.
 """
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NoReturn, Protocol
@@ -38,7 +38,7 @@ class Work(Protocol):
         ...
 
     def result(self) -> Any:
-        """What the function returned; raises what ended it."""
+        """The function's result; raises what ended it."""
         ...
 
     def end(self) -> None:
@@ -54,8 +54,7 @@ def chunks_of(missing: Sequence[int], workers: int) -> list[list[range]]:
         workers: Number of processes.
     """
     bounds = np.linspace(0, len(missing), min(workers, max(len(missing), 1)) + 1).round().astype(int)
-    shares = [missing[a:b] for a, b in pairwise(bounds) if b > a]
-    return [_ranges(share) for share in shares]
+    return [_ranges(missing[a:b]) for a, b in pairwise(bounds) if b > a]
 
 
 def _ranges(numbers: Sequence[int]) -> list[range]:
@@ -63,11 +62,11 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
     return [range(numbers[a], numbers[b - 1] + 1) for a, b in pairwise([*starts, len(numbers)])]
 
 
-def seams_of(shares: Sequence[Sequence[range]], frames: FrameFolder, *, preroll: int) -> dict[int, tuple[int, float]]:
+def seams_of(chunks: Sequence[Sequence[range]], frames: FrameFolder, *, preroll: int) -> dict[int, tuple[int, float]]:
     """The frames that are solved on both sides of a seam.
 
     Args:
-        shares: The frames of each worker.
+        chunks: The frames of each worker.
         frames: Where results are; frames of an earlier run in it have seams of their own.
         preroll: Frames solved before each range.
 
@@ -75,7 +74,7 @@ def seams_of(shares: Sequence[Sequence[range]], frames: FrameFolder, *, preroll:
         By the frame's number: that of the first frame after the seam, and its `Lead.weight`.
     """
     starts = frames.seams()
-    parts = [part for share in shares for part in share if part.start]
+    parts = [part for chunk in chunks for part in chunk if part.start]
     # Where the frame after a range is an earlier run's, what goes on there is not what the range began.
     starts |= {part.start for part in parts if part.stop not in frames.kept or part.stop in starts}
     found: dict[int, tuple[int, float]] = {}
@@ -105,111 +104,79 @@ def solve_in_chunks(
         workers: Number of processes; 1 solves in this one.
         preroll: Frames solved before each chunk but the first of the shot; they are yielded as the ``lead`` of the same
             frames of the chunk before.
-        start: What starts a function in a process of its own, with its arguments, in place of `Call`; then one chunk
-            is not solved in this process either.
+        start: Starts a function in a process of its own, with its arguments, in place of `Call`; then one chunk is not
+            solved in this process either.
 
     Raises:
         SolveError: A process died.
         LayerError: A result cannot be written.
     """
-    shares = chunks_of([k for k in range(len(times)) if k not in frames.kept], workers)
-    seams = seams_of(shares, frames, preroll=preroll)
-    if len(shares) < 2 and start is None:
-        yield from _solve_here(solver, times, shares[0] if shares else [], frames, preroll=preroll, seams=seams)
-        return
-    calls = [(start or Call)(_work, solver, list(times), share, frames, preroll) for share in shares]
-    owners = {k: call for share, call in zip(shares, calls, strict=True) for part in share for k in part}
+    chunks = chunks_of([k for k in range(len(times)) if k not in frames.kept], workers)
+    seams = seams_of(chunks, frames, preroll=preroll)
+    solved: Iterator[int] = iter(())
+    calls: list[Work] = []
+    if len(chunks) < 2 and start is None:
+        solved = _solve(solver, list(times), [part for chunk in chunks for part in chunk], frames, preroll)
+    else:
+        calls = [(start or Call)(_work, solver, list(times), chunk, frames, preroll) for chunk in chunks]
+    owners = {k: call for chunk, call in zip(chunks, calls, strict=False) for part in chunk for k in part}
     try:
         for index, time in enumerate(times):
-            outcome = _collect(frames, index, time, owner=owners.get(index))
-            yield _with_lead(
-                frames,
-                index,
-                outcome,
-                seams,
-                lambda k, seam: _collect(frames, k, times[k], owner=owners.get(seam), seam=seam),
-            )
+            outcome = _collect(frames, index, time, owner=owners.get(index), solved=solved)
+            if index in seams:
+                seam, weight = seams[index]
+                lead = frames.read(index, time, seam=seam)
+                if lead is None and seam not in frames.kept:
+                    lead = _collect(frames, index, time, owner=owners.get(seam), solved=solved, seam=seam)
+                outcome = outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight))
+            yield outcome
     finally:
         for call in calls:
             call.end()
 
 
-def _solve_here(
-    solver: Solver,
-    times: Sequence[float | None],
-    share: Sequence[range],
-    frames: FrameFolder,
-    *,
-    preroll: int,
-    seams: Mapping[int, tuple[int, float]],
-) -> Iterator[Outcome]:
-    """Solve ranges of frames in this process, as far as the next frame to yield needs, and yield all frames."""
-    solved = _solve(solver, times, share, frames=frames, preroll=preroll)
-    made: dict[tuple[int, int | None], Outcome] = {}
-
-    def taken(index: int, seam: int | None) -> Outcome:
-        while (index, seam) not in made:
-            number, before, outcome = next(solved, None) or _lost(times[index])
-            if before is None or before == seams.get(number, (None,))[0]:
-                made[number, before] = outcome
-        return made.pop((index, seam))
-
-    for index, time in enumerate(times):
-        outcome = frames.read(index, time) if index in frames.kept else taken(index, None)
-        yield _with_lead(frames, index, outcome or _lost(time), seams, taken)
-
-
-def _with_lead(
-    frames: FrameFolder,
-    index: int,
-    outcome: Outcome,
-    seams: Mapping[int, tuple[int, float]],
-    taken: Callable[[int, int], Outcome],
-) -> Outcome:
-    """An outcome with the same frame from behind the next seam, where there is one."""
-    if index not in seams:
-        return outcome
-    seam, weight = seams[index]
-    lead = frames.read(index, outcome.time, seam=seam) if seam in frames.kept else taken(index, seam)
-    return outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight))
-
-
 def _solve(
-    solver: Solver, times: Sequence[float | None], share: Sequence[range], *, frames: FrameFolder, preroll: int
-) -> Iterator[tuple[int, int | None, Outcome]]:
-    """Solve ranges of frames, each after its pre-roll, and file them; yields number, seam it is before, outcome."""
-    for part in share:
+    solver: Solver, times: Sequence[float | None], chunk: Sequence[range], frames: FrameFolder, preroll: int
+) -> Iterator[int]:
+    """Solve ranges of frames, each after its pre-roll, and file them; yields the number of each when it is there."""
+    for part in chunk:
         first = max(0, part.start - preroll)
         with memory_is_named():
             for index, outcome in enumerate(solver(times[first : part.stop]), start=first):
-                seam = part.start if index < part.start else None
-                frames.write(index, outcome, seam=seam)
-                yield index, seam, outcome
+                frames.write(index, outcome, seam=part.start if index < part.start else None)
+                yield index
 
 
-def _work(
-    solver: Solver, times: Sequence[float | None], share: Sequence[range], frames: FrameFolder, preroll: int
-) -> None:
-    """What a worker process does."""
-    for _ in _solve(solver, times, share, frames=frames, preroll=preroll):
+def _work(*job: Any) -> None:
+    """Solve a chunk in a worker process."""
+    for _ in _solve(*job):
         pass
 
 
 def _collect(
-    frames: FrameFolder, index: int, time: float | None, *, owner: Work | None, seam: int | None = None
+    frames: FrameFolder,
+    index: int,
+    time: float | None,
+    *,
+    owner: Work | None,
+    solved: Iterator[int],
+    seam: int | None = None,
 ) -> Outcome:
-    """Wait for one frame's file and read it; ``seam`` as `FrameFolder.read` takes it."""
+    """Read a frame's file once its owner, or without one ``solved``, has made it; ``seam`` as `FrameFolder.read`."""
     ended: float | None = None
     while True:
-        over = owner is None or owner.ready
+        over = owner is not None and owner.ready
         outcome = frames.read(index, time, seam=seam)
         if outcome is not None:
             return outcome
+        if owner is None:
+            if next(solved, None) is None:
+                _lost(time)
+            continue
         if over:
-            if owner is not None:
-                owner.result()
+            owner.result()
             ended = ended or clock.monotonic()
-            if owner is None or clock.monotonic() - ended >= owner.lag:
+            if clock.monotonic() - ended >= owner.lag:
                 _lost(time)
         clock.sleep(POLL_SECONDS)
 

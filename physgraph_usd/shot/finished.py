@@ -1,4 +1,4 @@
-"""What a run need not do: its layer is there and is to be left, or the same files, options and version made it.
+"""Runs that need not be done: the layer is there and is to be left, or the same files, options and version made it.
 
 It is decided without the solver, whose libraries take seconds to import.
 """
@@ -8,36 +8,23 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from ..errors import PhysGraphError
 from ..usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
 from ..usd.provenance import asset_path, file_hashes, is_result_of, mute_refined, unsaved_layers
 from ..usd.stage import open_stage
-from ..usd.view import Stage, StageView
+from ..usd.view import StageView
 from ..version import __version__, code_digest
 from .frames import frames_folder
 from .options import RefineOptions
 from .report import LOG, RefineReport
 
+if TYPE_CHECKING:
+    from ..usd.read.reader import Shot
+
 Job = tuple[str | Path, Path, RefineOptions]
 """A shot, the layer to write and options."""
-
-
-class Source(Protocol):
-    """A shot that is open.
-
-    Attributes:
-        path: Its name.
-        stage: It, without refined layers.
-        view: The stage as it was handed over.
-        unsaved: Names of the layers whose content is in no file.
-    """
-
-    path: str
-    stage: Stage
-    view: StageView
-    unsaved: tuple[str, ...]
 
 
 class _Opened:
@@ -93,8 +80,8 @@ def taken_as_done(report: RefineReport, out: Path) -> RefineReport:
     return report
 
 
-def made_from(opened: Source, out: Path | None, options: RefineOptions) -> dict[str, Any]:
-    """What decides a layer, for its record: version and code, options, the shot and the hashes of its files."""
+def made_from(opened: Shot | _Opened, out: Path | None, options: RefineOptions) -> dict[str, Any]:
+    """Everything that decides a layer, for its record: version, code, options, the shot and hashes of its files."""
     folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
     return {
         "version": __version__,
@@ -132,7 +119,7 @@ def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
 def in_order(
     found: Sequence[RefineReport | None], done: Generator[RefineReport | PhysGraphError, None, None]
 ) -> Iterator[RefineReport | PhysGraphError]:
-    """What became of each job: the report of one that was finished before, else the next that is done."""
+    """Results of jobs in order: the report of one that was finished before, else the next that is done."""
     with closing(done):
         for there in found:
             yield next(done) if there is None else there

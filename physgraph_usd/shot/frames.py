@@ -33,10 +33,10 @@ _OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """The same time code, solved by the process that goes on after a seam.
+    """A time code as it was solved by the process that goes on after a seam.
 
     Attributes:
-        outcome: What came of it there.
+        outcome: Its result there.
         seam: Number of the first frame that is that process's alone.
         weight: Part of its positions in the joined frame: k / (L + 1) in the k-th of the L frames that both solved.
     """
@@ -48,7 +48,7 @@ class Lead:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What came of one time code.
+    """The result of one time code.
 
     Attributes:
         time: The time code; None for a shot without samples.
@@ -68,7 +68,7 @@ class Outcome:
 
 
 def frames_folder(layer: Path) -> Path:
-    """Where the finished frames of a layer are."""
+    """The folder of a layer's finished frames."""
     return layer.with_name(layer.name + _FRAMES)
 
 
@@ -87,11 +87,10 @@ class Kept:
     of: int
 
     def __str__(self) -> str:
-        """For a message."""
-        said = (
-            f"{self.frames} of {counted(self.of, 'frame')} {'is' if self.frames == 1 else 'are'} kept in {self.folder}"
-        )
-        return f"{said}; --resume goes on from {'it' if self.frames == 1 else 'them'}"
+        """How many, where, and what to do with them."""
+        are, them = ("is", "it") if self.frames == 1 else ("are", "them")
+        frames = f"{self.frames} of {counted(self.of, 'frame')}"
+        return f"{frames} {are} kept in {self.folder}; --resume goes on from {them}"
 
 
 def kept_for(layer: Path) -> Kept | None:
@@ -137,20 +136,19 @@ class FrameFolder:
             LayerError: The folder cannot be made, or another run is at work in it.
         """
         self.folder, self._keep = folder, keep
-        wanted = json.loads(json.dumps(run))
         try:
             self._check_ours()
             self._lock = FolderLock(folder, layer=folder.with_name(folder.name.removesuffix(_FRAMES)))
             with ExitStack() as unless_taken:
                 unless_taken.callback(self._lock.release)
-                self._take(wanted, resume=resume, drop=drop)
+                self._take(json.loads(json.dumps(run)), resume=resume, drop=drop)
                 unless_taken.pop_all()
         except OSError as error:
             raise LayerError(f"cannot write {folder}: {error.strerror}") from error
 
     def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
-        """Use or drop what is there."""
-        found = self._found()
+        """Use or drop what is there; frames that failed are tried again."""
+        found = _whole_frames(self.folder)
         different = self._differences(wanted) if found else []
         if different and (resume or not drop):
             holds = f"{self.folder} holds {counted(len(found), 'finished frame')} of a run"
@@ -158,6 +156,8 @@ class FrameFolder:
             raise UsageError(f"{holds} with other {', '.join(different[:3])}; {remedy}")
         self.kept = frozenset(found if resume else ())
         self.dropped = 0 if resume or different else len(found)
+        for file in self.folder.glob(f"*{_FAILED}"):
+            file.unlink()
         if not self.kept:
             self._clear()
         self._run = json.dumps(wanted, indent=2) + "\n"
@@ -168,12 +168,8 @@ class FrameFolder:
         names = {file.name for file in self.folder.glob("*")}
         others = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
         if others or (names and not names & {RUN, LOCK}):
-            said = f"; {others[0]} is none of ours" if others else ""
-            raise UsageError(f"{self.folder} is no folder of finished frames{said}; choose another name for the layer")
-
-    def _found(self) -> list[int]:
-        """Numbers of the whole frames that are there."""
-        return _whole_frames(self.folder)
+            other = f"; {others[0]} is not a file of ours" if others else ""
+            raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
 
     def _differences(self, wanted: dict[str, Any]) -> list[str]:
         """Names of what decides the frames there, and is another here."""
@@ -197,7 +193,7 @@ class FrameFolder:
         return self.__dict__ | {"folder": self.folder.absolute()}
 
     def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
-        """Write what came of a frame; ``seam`` where it serves for the pre-roll of the frame of that number.
+        """Write a frame's result; ``seam`` where it serves for the pre-roll of the frame of that number.
 
         Raises:
             LayerError: The disk is full, or the folder is gone or another run's: a task on another machine may outlast
@@ -221,7 +217,7 @@ class FrameFolder:
             temporary.unlink(missing_ok=True)
 
     def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
-        """What came of a frame, or None where it is not there yet; ``seam`` as `write` takes it.
+        """A frame's result, or None where it is not there yet; ``seam`` as `write` takes it.
 
         Raises:
             LayerError: The file is damaged.
@@ -256,7 +252,7 @@ class FrameFolder:
     ) -> None:
         """Keep the frames, however the run failed, unless that was not wanted; let go of the folder."""
         try:
-            if kind is None or not (self._keep or self.kept) or not self._found():
+            if kind is None or not (self._keep or self.kept) or not _whole_frames(self.folder):
                 self._clear()
         finally:
             self._lock.release()
