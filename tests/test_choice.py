@@ -12,8 +12,7 @@ from folds import frame_with, named, refiner_with, square
 from sheets import garment_of
 
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.solver.frame.choice import LONGER, LONGER_CUDA, Choice, choose
-from physgraph_usd.solver.frame.problem import Problem
+from physgraph_usd.solver.frame.problem import LONGER, LONGER_CUDA, Choice, Problem, choose
 
 
 @dataclass

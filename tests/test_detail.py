@@ -9,7 +9,7 @@ from cloth import group_of, sheet, wave
 from meshes import mesh_of
 from sheets import rotation
 
-from physgraph_usd.solver.frame.detail import MovingFrames
+from physgraph_usd.solver.frame.from_cage import MovingFrames
 from physgraph_usd.solver.frame.values import State
 
 MESH, REST = sheet(6, 4)

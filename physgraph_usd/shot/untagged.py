@@ -15,8 +15,7 @@ import numpy as np
 from ..errors import StageError
 from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import MeshPose
-from ..solver.contact.broad_phase import bounds_of
-from ..solver.contact.nearby import NEAR, share_at, smallest_body
+from ..solver.contact.broad_phase import NEAR, bounds_of, share_at, smallest_body
 from ..solver.mesh.threads import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Frame

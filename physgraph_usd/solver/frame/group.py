@@ -24,8 +24,7 @@ from ..integrate.weights import shipped_network
 from ..level import Level, Placed, build_levels, unhindered
 from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame, recentred
-from .detail import MovingFrames
-from .followers import Followers
+from .from_cage import Followers, MovingFrames
 from .level_forces import LevelForces, build_forces
 from .settings import SolveSettings
 from .values import Cage, FrameInput

@@ -16,9 +16,8 @@ from ..integrate.solve import LevelReport
 from ..level import Placed, unhindered
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
-from .choice import Choice
 from .level_forces import named
-from .problem import Problem
+from .problem import Choice, Problem
 from .values import State
 
 

@@ -18,8 +18,7 @@ from ..mesh.subdivide import Refinement
 from ..scene import Frame, Scene, State, refuse_far
 from .group import Group
 from .history import Kept
-from .scene_cloth import SceneCloth
-from .scene_frame import SceneFrame
+from .scene_frame import SceneCloth, SceneFrame
 from .settings import SolveSettings
 
 LIMIT, LEAST_LIMIT, LIMIT_PER_VERTEX = 20.0, 120.0, 0.01

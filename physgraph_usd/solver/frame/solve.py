@@ -24,11 +24,10 @@ from ..integrate.base import Carry, System
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, descend, solve_level
 from ..level import Placed, unhindered
-from .choice import choose
 from .group import Group
 from .level_forces import blame
 from .outcome import measured, refuse_swallowed, scaled, state_left, telemetry_of
-from .problem import LevelProblem, begin
+from .problem import LevelProblem, begin, choose
 from .values import FrameInput, Solved, State
 
 STEPS, LONGEST = 4, 16

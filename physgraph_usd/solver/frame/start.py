@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..resolution import edge_strain
-from .detail import MovingFrames
+from .from_cage import MovingFrames
 from .settings import Reset
 from .values import Cage, State
 

@@ -1,0 +1,192 @@
+"""What the cage gives to the fine cloth: the last frame's detail, and the places of what no solve moves.
+
+Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame made of its normal
+and of a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface. What
+interpolates to the fine vertices is how frames have turned: tangents of neighbours may point anywhere, also against one
+another, and have no mean.
+
+Fixed vertices are placed by the cage, and corners of faces without area follow the cloth beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from ..level import PIN_MARGIN, Level, Placed
+from ..mesh.stencil import Stencil, add_at
+from ..mesh.topology import PolygonMesh
+from .values import State
+
+
+class MovingFrames:
+    """The frames of a cage and the way from them to the fine vertices.
+
+    Attributes:
+        edge: Mean edge of the cage [m].
+    """
+
+    def __init__(self, cage: Level, finest: Level) -> None:
+        """Fix each cage vertex's tangent in the rest shape."""
+        self._level, self._triangles = finest, cage.triangles.long()
+        triangles, rest = cage.triangles.cpu().numpy(), cage.rest.double().cpu().numpy()
+        self._tangent = Stencil(tangent_operator(triangles, rest), dtype=finest.dtype, device=finest.device)
+        self.edge = mean_edge(triangles, rest)
+
+    def frames(self, coarse: Float[Tensor, "coarse 3"]) -> Float[Tensor, "coarse 3 3"]:
+        """Orthonormal frames at the cage vertices; columns are tangent, bitangent, normal."""
+        corner = coarse[self._triangles]
+        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal = add_at(torch.zeros_like(coarse), self._triangles.T.reshape(-1), area.repeat(3, 1))
+        return orthonormal(normal, self._tangent.apply(coarse))
+
+    def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> State:
+        """Keep a solved frame's detail."""
+        return State(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
+
+    def predict(
+        self, kept: State, coarse: Float[Tensor, "coarse 3"]
+    ) -> tuple[Float[Tensor, "vertices 3"], float, float]:
+        """Carry detail to new cage positions.
+
+        Returns:
+            Predicted fine positions [m], the RMS motion of the cage in mean cage edges, and its RMS turn [rad].
+        """
+        frames = self.frames(coarse)
+        moved = torch.einsum("vij,vj->vi", self._turned(kept.frames, frames), kept.detail)
+        motion = float((coarse - kept.coarse).square().sum(dim=1).mean().sqrt()) / self.edge
+        cosine = (torch.einsum("cij,cij->c", frames, kept.frames) - 1.0) / 2.0
+        turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
+        return self._level.smooth_base.apply(coarse) + moved, motion, turn
+
+    def scaled(
+        self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"], gain: np.ndarray
+    ) -> Float[Tensor, "vertices 3"]:
+        """Scale the detail of free vertices by a gain at each cage vertex, shape (C,); 1 everywhere changes nothing."""
+        if np.all(gain == 1.0):
+            return fine
+        more = torch.as_tensor(self._level.from_coarse @ gain).to(fine).unsqueeze(1)
+        smooth = self._level.smooth_base.apply(coarse)
+        return torch.where(self._level.free, smooth + more * (fine - smooth), fine)
+
+    def _turned(
+        self, before: Float[Tensor, "coarse 3 3"], after: Float[Tensor, "coarse 3 3"]
+    ) -> Float[Tensor, "vertices 3 3"]:
+        """How cage frames have turned, interpolated to the fine vertices; not at all where either is no frame."""
+        turned = torch.einsum("cij,ckj->cik", after, before)
+        whole = (torch.linalg.det(turned) > 0.5).unsqueeze(1).unsqueeze(2)
+        turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
+        first, last = (self._level.base.apply(turned[:, :, column].contiguous()) for column in (0, 2))
+        return orthonormal(last, first)
+
+
+NEAREST = 1e-6
+"""Distance under which points count as at one place, in edge lengths."""
+
+
+class Followers:
+    """Fixed vertices, and corners of faces without area, which move with what lies beside them, by nearness."""
+
+    def __init__(self, level: Level, meshes: Sequence[PolygonMesh]) -> None:
+        """Find them at a level; ``meshes`` are its garments' polygons."""
+        parts = zip(meshes, level.spans, strict=True)
+        edges = np.concatenate([mesh.half_edges.edges.astype(np.int64) + span.start for mesh, span in parts])
+        ends = np.concatenate([edges, edges[:, ::-1]])
+        idle = ((level.vertex_area == 0) & (level.pin < 1.0 - PIN_MARGIN)).cpu().numpy()
+        ends = ends[idle[ends[:, 0]] & (ends[:, 0] != ends[:, 1])]
+        self._which, row = np.unique(ends[:, 0], return_inverse=True)
+        rest = level.rest.double().cpu().numpy()
+        length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
+        near = 1.0 / np.maximum(length, NEAREST * float(level.spacing.mean()))
+        beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._which), level.vertex_count))
+        # What hangs together with no cloth at all stays: the margin makes its matrix one that can be inverted.
+        degree = sp.diags(np.bincount(row, near, len(self._which)) * (1.0 + 1e-9))
+        self._inverse = splu(sp.csc_matrix(degree - beside[:, self._which])) if len(row) else None
+        self._fixed = np.flatnonzero(~level.free.cpu().numpy().ravel())
+        self._place_fixed = sp.csr_matrix(level.from_coarse[self._fixed])
+        self._beside, self._from_coarse = sp.csr_matrix(beside @ sp.diags(1.0 - idle)), level.from_coarse
+
+    def placed(self, x: Placed, origin: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+        """World positions [m], shape (V, 3), of which these are placed by the cage's and by the others.
+
+        Fixed vertices are the upsampled cage's own; a corner is moved off it as its neighbours are on the mean.
+
+        Args:
+            x: Where the cloth is, about the origin [m].
+            origin: World position [m], shape (3,).
+            coarse: The cage's world positions [m], shape (C, 3).
+        """
+        out = x.double().cpu().numpy() + origin
+        out[self._fixed] = self._place_fixed @ coarse
+        if self._inverse is not None:
+            base = self._from_coarse @ coarse
+            out[self._which] = base[self._which] + self._inverse.solve(self._beside @ (out - base))
+        return out
+
+
+def orthonormal(
+    normal: Float[Tensor, "vertices 3"], tangent: Float[Tensor, "vertices 3"]
+) -> Float[Tensor, "vertices 3 3"]:
+    """Frames from normals and rough tangents, columns are tangent, bitangent, normal; any where both vanish."""
+    normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
+    tangent = tangent - (tangent * normal).sum(dim=1, keepdim=True) * normal
+    tangent = torch.nn.functional.normalize(tangent, dim=1, eps=1e-30)
+    return torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=2)
+
+
+def tangent_operator(triangles: np.ndarray, rest: np.ndarray) -> sp.csr_matrix:
+    """Sparse map from cage positions to one tangent a vertex.
+
+    A vertex's reference direction at rest is projected into each incident triangle and written as a combination of that
+    triangle's two edges; the same combination of the deformed edges is that triangle's vote.
+
+    Args:
+        triangles: Corner vertices, shape (T, 3).
+        rest: Rest positions [m], shape (C, 3), float64.
+    """
+    count = len(rest)
+    reference = _reference_directions(triangles, rest)
+    rows, columns, values = [], [], []
+    first, second = rest[triangles[:, 1]] - rest[triangles[:, 0]], rest[triangles[:, 2]] - rest[triangles[:, 0]]
+    a, b, c = (np.einsum("tc,tc->t", u, v) for u, v in ((first, first), (first, second), (second, second)))
+    determinant = a * c - b * b
+    sound = determinant > 1e-12 * a * c
+    inverse = np.where(sound, 1.0 / np.where(sound, determinant, 1.0), 0.0)
+    area = np.sqrt(np.maximum(determinant, 0.0))
+    for corner in range(3):
+        vertex = triangles[:, corner]
+        p = np.einsum("tc,tc->t", first, reference[vertex])
+        q = np.einsum("tc,tc->t", second, reference[vertex])
+        along_first, along_second = area * inverse * (c * p - b * q), area * inverse * (a * q - b * p)
+        rows += [vertex] * 3
+        columns += [triangles[:, 0], triangles[:, 1], triangles[:, 2]]
+        values += [-along_first - along_second, along_first, along_second]
+    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.csr_matrix(triplets, shape=(count, count))
+
+
+def _reference_directions(triangles: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """One tangent direction per cage vertex in the rest shape: its first edge, projected."""
+    normal = np.zeros_like(rest)
+    area = np.cross(rest[triangles[:, 1]] - rest[triangles[:, 0]], rest[triangles[:, 2]] - rest[triangles[:, 0]])
+    for corner in range(3):
+        np.add.at(normal, triangles[:, corner], area)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    direction = np.zeros_like(rest)
+    for corner in (2, 1, 0):
+        direction[triangles[:, corner]] = rest[triangles[:, (corner + 1) % 3]] - rest[triangles[:, corner]]
+    return direction - np.einsum("vc,vc->v", direction, normal)[:, None] * normal
+
+
+def mean_edge(triangles: np.ndarray, rest: np.ndarray) -> float:
+    """Mean edge of triangles [m]; 1 where there are none."""
+    if not len(triangles):
+        return 1.0
+    sides = rest[triangles] - rest[np.roll(triangles, 1, axis=1)]
+    return max(float(np.linalg.norm(sides, axis=2).mean()), 1e-12)
