@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
-from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, find_property
+from .schema import AUTO_LEVEL, GARMENT, MATERIAL, Property, find_property
 from .stage import in_brief, timecode
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
@@ -217,13 +217,3 @@ def is_within(value: float, low: float | None, high: float | None) -> bool:
 def is_on(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> bool:
     """Value of a boolean attribute."""
     return bool(find_value(prim, row, overrides).at(None))
-
-
-ENABLED = GARMENT["enabled"]
-"""Whether a garment is refined."""
-COLLIDER_ENABLED = COLLIDER["collider:enabled"]
-"""Whether a collider counts."""
-COLLIDER_OFFSET = COLLIDER["collider:offset"]
-"""Distance kept from a collider, added to the garment's."""
-COLLIDER_SIDE = COLLIDER["collider:side"]
-"""Where cloth belongs at a collider."""

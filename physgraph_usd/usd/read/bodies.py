@@ -15,7 +15,8 @@ from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
-from ..lookup import COLLIDER_OFFSET, COLLIDER_SIDE, find_token, find_value
+from ..lookup import find_token, find_value
+from ..schema import COLLIDER
 from ..stage import Notice, timecode, value_at
 from .placement import is_flipped, place
 
@@ -149,8 +150,8 @@ def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None,
     if not UsdGeom.Mesh(prim) and kind not in _KINDS:
         return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
     kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
-    offset = find_value(prim, COLLIDER_OFFSET).at(None) or 0.0
-    side = find_token(prim, COLLIDER_SIDE)
+    offset = find_value(prim, COLLIDER["collider:offset"]).at(None) or 0.0
+    side = find_token(prim, COLLIDER["collider:side"])
     odd = (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
     return ColliderReader(prim, Collider(path, kind, offset, side), metres), odd
 

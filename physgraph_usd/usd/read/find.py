@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from ...errors import AbsentError, GarmentError, StageError
-from ..lookup import COLLIDER_ENABLED, is_on, with_ancestors
-from ..schema import COLLIDER_API, GARMENT_API
+from ..lookup import is_on, with_ancestors
+from ..schema import COLLIDER, COLLIDER_API, GARMENT_API
 from ..stage import TRAVERSAL, Notice, list_meshes
 
 _COLLECTION = ".collection:"
@@ -119,7 +119,7 @@ def targets_of(prim: Usd.Prim, name: str) -> list[Sdf.Path]:
 def _collides(prim: Usd.Prim) -> bool:
     """Whether a prim is a collider by our schema, or else by UsdPhysics."""
     if has_schema(prim, COLLIDER_API):
-        return is_on(prim, COLLIDER_ENABLED)
+        return is_on(prim, COLLIDER["collider:enabled"])
     collision = UsdPhysics.CollisionAPI(prim)
     return bool(collision) and bool(UsdGeom.Imageable(prim)) and collision.GetCollisionEnabledAttr().Get() is not False
 

@@ -21,7 +21,7 @@ from pxr import Sdf, Usd
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
-from ..lookup import ENABLED, check_limits, check_overrides, is_on, parse_overrides
+from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
 from ..schema import GARMENT
 from ..stage import (
@@ -66,7 +66,14 @@ class Shot:
     """
 
     def __init__(
-        self, path: str, stage: Usd.Stage, view: StageView, *, request: Request, readers: Sequence[GarmentReader]
+        self,
+        path: str,
+        stage: Usd.Stage,
+        view: StageView,
+        *,
+        request: Request,
+        readers: Sequence[GarmentReader],
+        bodies: Sequence[ColliderReader],
     ) -> None:
         """Put together the parts that ``open_shot`` read."""
         self.path, self.stage, self.view = path, stage, view
@@ -79,29 +86,9 @@ class Shot:
         self.sources: tuple[GarmentSource, ...] = tuple(
             replace(reader.source, times=snap(reader.source.times, times)) for reader in readers
         )
-        self.scene = Scene(tuple(reader.garment for reader in readers), request.units.gravity, times)
-        self._readers, self._request = tuple(readers), request
-        self._bodies: tuple[ColliderReader, ...] = ()
-
-    def add_colliders(
-        self, bodies: Sequence[ColliderReader], felt: Sequence[tuple[int, ...]], apart: Sequence[dict[str, str]]
-    ) -> None:
-        """Take colliders into the scene.
-
-        Args:
-            bodies: The colliders.
-            felt: For each garment, the numbers of those that it feels.
-            apart: For each garment, the colliders and garments that it never touches, and what excludes each.
-        """
-        self._bodies = tuple(bodies)
-        paths = {garment.path for garment in self.scene.garments}
-        garments = (
-            replace(garment, colliders=numbers, apart_from=tuple(path for path in excluded if path in paths))
-            for garment, numbers, excluded in zip(self.scene.garments, felt, apart, strict=True)
-        )
         colliders = tuple(body.collider for body in bodies)
-        self.scene = replace(self.scene, garments=tuple(garments), colliders=colliders)
-        self.sources = tuple(replace(s, apart_from=excluded) for s, excluded in zip(self.sources, apart, strict=True))
+        self.scene = Scene(tuple(reader.garment for reader in readers), request.units.gravity, times, colliders)
+        self._readers, self._bodies, self._request = tuple(readers), tuple(bodies), request
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
         """Matrix from a garment's local space to world metres, shape (4, 4), float64: ``world = M @ [local; 1]``.
@@ -229,18 +216,14 @@ def open_shot(
         notices += [Notice(path, None, message) for path, message in dict.fromkeys(beyond_limits_of_all(prims, found))]
         units, odd = read_units(stage)
         assumed = root_metadata(stage, "metersPerUnit") is None
-        prims = [
-            prim for prim in prims if is_on(prim, ENABLED, asked) or notices.append(_left_out(prim, "is disabled"))
-        ]
         bake = Bake(stage)
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
-        opened = Shot(path, stage, view, request=request, readers=readers)
-        _add_colliders(opened, bodies, colliders, notices=notices)
-        opened.selections = selections(
-            map(stage.GetPrimAtPath, [*(s.path for s in opened.sources), *bodies, *bake.prims()])
-        )
+        readers, solids = _link(stage, readers, bodies, wanted=colliders, metres=units.metres, notices=notices)
+        opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
+        read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
+        opened.selections = selections(map(stage.GetPrimAtPath, read))
     opened.unsaved = unsaved
     opened.colliders = tuple(str(path) for path in bodies)
     read_notices = [notice for reader in readers for notice in reader.notices]
@@ -272,28 +255,37 @@ def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) 
         raise kind(f"{error}; missing: {'; '.join(notice.message for notice in notices)}") from error
 
 
-def _add_colliders(shot: Shot, paths: Sequence[Sdf.Path], wanted: Sequence[str], *, notices: list[Notice]) -> None:
-    """Read the colliders and which garment feels which, but those that every garment is kept apart from."""
-    prims = [shot.stage.GetPrimAtPath(source.path) for source in shot.sources]
-    reachable = felt_by(shot.stage, prims, wanted)
-    excluded, odd = read_apart(shot.stage, prims)
-    notices += odd
+def _link(
+    stage: Usd.Stage,
+    readers: Sequence[GarmentReader],
+    paths: Sequence[Sdf.Path],
+    *,
+    wanted: Sequence[str],
+    metres: float,
+    notices: list[Notice],
+) -> tuple[list[GarmentReader], list[ColliderReader]]:
+    """Garments with the numbers of the colliders that they feel, and these colliders."""
+    prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
     cloth = {prim.GetPath() for prim in prims}
-    apart = [
-        {path: target for path, target in targets.items() if path in paths | cloth}
-        for paths, targets in zip(reachable, excluded, strict=True)
-    ]
-    felt = [{str(path) for path in paths - set(targets)} for paths, targets in zip(reachable, apart, strict=True)]
-    bodies, anywhere = [], set[str]().union(*felt)
+    reachable = felt_by(stage, prims, wanted)
+    excluded, odd = read_apart(stage, prims)
+    notices += odd
+    felt = [near - targets.keys() for near, targets in zip(reachable, excluded, strict=True)]
+    bodies = []
     for path in paths:
-        if str(path) not in anywhere:
-            continue
-        body, odd = read_collider(shot.stage.GetPrimAtPath(path), shot.metres_per_unit)
-        notices += odd
-        bodies += [body] if body is not None else []
-    order = {body.collider.path: number for number, body in enumerate(bodies)}
-    numbers = [tuple(sorted(order[path] for path in names & order.keys())) for names in felt]
-    shot.add_colliders(bodies, numbers, [{str(path): by for path, by in targets.items()} for targets in apart])
+        if any(path in near for near in felt):
+            body, odd = read_collider(stage.GetPrimAtPath(path), metres)
+            notices += odd
+            bodies += [body] if body is not None else []
+    numbers = {body.prim.GetPath(): number for number, body in enumerate(bodies)}
+    linked = []
+    for reader, near, targets in zip(readers, reachable, excluded, strict=True):
+        apart = {str(path): target for path, target in targets.items() if path in near | cloth}
+        others = tuple(str(path) for path in targets if path in cloth)
+        colliders = tuple(sorted(numbers[path] for path in (near - targets.keys()) & numbers.keys()))
+        garment = replace(reader.garment, colliders=colliders, apart_from=others)
+        linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
+    return linked, bodies
 
 
 def _read(
@@ -306,7 +298,9 @@ def _read(
     skip_invisible: bool,
 ) -> list[GarmentReader]:
     """Bake the skinning of garments and bodies and read every garment that is not left out."""
-    roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in prims}
+    on = [prim for prim in prims if is_on(prim, GARMENT["enabled"], request.overrides)]
+    notices += [_left_out(prim, "is disabled") for prim in prims if prim not in on]
+    roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in on}
     # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
     frames = None if request.frames is None or request.rest_frame is not None else (-math.inf, request.frames[1])
     notices += request.bake.add([*roots], frames, bodies=bodies)
