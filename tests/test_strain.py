@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import grid
 from pxr import UsdGeom, Vt
+from sheets import garment_of
 from shots import command, fine, refine, sample_times
 from stages import GARMENT_API, new_stage, save, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.mesh.fit import median_shape
-from physgraph_usd.solver.strain import strayed
+from physgraph_usd.solver.strain import strained_parts, strayed
 from physgraph_usd.usd.read.reader import open_shot
 
 SLEEVE = "/World/sleeve"
@@ -69,6 +71,14 @@ def test_stretched_parts_are_told_with_place_amount_and_remedy(tmp_path: Path):
     assert f"<{SLEEVE}>" in said
     assert "(default points)" in said
     assert f"{part['area_ratio']:.0%} of its area on {part['faces']} faces in its upper part" in said
+
+
+def test_a_part_is_named_by_height_and_axes():
+    mesh, rest = grid(6, 6)
+    garment = garment_of(mesh, rest)
+    large = rest * np.where((rest[:, :1] > rest[:, 0].mean()) & (rest[:, 1:2] > rest[:, 1].mean()), 1.5, 1.0)
+    for up, said in (((0, 1, 0), "in its upper part, towards +X"), ((0, 0, 1), "in its middle, towards +X and +Y")):
+        assert strained_parts(garment, [large], {}, up=np.array(up, float))[0].where == said
 
 
 def test_a_subset_that_covers_a_part_names_it(tmp_path: Path):

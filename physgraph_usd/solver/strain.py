@@ -140,5 +140,6 @@ def _where(garment: Garment, faces: np.ndarray, subsets: Mapping[str, np.ndarray
     height = int(np.abs(up).argmax())
     upper = "upper part" if at[height] * up[height] > 0 else "lower part"
     part = f"in its {upper if abs(at[height]) > THIRD and up.any() else 'middle'}"
-    sides = ["-+"[int(at[k] > 0)] + "XYZ"[k] for k in range(3) if abs(at[k]) > THIRD and (k != height or not up.any())]
+    across = [k for k in range(3) if abs(at[k]) > THIRD and not (k == height and up.any())]
+    sides = [("+" if at[k] > 0 else "-") + "XYZ"[k] for k in across]
     return part + (f", towards {' and '.join(sides)}" if sides else "")
