@@ -27,8 +27,8 @@ import torch
 
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import prepare_device
 from physgraph_usd.shot.settled import unsettled
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame import level_forces
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.refiner import Refiner

@@ -20,7 +20,7 @@ from typing import Any
 
 import trimesh
 
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.fabric import PRESETS

@@ -25,7 +25,8 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import label, surface_of
 from physgraph_usd.shot.page.raycast import BACKGROUND, View, draw, encode_color, fit_view
-from physgraph_usd.shot.refine import prepare_device, refine_shot
+from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.contact.bodies import FrameBodies
 from physgraph_usd.solver.contact.broad_phase import Bodies
 from physgraph_usd.solver.contact.cloth import ClothContact

@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.crossing_count import crossing_count
 from benchmarks.temporal import detail_of
 from physgraph_usd.lab.samples import write_sample
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.usd.read.reader import Shot, open_shot

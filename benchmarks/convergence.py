@@ -23,7 +23,7 @@ import torch
 
 from physgraph_usd.lab.chart.reference import Reference
 from physgraph_usd.lab.train.patches import PatchConfig, make_patches
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import METHODS

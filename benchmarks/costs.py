@@ -19,7 +19,8 @@ import click
 
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import prepare_device, refine_shot
+from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.usd.read.reader import open_shot
 
 from .contact_shots import REAL

@@ -28,7 +28,8 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import label, surface_of
 from physgraph_usd.shot.page.raycast import View, draw, fit_view
-from physgraph_usd.shot.refine import prepare_device, refine_shot
+from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
 
 LEVEL, PANEL, QUALITY = 2, (480, 540), "25"

@@ -19,7 +19,7 @@ import numpy as np
 
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.refiner import Refiner

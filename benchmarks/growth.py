@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.rows import say, table
 from benchmarks.unseen import opened_garment, plain_group
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
 from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton

@@ -19,7 +19,7 @@ import click
 import numpy as np
 
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Frame
 

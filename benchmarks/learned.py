@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from physgraph_usd.lab.chart.reference import Reference
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.integrate.base import Integrator
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.learned import integrator_of

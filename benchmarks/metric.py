@@ -18,7 +18,7 @@ from unittest import mock
 
 import torch
 
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame import level_forces
 from physgraph_usd.solver.integrate.metric import Metric, kept_to_edges
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton

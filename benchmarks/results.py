@@ -39,7 +39,7 @@ from benchmarks import (
 )
 from benchmarks.rows import HEAD, Found, Part, code_of
 from physgraph_usd import __version__
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.integrate.weights import FOLDER
 
 PAGE = Path("docs/notes/results.md")

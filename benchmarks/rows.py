@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 
 HEAD = ("| what | the paper | target | ours | |", "|---|---|---|---|---|")
 

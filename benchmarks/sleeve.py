@@ -23,7 +23,8 @@ from benchmarks.unseen import reference_of
 from physgraph_usd.lab.chart.reference import Reference
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import prepare_device, refine_shot
+from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings

@@ -22,7 +22,7 @@ from typing import cast
 import numpy as np
 import torch
 
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 from benchmarks.rows import Found, Row, show, table, under
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 
 PAPER_MS = {1_000: (0.037, 7.13), 10_000: (0.042, 9.74), 100_000: (0.051, 37.74), 1_000_000: (0.078, 343.08)}
 """Forces and integrator by number of springs [ms]."""

@@ -21,7 +21,7 @@ from benchmarks.rows import Found, Row, run_alone, say, table, under
 from benchmarks.shots import CORES, opened
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import prepare_device
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.mesh.subdivide import Refinement
 from physgraph_usd.solver.scene import Frame

@@ -21,7 +21,8 @@ from physgraph_usd.cli import main
 from physgraph_usd.errors import GarmentError
 from physgraph_usd.shot.estimate import cannot_fit, estimate, memory_there
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import ending, inspect_shot
+from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.shot.run import ending
 from physgraph_usd.shot.untagged import open_with_colliders
 from physgraph_usd.solver.colliders.pose import Collider, ShapePose
 from physgraph_usd.solver.contact.crowding import Crowding, CrowdingMeter
@@ -133,7 +134,7 @@ def test_a_long_run_says_after_three_frames_when_it_will_end(tmp_path: Path, mon
     assert re.fullmatch(r"3 of 48 frames in 30 s: all in about 8 min more, at \d\d:\d\d", ending(30.0, 48, 1))
     assert "about 4 min more" in ending(30.0, 48, 2)
     assert ending(0.3, 48, 1) == ""
-    monkeypatch.setattr("physgraph_usd.shot.refine.LONG_RUN", 0.0)
+    monkeypatch.setattr("physgraph_usd.shot.run.LONG_RUN", 0.0)
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0, 4.0, 5.0))
     done = CliRunner().invoke(main, ["refine", str(shot), "-o", str(tmp_path / "out.usdc"), "--level", "0"])
     assert done.exit_code == 0, done.output

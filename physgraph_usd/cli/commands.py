@@ -209,7 +209,7 @@ def chart(shot: str, out: Path, **options: Any) -> None:
 def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
     """Train a learned integrator and print its weights' path."""
     from ..lab.train.record import run_training
-    from ..shot.refine import prepare_device
+    from ..shot.solve import prepare_device
 
     prepare_device(device)
     click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))
@@ -222,7 +222,7 @@ def warm_up(device: str) -> None:
 
     They are kept in the folder that WARP_CACHE_PATH names, by default in the user's cache.
     """
-    from ..shot.refine import prepare_device
+    from ..shot.solve import prepare_device
     from ..solver.mesh.threads import compile_kernels
 
     prepare_device(device)

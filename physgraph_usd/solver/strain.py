@@ -136,7 +136,8 @@ def _where(garment: Garment, faces: np.ndarray, subsets: Mapping[str, np.ndarray
         return "all over it"
     corners = garment.mesh.indices[np.isin(garment.mesh.corner_face, faces)]
     low, size = garment.rest.min(axis=0), np.ptp(garment.rest, axis=0)
-    at = (garment.rest[corners].mean(axis=0) - low) / np.maximum(size, np.finfo(float).tiny) - 0.5
+    middle = garment.rest[corners].mean(axis=0) - low
+    at = np.divide(middle, size, out=np.full(3, 0.5), where=size > 0) - 0.5
     height = int(np.abs(up).argmax())
     upper = "upper part" if at[height] * up[height] > 0 else "lower part"
     part = f"in its {upper if abs(at[height]) > THIRD and up.any() else 'middle'}"

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UsageError
-from ..shot.refine import prepare_device
+from ..shot.solve import prepare_device
 from ..shot.untagged import AUTO, bodies_beside, open_with_colliders
 from ..shot.warnings import of_unfelt
 from ..solver.fabric import PRESETS

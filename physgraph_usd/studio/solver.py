@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 from ..shot.options import RefineOptions
-from ..shot.refine import MOST_THREADS, sampled_at
+from ..shot.solve import MOST_THREADS, sampled_at
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.frame.settings import SolveSettings

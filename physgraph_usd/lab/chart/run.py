@@ -16,7 +16,7 @@ import torch
 
 from ...errors import UsageError
 from ...shot.options import RefineOptions
-from ...shot.refine import MOST_THREADS, prepare_device
+from ...shot.solve import MOST_THREADS, prepare_device
 from ...shot.untagged import open_with_colliders
 from ...solver.resolution import choose_levels, sample_frames
 from ...solver.scene import Frame, Scene

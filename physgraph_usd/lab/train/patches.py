@@ -22,7 +22,7 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ...shot.refine import prepare_device
+from ...shot.solve import prepare_device
 from ...solver.contact.settings import ContactSettings
 from ...solver.fabric import Fabric
 from ...solver.forces.base import ForceModule

@@ -1,0 +1,128 @@
+"""Solves frames of a shot: the one place where USD meets the solver; picks device and threads."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time as clock
+from collections.abc import Generator, Sequence
+from typing import Any
+
+import torch
+
+from ..errors import SolveError, StageError, UsageError
+from ..solver.frame.lead_in import cages_walked
+from ..solver.frame.refiner import Refiner
+from ..solver.mesh.threads import start_warp
+from ..usd.read.reader import Shot
+from ..usd.view import Stage
+from .frames import Outcome
+from .options import RefineOptions
+from .untagged import open_with_colliders
+
+MOST_THREADS = 4
+"""Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
+Outcomes = Generator[Outcome, None, None]
+
+
+def prepare_device(device: str) -> None:
+    """Start Warp, and keep torch on one thread: its sums depend on how many share them.
+
+    Raises:
+        UsageError: CUDA was asked for and is not there.
+    """
+    start_warp()
+    torch.set_num_threads(1)
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device cpu")
+
+
+def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
+    """Open a shot with the options that concern reading."""
+    return open_with_colliders(
+        shot,
+        garments=options.garments,
+        colliders=options.colliders,
+        frames=options.frames if options.preroll is None else None,
+        level=options.level,
+        overrides=options.overrides,
+        rest_frame=options.rest_frame,
+    )
+
+
+class ShotSolver:
+    """Solves time codes of a shot, in this process or in one that it is sent to.
+
+    Attributes:
+        levels: Subdivisions of each garment.
+    """
+
+    def __init__(self, shot: str, levels: list[int], options: RefineOptions, *, opened: Shot | None = None) -> None:
+        """Take a shot, for this process open; each other one opens it for itself."""
+        self.levels = levels
+        self._shot, self._options = shot, dataclasses.replace(options, progress=None)
+        self._threads = min(MOST_THREADS, max(1, (os.cpu_count() or 1) // options.workers))
+        self._opened = opened
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the stage behind, since each process opens its own, perhaps in another folder."""
+        weights = self._options.weights
+        options = self._options if weights is None else dataclasses.replace(self._options, weights=weights.absolute())
+        return self.__dict__ | {"_opened": None, "_shot": os.path.abspath(self._shot), "_options": options}
+
+    def __call__(self, times: Sequence[float | None]) -> Outcomes:
+        """Solve time codes in order; one that fails yields its error, and the next starts from the last good one."""
+        device = self._options.device
+        prepare_device(device)
+        shot = self._opened = self._opened or open_for(self._shot, self._options)
+        settings = self._options.solve_settings()
+        options = {"device": device, "threads": self._threads, "heat_map": self._options.heat_map}
+        refiner = Refiner(shot.scene, settings, levels=self.levels, **options)
+        self._begin(shot, refiner, times)
+        for time in times:
+            began = clock.perf_counter()
+            try:
+                frame = shot.frame(time)
+                read_ms = round(1e3 * (clock.perf_counter() - began), 3)
+                state = refiner.solve(frame, sampled_at(shot, time))
+            except (SolveError, StageError) as error:
+                yield Outcome(time, (), (), {"time": time, "error": str(error)})
+                continue
+            record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
+            yield Outcome(time, state.points, state.reused, record, state.heat)
+
+    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
+        """Begin in the middle of a shot, where its cage crosses, with the cage walked there from an earlier frame."""
+        earlier = [] if not times or times[0] is None else shot.times_until(times[0])
+        settings = {"times": earlier, "device": self._options.device, "threads": self._threads}
+        found = cages_walked(shot.scene, self._options.solve_settings(), shot.frame, **settings)
+        if found is not None:
+            refiner.begin_at(found[0], since=found[1])
+
+
+def sampled_at(shot: Shot, time: float | None) -> list[bool]:
+    """For each garment, whether the layer gets a sample at a time code: its own authored times, or the first of all."""
+    first = shot.scene.times[0] if shot.scene.times else None
+    return [time in source.times if source.times else time == first for source in shot.sources]
+
+
+def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[str, float]:
+    """Wall time of a frame from nothing, of the one after it, and of the whole shot by these [s].
+
+    Args:
+        shot: The shot, of which two frames in the middle are solved.
+        options: Those of a run.
+        levels: Subdivisions of each garment.
+    """
+    prepare_device(options.device)
+    threads = min(MOST_THREADS, max(1, os.cpu_count() or 1))
+    refiner = Refiner(shot.scene, options.solve_settings(), levels=levels, device=options.device, threads=threads)
+    times, spent = list(shot.scene.times) or [None], []
+    middle = (len(times) - 1) // 2
+    for time in times[middle : middle + 2]:
+        began = clock.perf_counter()
+        refiner.solve(shot.frame(time))
+        spent.append(clock.perf_counter() - began)
+    whole = spent[0] + spent[-1] * (len(times) - 1)
+    seconds = {"first_frame_seconds": spent[0], "seconds_a_frame": spent[-1], "whole_shot_seconds": whole}
+    return {name: float(f"{value:.3g}") for name, value in seconds.items()}
