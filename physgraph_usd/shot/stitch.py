@@ -26,7 +26,7 @@ from ..usd.stage import is_there, pxr_errors, quiet
 from ..usd.times import within
 from ..usd.write.atomic import prepare_target
 from ..usd.write.chunk import ChunkLayer, Frame, Points, mean_edge, open_chunk, vertex_count
-from ..usd.write.stitch import SeamFrames, joined_record, targets_of, write_clips, write_layer
+from ..usd.write.stitch import joined_record, targets_of, write_clips, write_layer
 from ..usd.write.track import to_local
 from .frames import Lead, Outcome
 from .joined import Joint, Mover, Positions, SafeMover, join
@@ -87,8 +87,8 @@ def stitch(
         frames: First and last time code that the layer must have; None for all of the shot.
         seam_bound: Most that a seam may add to a frame's move, RMS over a garment, in mean fine edge lengths.
         clips: Leave the chunks where they are and make ``out`` a small layer that plays them as value clips. Beside it
-            come ``<out>.topology.usdc`` with what does not move, ``<out>.manifest.usda``, and ``<out>.seam<time>.usdc``
-            with the frames in which two chunks are joined.
+            come ``<out>.topology.usdc``, with what does not move and the frames in which two chunks are joined, and
+            ``<out>.manifest.usda``.
         root: A small root layer to write, with the layer over the shot.
         overwrite: Whether existing files may be replaced.
 
@@ -106,17 +106,19 @@ def stitch(
         shot = _check_alike(parts)
         _check_frames(parts, frames)
         inputs = {part.file for part in parts} | files_of(shot)
-        targets = targets_of(parts, out, clips=clips) | ({} if root is None else {"root": Path(root)})
+        targets = targets_of(out, clips=clips) | ({} if root is None else {"root": Path(root)})
         check_targets([(f"the {what}", path) for what, path in targets.items()], inputs)
         if root is not None:
             prepare_target(Path(root), overwrite=overwrite)
         seams, made = _join_each(list(pairwise(parts)), shot)
         _check_seams(parts, seams, seam_bound)
         record = joined_record(parts, shot, out, frames=frames)
+        how = {"shot": shot, "overwrite": overwrite}
         if clips:
-            write_clips(parts, _seam_frames(parts, made), out, record, shot=shot, overwrite=overwrite)
+            begins, windows = _windows(parts, made)
+            write_clips(parts, _frames(parts, made, only=windows), begins, out, record, **how)
         else:
-            write_layer(parts, _frames(parts, made), out, record, shot=shot, overwrite=overwrite)
+            write_layer(parts, _frames(parts, made), out, record, **how)
         if root is not None:
             absolute = Path(str(parts[0].record["shot"])).is_absolute()
             write_root(Path(root), layer=out, shot=shot, absolute=absolute, overwrite=overwrite)
@@ -339,15 +341,18 @@ def _frames(
                 yield replace(frame, points={**frame.points, **made.get(time, {})})
 
 
-def _seam_frames(parts: Sequence[ChunkLayer], made: Mapping[float, Points]) -> list[SeamFrames]:
-    """The frames of each seam that are made anew, two before and one after them, by which velocities are known."""
-    found, every = [], parts[0].chunk.every
+def _windows(parts: Sequence[ChunkLayer], made: Mapping[float, Points]) -> tuple[dict[Path, float], set[float]]:
+    """Time codes from which joined frames are shown, by the chunk after them, and those of all frames that this takes.
+
+    They are the frames made anew, two before and one after them, by which velocities are known.
+    """
+    begins, windows, every = {}, set(), parts[0].chunk.every
     for before, after in pairwise(parts):
         if anew := [time for time in before.chunk.times if time in made]:
             first, seam = every.index(anew[0]), every.index(after.chunk.times[0])
-            frames = list(_frames(parts, made, only=every[max(first - 2, 0) : seam + 1]))
-            found.append(SeamFrames(after, every[max(first - 1, 0)], frames))
-    return found
+            begins[after.file] = every[max(first - 1, 0)]
+            windows |= set(every[max(first - 2, 0) : seam + 1])
+    return begins, windows
 
 
 def _mover(stack: ExitStack, shot: Path, parts: Sequence[ChunkLayer]) -> tuple[list[str], Mover]:

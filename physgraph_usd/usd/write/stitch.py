@@ -39,21 +39,6 @@ _MOVING = ("points", "normals", "extent", "velocities", *(PREFIX + name for name
 """Properties of a fine mesh whose samples are written anew."""
 
 
-@dataclass(frozen=True, eq=False)
-class SeamFrames:
-    """The frames in which two chunks are joined, and those beside them.
-
-    Attributes:
-        after: The chunk after the seam.
-        begin: Time code from which they are shown in place of the chunk before.
-        frames: Two before the first that is joined, those that are, and the first after the seam.
-    """
-
-    after: ChunkLayer
-    begin: float
-    frames: Sequence[Frame]
-
-
 @dataclass(frozen=True)
 class _Clip:
     """A layer that is played from a time code on."""
@@ -63,16 +48,10 @@ class _Clip:
     begin: float = -inf
 
 
-def targets_of(parts: Sequence[ChunkLayer], out: Path, *, clips: bool) -> dict[str, Path]:
-    """Files that may be written, by what they are."""
+def targets_of(out: Path, *, clips: bool) -> dict[str, Path]:
+    """Files that are written, by what they are."""
     beside = {"topology": out.with_suffix(".topology.usdc"), "manifest": out.with_suffix(".manifest.usda")}
-    seams = {f"seam at {part.chunk.times[0]:g}": _seam_file(out, part) for part in parts[1:]}
-    return {"layer": out} | (beside | seams if clips else {})
-
-
-def _seam_file(out: Path, after: ChunkLayer) -> Path:
-    """The clip with the joined frames before a chunk."""
-    return out.with_suffix(f".seam{after.chunk.times[0]:g}.usdc")
+    return {"layer": out} | (beside if clips else {})
 
 
 def joined_record(
@@ -226,18 +205,20 @@ def _normals(layer: Sdf.Layer, path: str) -> VertexNormals:
 
 def write_clips(
     parts: Sequence[ChunkLayer],
-    seams: Sequence[SeamFrames],
+    frames: Iterable[Frame],
+    begins: Mapping[Path, float],
     out: Path,
     record: Mapping[str, Any],
     *,
     shot: Path,
     overwrite: bool,
 ) -> None:
-    """Write what does not move, the joined frames, the manifest, and a layer that plays the chunks with them.
+    """Write a layer that plays the chunks, the manifest, and one with what does not move and the joined frames.
 
     Args:
         parts: The chunks, in order; they stay where they are.
-        seams: The frames that are not as a chunk has them.
+        frames: The frames in which two chunks are joined, with those beside them.
+        begins: Time code from which these are shown before a chunk, by the chunk's file.
         out: The layer.
         record: Its record.
         shot: The shot, which need not be there.
@@ -247,17 +228,19 @@ def write_clips(
         UsageError: A file exists and may not be replaced.
         LayerError: A file cannot be written, or USD does not show what the chunks hold.
     """
-    joined = {seam.after.file: seam for seam in seams}
-    unwanted = {f"seam at {part.chunk.times[0]:g}" for part in parts if part.file not in joined}
-    targets = {what: path for what, path in targets_of(parts, out, clips=True).items() if what not in unwanted}
+    targets = targets_of(out, clips=True)
     for path in targets.values():
         check_suffix("the layer", path, LAYER_SUFFIXES)
         prepare_target(path, overwrite=overwrite)
-    export_layer(_still(parts, out), targets["topology"])
+    with LayerStream(targets["topology"], overwrite=overwrite) as stream:
+        stream.layer.TransferContent(_still(parts, out))
+        _write_frames(stream, parts, frames)
+        stream.commit()
+    joined = Sdf.Layer.FindOrOpen(str(targets["topology"]))
     clips = []
     for part in parts:
-        if part.file in joined:
-            clips.append(_seam_clip(joined[part.file], parts, _seam_file(out, part)))
+        if part.file in begins:
+            clips.append(_Clip(targets["topology"], joined, begins[part.file]))
         clips.append(_Clip(part.file, part.layer))
     root, manifest = _clip_root(clips, out, record["garments"], manifest=targets["manifest"].name)
     root.subLayerPaths.append(f"./{targets['topology'].name}")
@@ -265,15 +248,6 @@ def write_clips(
     export_layer(manifest, targets["manifest"])
     export_layer(root, out)
     _check_clips(clips, record["garments"], shot, out)
-
-
-def _seam_clip(seam: SeamFrames, parts: Sequence[ChunkLayer], file: Path) -> _Clip:
-    """Write the frames of a seam."""
-    with LayerStream(file, overwrite=True) as stream:
-        stream.layer.timeCodesPerSecond = parts[0].layer.timeCodesPerSecond
-        _write_frames(stream, parts, seam.frames)
-        stream.commit()
-    return _Clip(file, Sdf.Layer.FindOrOpen(str(file)), seam.begin)
 
 
 def _shown(clips: Sequence[_Clip], path: str) -> list[tuple[_Clip, list[float]]]:
