@@ -23,6 +23,14 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.usd.read.reader import open_shot
 
 
+def test_the_mean_beside_a_vertex_is_that_of_its_neighbours():
+    level = levels_of(named(square(3), "A"), named(square(3), "B"))[-1]
+    mesh = ClothMesh(level, np.ones((2, 2), bool), np.array([[0, level.vertex_count // 2]]))
+    values, near = torch.randn((level.vertex_count, 3), dtype=torch.float64), mesh.beside.toarray()
+    expected = near @ values.numpy() / near.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(mesh.mean_beside(values).numpy(), expected, rtol=1e-12)
+
+
 class TestRepairedCage:
     def test_a_cage_between_no_parts_is_followed_itself(self):
         """Whether it crosses itself or not, and also where it goes through a body."""
