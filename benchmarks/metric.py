@@ -20,13 +20,13 @@ import torch
 
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame import level_forces
-from physgraph_usd.solver.integrate.metric import Metric, kept_to_edges
+from physgraph_usd.solver.integrate.metric import Metric, on_edges
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 
 from .rows import say, table
 from .unseen import Case, cases, descend
 
-MATRICES: dict[str, Callable] = {"kept to the edges": kept_to_edges, "whole": lambda matrix, edges: matrix}
+MATRICES: dict[str, Callable] = {"couplings along edges": on_edges, "whole": lambda matrix, edges: matrix}
 SCHEDULE = (10, 10, 5)
 REPEATS = 9
 
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def measured_with(keep: Callable, shot: str, least: Path) -> tuple[float, ...]:
     """`measured` of a garment whose matrix is made so; ``least`` keeps the least energy known."""
-    with mock.patch.object(level_forces, "kept_to_edges", keep):
+    with mock.patch.object(level_forces, "on_edges", keep):
         return measured(next(iter(cases(shots=(shot,), fabrics=("jersey",), cache=least))))
 
 

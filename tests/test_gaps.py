@@ -12,7 +12,7 @@ from folds import EDGE, curved, flat, folded, levels_of, named, placed, square, 
 from test_tangles import pair
 
 from physgraph_usd.solver.contact.cloth import ClothView
-from physgraph_usd.solver.forces.self_contact import Gaps, SelfContact
+from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 
 QUIET: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "flat": flat,
@@ -45,7 +45,7 @@ class TestOneSheet:
         term = view.term(x)
         assert isinstance(term, SelfContact)
         beside, nearest = view.mesh.beside.toarray() > 0, []
-        pushes = term.gaps.lacks(x).abs() > 0
+        pushes = term.gaps.penetration(x).abs() > 0
         for corners, weights in zip(term.gaps.corners[pushes].tolist(), term.gaps.weight[pushes].tolist(), strict=True):
             of = [[c for c, w in zip(corners, weights, strict=True) if side * w > 1e-6] for side in (1.0, -1.0)]
             nearest.append(min(1 if beside[a, b] else 2 for a in of[0] for b in of[1]))
@@ -55,7 +55,7 @@ class TestOneSheet:
 class TestCrossing:
     """Two sheets of 4 by 4 cells that cross."""
 
-    def gaps(self, x: torch.Tensor) -> tuple[ClothView, Gaps]:
+    def gaps(self, x: torch.Tensor) -> tuple[ClothView, PairConstraints]:
         garments = [named(square(4), name) for name in "AB"]
         view = view_of(levels_of(*garments), garments, thickness=0.4 * EDGE)
         term = view.term(x)
@@ -77,7 +77,7 @@ class TestCrossing:
 class TestLayers:
     """Two wavy sheets of 8 by 8 cells, 8 mm apart; their fronts face down, so outside is below."""
 
-    def lacks(self, height: float, turn: float, *, upper_is_outer: bool, order: bool = True) -> np.ndarray:
+    def penetration(self, height: float, turn: float, *, upper_is_outer: bool, order: bool = True) -> np.ndarray:
         """How far each pair is under what it keeps [m]; waves are so many fine edges high, and turn so fast an edge."""
         layers = (0, 1) if upper_is_outer else (1, 0)
         garments = [named(square(8), name, layer=layer) for name, layer in zip("AB", layers, strict=True)]
@@ -96,19 +96,19 @@ class TestLayers:
         # Towards where it belongs the outer sheet goes down, which raises the inner one against it.
         first = term.gaps.corners[:, 0].long() >= len(x) // 2
         up = torch.where(first, term.gaps.normal[:, 1], -term.gaps.normal[:, 1])
-        return torch.sign(up).numpy() * term.gaps.lacks(x).abs().numpy()
+        return torch.sign(up).numpy() * term.gaps.penetration(x).abs().numpy()
 
     @pytest.mark.parametrize(("height", "turn"), [(0.0, 1.0), (1.0, 1.0), (1.0, 1.5), (2.0, 1.0)])
     def test_none_is_sent_back_that_lies_right(self, height: float, turn: float):
         """Beyond the next wave an outer sheet lies behind the inner one's normals, and is outside all the same."""
-        assert self.lacks(height, turn, upper_is_outer=False).min() > -1e-6
+        assert self.penetration(height, turn, upper_is_outer=False).min() > -1e-6
 
     @pytest.mark.parametrize("height", [0.0, 0.5])
     def test_all_are_sent_back_that_lie_wrong(self, height: float):
-        assert (self.lacks(height, 1.0, upper_is_outer=True) < -0.001).mean() > 0.95
+        assert (self.penetration(height, 1.0, upper_is_outer=True) < -0.001).mean() > 0.95
 
     def test_nor_is_any_where_nobody_asked_for_the_order(self):
-        assert self.lacks(0.0, 1.0, upper_is_outer=True, order=False).min() > -1e-6
+        assert self.penetration(0.0, 1.0, upper_is_outer=True, order=False).min() > -1e-6
 
 
 def test_the_energy_of_each_pair_counts_for_the_garment_of_its_first_corner():
@@ -120,7 +120,9 @@ def test_the_energy_of_each_pair_counts_for_the_garment_of_its_first_corner():
     whole, _ = evaluate(term, x.float())
     energy, owner = term.split(x.float())
     gaps = term.gaps
-    np.testing.assert_allclose(energy.numpy(), 0.5 * gaps.stiffness * gaps.lacks(x.float()) ** 2, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        energy.numpy(), 0.5 * gaps.stiffness * gaps.penetration(x.float()) ** 2, rtol=1e-5, atol=1e-12
+    )
     assert float(energy.sum()) == pytest.approx(float(whole), rel=1e-5)
     assert float(whole) > 0
     upper = gaps.corners[:, 0] >= len(x) // 2

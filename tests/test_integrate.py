@@ -15,7 +15,7 @@ from physgraph_usd.errors import SolveError, UsageError
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.integrate import LEARNED, METHODS, method_named
 from physgraph_usd.solver.integrate.base import Carry, ForceField, Integrator, System
-from physgraph_usd.solver.integrate.metric import REGULARISATION, Metric, kept_to_edges
+from physgraph_usd.solver.integrate.metric import REGULARISATION, Metric, on_edges
 from physgraph_usd.solver.integrate.newton import Newton
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, backtrack
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
@@ -128,7 +128,7 @@ class TestKeptToEdges:
         field = system.field
         assert isinstance(field, ForceModule)
         edges = level.edges.numpy()
-        return field.rest_matrix(), kept_to_edges(field.rest_matrix(), edges), edges
+        return field.rest_matrix(), on_edges(field.rest_matrix(), edges), edges
 
     def test_row_sums_are_kept(self):
         whole, kept, _ = self.matrices()

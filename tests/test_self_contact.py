@@ -12,14 +12,14 @@ from sheets import irregular, level_of, rotation
 from test_force_hessians import dense
 from test_forces import crumple
 
-from physgraph_usd.solver.forces.self_contact import Gaps, SelfContact
+from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 
 POINTS, TRIANGLES = irregular(0.4, 0.3, 0.1)
 LEVEL = level_of(POINTS, TRIANGLES)
 X = crumple(POINTS, 0.05, 8)
 
 
-def gaps_of(x: torch.Tensor, count: int = 40, *, lack: float | None = None, seed: int = 0) -> Gaps:
+def gaps_of(x: torch.Tensor, count: int = 40, *, lack: float | None = None, seed: int = 0) -> PairConstraints:
     """Random pairs, vertex-face ones first; all short of their offset by the same, or by anything between +-2 cm."""
     rng = np.random.default_rng(seed)
     corners = torch.as_tensor(np.array([rng.choice(len(x), 4, replace=False) for _ in range(count)]), dtype=torch.int32)
@@ -33,7 +33,7 @@ def gaps_of(x: torch.Tensor, count: int = 40, *, lack: float | None = None, seed
     normal = rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     none = torch.zeros(count, dtype=x.dtype)
-    made = Gaps(corners, torch.as_tensor(weight), torch.as_tensor(normal), none, none)
+    made = PairConstraints(corners, torch.as_tensor(weight), torch.as_tensor(normal), none, none)
     offset = (made.vectors(x) * made.normal).sum(dim=1)
     short = torch.as_tensor(rng.uniform(-0.02, 0.02, count)) if lack is None else torch.full_like(none, lack)
     return replace(made, offset=offset + short, stiffness=torch.as_tensor(rng.uniform(10, 1000, count)))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..errors import NOTICE, SolveError, counted
 from ..solver.level import refine_garments
-from ..solver.mesh.threads import kernels_are_kept
+from ..solver.mesh.threads import kernels_are_compiled
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED
 from ..usd.read.reader import Shot
 from ..usd.view import Layer
@@ -63,7 +63,7 @@ class Run:
             LayerError: The layer cannot be written.
         """
         began = clock.perf_counter()
-        if not kernels_are_kept():
+        if not kernels_are_compiled():
             LOG.info("kernels are compiled, once on this machine: some 15 s; physgraph-usd warm-up does it ahead")
         layer = self._write_layer()
         self.report.seconds["total"] = self.report.seconds["open"] + clock.perf_counter() - began

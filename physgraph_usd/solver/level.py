@@ -29,7 +29,7 @@ QUAD_SPRING = (0.75, 1.5)
 splits them, are isotropic with nu = 1/3; else Y varies from 0.75 to 1.2 with direction (docs/notes/calibration.md)."""
 
 QUAD_HINGE = (1.28, 0.64)
-"""The same for hinges: D is then 1 in all directions instead of 0.86 to 1.36."""
+"""Such factors of hinges: D is then 1 in all directions instead of 0.86 to 1.36."""
 
 PIN_MARGIN = 1e-6
 """A pin within this of 1 is exact."""
@@ -267,10 +267,10 @@ def _sound(split: TriangleSplit, rest: np.ndarray) -> TriangleSplit:
     corners = rest[split.triangles]
     sides = corners - np.roll(corners, 1, axis=1)
     area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    kept = np.zeros(len(area), bool)
-    kept[np.unique(np.sort(split.triangles, axis=1), axis=0, return_index=True)[1]] = True
-    kept &= area > FLAT * (sides**2).sum(axis=2).max(axis=1)
-    return split if kept.all() else TriangleSplit(split.triangles[kept], split.face[kept])
+    valid = np.zeros(len(area), bool)
+    valid[np.unique(np.sort(split.triangles, axis=1), axis=0, return_index=True)[1]] = True
+    valid &= area > FLAT * (sides**2).sum(axis=2).max(axis=1)
+    return split if valid.all() else TriangleSplit(split.triangles[valid], split.face[valid])
 
 
 def _join(

@@ -33,7 +33,7 @@ EDGES_PER_WAVE = 5.0
 FEWEST_EDGES = 2.0
 """No mesh carries a wave of fewer edges: what would fold so folds at the mesh's own size."""
 SHARP_FOLD = math.radians(45.0)
-SHARP_SHARE = 0.01
+SHARP_FRACTION = 0.01
 """Share of sharp folds above which the mesh shows: 0.1% on the T-shirt at level 3, 1.1% at level 2, where it does."""
 LEAST_TENSION = 1e-9
 """[N/m]; cloth without stiffness does not buckle."""
@@ -68,7 +68,7 @@ class LevelChoice:
 
 
 def finer(level: int, needed: int, edge: float) -> str:
-    """What to do about a mesh that is too coarse: the same wherever a run or a look at a shot says so.
+    """The remedy for a mesh that is too coarse, in words.
 
     Args:
         level: The garment's number of subdivisions.
@@ -82,9 +82,9 @@ def finer(level: int, needed: int, edge: float) -> str:
     if target <= level:
         return f"raise bendStiffness: level {LIMIT} is the finest"
     step = target - level
-    said = f"use --level {target}, with edges of {1e3 * edge / 2**step:.1f} mm, for up to {4**step} times the time"
+    text = f"use --level {target}, with edges of {1e3 * edge / 2**step:.1f} mm, for up to {4**step} times the time"
     return (
-        said + (" (the finest, and not all of what is needed)" if needed > LIMIT else "") + ", or raise bendStiffness"
+        text + (" (the finest, and not all of what is needed)" if needed > LIMIT else "") + ", or raise bendStiffness"
     )
 
 
@@ -133,13 +133,13 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     strain, edge = _compression(rest, ends, frames), float(rest.mean())
     fabric = frames[0].fabric
     wave = 2.0 * math.pi * math.sqrt(fabric.bend / max(fabric.stretch * strain, LEAST_TENSION))
-    said = f"wrinkles of {1e3 * wave:.1f} mm (compression {strain:.2g}), cage edges of {1e3 * edge:.1f} mm"
+    text = f"wrinkles of {1e3 * wave:.1f} mm (compression {strain:.2g}), cage edges of {1e3 * edge:.1f} mm"
     needed = math.ceil(math.log2(max(edge * EDGES_PER_WAVE / max(wave, SHORTEST_WAVE * edge), 1.0)))
-    level, reason = garment.level, f"as authored or asked for; {said}"
+    level, reason = garment.level, f"as authored or asked for; {text}"
     if level == AUTO:
         level, reason = (
             min(needed, MOST),
-            f"auto: {said}" + (f", which takes no more than level {MOST}" * (needed > MOST)),
+            f"auto: {text}" + (f", which takes no more than level {MOST}" * (needed > MOST)),
         )
     fine = edge / 2**level
     choice = LevelChoice(

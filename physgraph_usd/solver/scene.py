@@ -109,7 +109,7 @@ class GarmentFrame:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What the stage gives at one time code.
+    """The stage at one time code.
 
     Attributes:
         time: The stage's own time code; None for a shot without samples.
@@ -124,7 +124,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stays the same over the shot.
+    """The constant part of a shot.
 
     Attributes:
         garments: The garments to refine.
@@ -141,7 +141,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What was computed at one time code.
+    """The result at one time code.
 
     Attributes:
         time: The stage's own time code; None for a shot without samples.
@@ -183,13 +183,13 @@ def refuse_far(scene: Scene, frame: Frame) -> None:
     Raises:
         GarmentError: With the prim, the time code and the point.
     """
-    for garment, own in zip(scene.garments, frame.garments, strict=True):
-        if said := out_of_bounds(own.points) or _unsolvable(garment, own.points):
-            raise GarmentError(garment.path, said, time=frame.time, remedy=_REMEDY)
+    for garment, garment_frame in zip(scene.garments, frame.garments, strict=True):
+        if problem := out_of_bounds(garment_frame.points) or _unsolvable(garment, garment_frame.points):
+            raise GarmentError(garment.path, problem, time=frame.time, remedy=_REMEDY)
     for collider, pose in zip(scene.colliders, frame.colliders, strict=False):
         corners = np.zeros((0, 3)) if pose is None else pose.corners()
-        if said := out_of_bounds(corners[~np.isnan(corners).any(axis=1)]):
-            raise GarmentError(collider.path, said, time=frame.time, remedy=_REMEDY)
+        if problem := out_of_bounds(corners[~np.isnan(corners).any(axis=1)]):
+            raise GarmentError(collider.path, problem, time=frame.time, remedy=_REMEDY)
 
 
 def _unsolvable(garment: Garment, points: np.ndarray) -> str:
@@ -225,12 +225,14 @@ def refuse_falling(scene: Scene, frame: Frame) -> None:
     """
     if len(scene.garments) > 1:
         return
-    for garment, own in zip(scene.garments, frame.garments, strict=True):
-        weight = own.fabric.density * float(np.linalg.norm(scene.gravity))
-        held = garment.colliders or (garment.pin > 0).any() or not len(own.points)
-        size = max(SPECK, *(float(np.ptp(x, axis=0).max(initial=0.0)) for x in (own.points, garment.rest)))
-        stiffness = own.guide * float(garment.guide_scale.mean())
+    for garment, garment_frame in zip(scene.garments, frame.garments, strict=True):
+        weight = garment_frame.fabric.density * float(np.linalg.norm(scene.gravity))
+        held = garment.colliders or (garment.pin > 0).any() or not len(garment_frame.points)
+        size = max(SPECK, *(float(np.ptp(x, axis=0).max(initial=0.0)) for x in (garment_frame.points, garment.rest)))
+        stiffness = garment_frame.guide * float(garment.guide_scale.mean())
         if not held and weight > FALLS * size * stiffness:
             sinks = "without end" if stiffness == 0 else f"by {weight / stiffness:.3g} m"
-            said = f"nothing holds it up but a guide of {own.guide:g} N/m^3: it would sink {sinks}"
-            raise GarmentError(garment.path, said, time=frame.time, remedy="raise physgraph:guide:stiffness, or pin it")
+            problem = f"nothing holds it up but a guide of {garment_frame.guide:g} N/m^3: it would sink {sinks}"
+            raise GarmentError(
+                garment.path, problem, time=frame.time, remedy="raise physgraph:guide:stiffness, or pin it"
+            )

@@ -18,7 +18,7 @@ STRAINED = 1.1
 """Area over rest area, or its inverse, from which a face is strained."""
 SHRUNK = 0.25
 """Area over rest area under which cloth is not gathered: the rest shape is another one's, or broken."""
-LEAST_SHARE = 0.01
+LEAST_FRACTION = 0.01
 """Of the garment's rest area; smaller parts, such as single faces in a fold, are passed over."""
 COVERED = 0.9
 """Share of a part's faces inside a subset that gives it its name."""
@@ -71,7 +71,7 @@ def strained_parts(
     for strained in (ratio > STRAINED, ratio < 1.0 / STRAINED):
         for faces in _connected(garment, np.flatnonzero(strained)):
             share = float(rest[faces].sum() / rest.sum())
-            if share >= LEAST_SHARE:
+            if share >= LEAST_FRACTION:
                 size = float(np.median(areas[:, faces].sum(axis=1)) / rest[faces].sum())
                 where = _where(garment, faces, subsets, up)
                 parts.append(StrainedPart(where, len(faces), round(size, 3), round(share, 4)))
@@ -96,12 +96,12 @@ def strayed(cage: np.ndarray, fine: np.ndarray, *, before: np.ndarray | None = N
     if not len(cage) or not len(fine):
         return ""
     earlier = cage if before is None else before
-    size, own, known = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (cage, fine, earlier))
+    size, fine_size, earlier_size = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (cage, fine, earlier))
     away = float(np.linalg.norm(fine.mean(axis=0) - cage.mean(axis=0)))
     if away > size:
         return f"the refined cloth lies {1e3 * away:.4g} mm from its cage, which is {1e3 * size:.4g} mm large"
-    if not min(size, known) / LARGEST <= own <= LARGEST * size:
-        return f"the refined cloth is {1e3 * own:.4g} mm large, its cage {1e3 * size:.4g} mm"
+    if not min(size, earlier_size) / LARGEST <= fine_size <= LARGEST * size:
+        return f"the refined cloth is {1e3 * fine_size:.4g} mm large, its cage {1e3 * size:.4g} mm"
     return ""
 
 
@@ -129,7 +129,7 @@ def _connected(garment: Garment, faces: np.ndarray) -> list[np.ndarray]:
 
 def _where(garment: Garment, faces: np.ndarray, subsets: Mapping[str, np.ndarray], up: np.ndarray) -> str:
     """The smallest subset that covers the faces, or in which part of the rest shape's bounding box they are."""
-    covering = [name for name, own in subsets.items() if np.isin(faces, own).mean() >= COVERED]
+    covering = [name for name, inside in subsets.items() if np.isin(faces, inside).mean() >= COVERED]
     if covering:
         return f"in GeomSubset {min(covering, key=lambda name: len(subsets[name]))}"
     if 4 * len(faces) > 3 * garment.mesh.face_count:

@@ -20,7 +20,7 @@ from ..collide.near import near_pairs
 from ..collide.parts import Parts
 from ..collide.sweep import Listed, Reach
 from ..forces.seam import Seam
-from ..forces.self_contact import Gaps, SelfContact
+from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
 from ..scene import Garment
 from .broad_phase import touch_one_another
@@ -180,7 +180,7 @@ class ClothView:
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
-    def _gaps(self, x: Tensor, found: Crossings, listed: Listed | None, *, order: bool) -> Gaps:
+    def _gaps(self, x: Tensor, found: Crossings, listed: Listed | None, *, order: bool) -> PairConstraints:
         """The springs between all parts that are near and do not cross."""
         near = near_pairs(self.parts, x, self.near, listed=listed)
         corners = near.corners.long()
@@ -205,7 +205,7 @@ class ClothView:
         share = torch.where(near.face[kept], area[:, 0], area.amin(dim=1) / 3.0)
         normal = torch.nn.functional.normalize(way[kept], dim=1, eps=1e-30).contiguous()
         stiffness = self._settings.cloth_stiffness * share
-        return Gaps(near.corners[kept], near.weight[kept], normal, offset[kept].contiguous(), stiffness)
+        return PairConstraints(near.corners[kept], near.weight[kept], normal, offset[kept].contiguous(), stiffness)
 
     def measure(
         self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.crossings import Crossings
-from ..forces.self_contact import Gaps
+from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
@@ -140,7 +140,7 @@ def ways_out(
 
 def gaps_out(
     mesh: ClothMesh, crossings: Crossings, x: Float[Tensor, "vertices 3"], *, step: float, stiffness: float
-) -> Gaps:
+) -> PairConstraints:
     """Planes that draw crossing edges out of their faces by a step at most.
 
     Args:
@@ -160,7 +160,9 @@ def gaps_out(
     normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30).repeat(2, 1)
     here = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
     strength = stiffness * share * level.vertex_area[corners[:, 0]]
-    return Gaps(corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step * length, strength)
+    return PairConstraints(
+        corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step * length, strength
+    )
 
 
 def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor, "points 3"]:

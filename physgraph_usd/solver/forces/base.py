@@ -1,4 +1,4 @@
-"""What a force is, and the sum of forces that an integrator sees."""
+"""Forces, and the sum of them that an integrator sees."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
@@ -44,7 +44,7 @@ class Force(Protocol):
 
 
 class _Last:
-    """What a module's own terms answered last, on the CPU: on CUDA recorded steps write into tensors unseen."""
+    """The last answer of terms that do not change, on the CPU: on CUDA recorded steps write into tensors unseen."""
 
     def __init__(self) -> None:
         """Nothing was asked yet."""
@@ -78,23 +78,23 @@ class ForceModule:
             remembers: Whether what they answered last serves again at the same positions: for terms that do not change.
         """
         self.forces = tuple(forces)
-        self._own, self._last = self.forces, _Last() if remembers else None
+        self._lasting, self._last = self.forces, _Last() if remembers else None
 
     def joined_by(self, more: Sequence[Force]) -> ForceModule:
         """This module's terms and more; if it remembers, its own are not evaluated anew at the same positions."""
         joined = ForceModule((*self.forces, *more))
-        joined._own, joined._last = self._own, self._last
+        joined._lasting, joined._last = self._lasting, self._last
         return joined
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
-        known = None if self._last is None else self._last.recall(x)
-        if known is None:
+        total = None if self._last is None else self._last.recall(x)
+        if total is None:
             nothing = torch.zeros((), dtype=torch.float64, device=x.device)
-            known = self._sum(self._own, x, (nothing, torch.zeros_like(x)))
+            total = self._sum(self._lasting, x, (nothing, torch.zeros_like(x)))
             if self._last is not None:
-                self._last.keep(x, *known)
-        return self._sum(self.forces[len(self._own) :], x, known)
+                self._last.keep(x, *total)
+        return self._sum(self.forces[len(self._lasting) :], x, total)
 
     @staticmethod
     def _sum(terms: Sequence[Force], x: Tensor, so_far: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -189,10 +189,12 @@ class Elements:
         self.energy = torch.zeros(self.count, dtype=dtype, device=device)
         self.corner_force = torch.zeros((self.count * width, 3), dtype=dtype, device=device)
         x = vectors(torch.zeros_like(level.rest))
-        own = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
+        arrays = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
         buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
-        self._kept = (corners, starts, slots, parameters)
-        self._elements = Launch(kernels[dtype], self.count, [x, packed, *own, *buffers], device=device, threads=threads)
+        self._tensors = (corners, starts, slots, parameters)
+        self._elements = Launch(
+            kernels[dtype], self.count, [x, packed, *arrays, *buffers], device=device, threads=threads
+        )
         inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
         self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, device=device, threads=threads)
 
@@ -228,5 +230,5 @@ def element_overloads(
         The concrete kernel for each torch scalar type.
     """
     corners = wp.types.vector(length=width, dtype=wp.int32)
-    own = [VECTOR] * vector_parameters + [SCALAR] * parameters
-    return overloads(kernel, VECTOR, corners, *own, SCALAR, VECTOR)
+    arrays = [VECTOR] * vector_parameters + [SCALAR] * parameters
+    return overloads(kernel, VECTOR, corners, *arrays, SCALAR, VECTOR)

@@ -101,8 +101,8 @@ class Contact:
     def _prepare(level: Level, planes: Planes, weight: Tensor, energy: Tensor) -> Launch:
         start_warp()  # Views of tensors do not start Warp by themselves.
         x = vectors(torch.zeros_like(level.rest))
-        own = [wp.from_torch(planes.vertex), vectors(planes.normal), wp.from_torch(planes.height)]
-        inputs = [x, *own, wp.from_torch(weight), wp.from_torch(energy), x]
+        plane_arrays = [wp.from_torch(planes.vertex), vectors(planes.normal), wp.from_torch(planes.height)]
+        inputs = [x, *plane_arrays, wp.from_torch(weight), wp.from_torch(energy), x]
         return Launch(_PUSH[level.dtype], len(planes.vertex), inputs, device=level.device, threads=level.threads)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
@@ -124,10 +124,10 @@ class Contact:
 
     def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
         """Which vertices see a plane."""
-        seen = torch.zeros_like(level.free)
+        near = torch.zeros_like(level.free)
         for each in self.planes:
-            seen[each.vertex.long()] = True
-        return seen
+            near[each.vertex.long()] = True
+        return near
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """k_c a_v / 3 where a plane pushes [N/m]."""

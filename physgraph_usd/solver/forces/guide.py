@@ -38,17 +38,17 @@ class GuideMap:
     def __init__(self, level: Level) -> None:
         """Build R, its transpose and the areas from the level's prolongation."""
         area = sp.diags(level.vertex_area.double().cpu().numpy())
-        shares = sp.csr_matrix(level.from_coarse.T @ area)
-        self.coarse_area = np.asarray(shares.sum(axis=1)).ravel()
+        fine_areas = sp.csr_matrix(level.from_coarse.T @ area)
+        self.coarse_area = np.asarray(fine_areas.sum(axis=1)).ravel()
         rows = sp.diags(1.0 / np.maximum(self.coarse_area, np.finfo(float).tiny))
-        matrix = sp.csr_matrix(rows @ shares)
+        matrix = sp.csr_matrix(rows @ fine_areas)
         self.spread_matrix = sp.csr_matrix(matrix.T)
         self.average, self.spread = (
             Stencil(stencil, dtype=level.dtype, device=level.device, threads=level.threads)
             for stencil in (matrix, self.spread_matrix)
         )
         self.squares = sp.csr_matrix(matrix.multiply(matrix).T)
-        self.shares = sp.csr_matrix(shares.T)
+        self.fine_areas = sp.csr_matrix(fine_areas.T)
         # Subdivision keeps every cage vertex, so each row of the transpose has an entry.
         of_coarse = sp.csc_matrix(level.from_coarse)
         self.garment = level.vertex_garment[torch.as_tensor(of_coarse.indices[of_coarse.indptr[:-1]]).long()]
@@ -80,7 +80,7 @@ class Guide:
         pin = level.pin.double().cpu().numpy()
         soft = np.where((pin > 0) & (pin < 1.0 - PIN_MARGIN), SOFT_PIN * pin / np.maximum(1.0 - pin, PIN_MARGIN), 0.0)
         self._coarse_weight = per_area * guide_map.coarse_area
-        self._pin_weight = soft * np.asarray(guide_map.shares @ per_area).ravel()
+        self._pin_weight = soft * np.asarray(guide_map.fine_areas @ per_area).ravel()
         self._weight = torch.as_tensor(self._coarse_weight, dtype=level.dtype, device=level.device).unsqueeze(1)
         self._pin = torch.as_tensor(self._pin_weight, dtype=level.dtype, device=level.device).unsqueeze(1)
         self._has_soft_pins = bool(soft.any())
@@ -88,7 +88,7 @@ class Guide:
         self._base = torch.zeros_like(level.rest)
 
     def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
-        """The same ties, to the coarse positions of one frame [m]."""
+        """These ties, to the coarse positions of one frame [m]."""
         guide = copy.copy(self)
         guide._base = self._level.base.apply(coarse)
         guide._target = self._map.average.apply(guide._base)

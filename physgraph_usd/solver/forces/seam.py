@@ -56,7 +56,7 @@ class Seam:
         self._place, self._first = (torch.as_tensor(each, device=device) for each in (sewn, first))
         self._free = level.free[self._place]
         self._mean = Stencil(mean, dtype=dtype, device=device)
-        self._share = Stencil(sp.csr_matrix(sp.diags((~held).astype(float)) @ mean), dtype=dtype, device=device)
+        self._fraction = Stencil(sp.csr_matrix(sp.diags((~held).astype(float)) @ mean), dtype=dtype, device=device)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Sewn points brought together; to the last bit as they are where they are together."""
@@ -69,7 +69,7 @@ class Seam:
     def shared(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Forces shared by sewn points; none on what is sewn to something that may not move."""
         out = force.clone()
-        out[self._place] = self._share.apply(force[self._place])
+        out[self._place] = self._fraction.apply(force[self._place])
         return out
 
 

@@ -4,9 +4,9 @@
 
 | symbol | here | meaning |
 |---|---|---|
-| sum_i w_gi x_i | ``Gaps`` | way from one point to another: vertex, face (1, -b0, -b1, -b2), edges (1-s, s, t-1, -t) |
-| n_g | ``Gaps.normal`` | the side on which the first point lies, a unit vector |
-| k_g | ``Gaps.stiffness`` | k_c times the pair's area [N/m] |
+| sum_i w_gi x_i | ``vectors`` | from one point to another: vertex, face (1, -b0, -b1, -b2), edges (1-s, s, t-1, -t) |
+| n_g | ``PairConstraints.normal`` | the side on which the first point lies, a unit vector |
+| k_g | ``PairConstraints.stiffness`` | k_c times the pair's area [N/m] |
 
 Pairs, weights and normals stay while the term lives, so it is a function of x alone, and a convex one.
 """
@@ -31,7 +31,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True, eq=False)
-class Gaps:
+class PairConstraints:
     """Pairs of material points that keep to their sides of one another.
 
     Attributes:
@@ -48,15 +48,17 @@ class Gaps:
     offset: Float[Tensor, " gaps"]
     stiffness: Float[Tensor, " gaps"]
 
-    def with_more(self, other: Gaps) -> Gaps:
+    def with_more(self, other: PairConstraints) -> PairConstraints:
         """These pairs and others."""
-        return Gaps(*(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)))
+        return PairConstraints(
+            *(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self))
+        )
 
     def vectors(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "gaps 3"]:
         """From the second point to the first [m]."""
         return (self.weight.unsqueeze(2) * x[self.corners.long()]).sum(dim=1)
 
-    def lacks(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " gaps"]:
+    def penetration(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " gaps"]:
         """How far each pair is under its offset [m], not below zero."""
         return (self.offset - (self.normal * self.vectors(x)).sum(dim=1)).clamp_min(0.0)
 
@@ -78,9 +80,9 @@ def _keep_apart(
     i = first + wp.tid()
     c = corners[i]
     gap = wp.dot(g0[i], x[c[0]]) + wp.dot(g1[i], x[c[1]]) + wp.dot(g2[i], x[c[2]]) + wp.dot(g3[i], x[c[3]])
-    lack = wp.max(offset[i] - gap, offset.dtype(0.0))
-    push = stiffness[i] * lack
-    energy[i] = offset.dtype(0.5) * push * lack
+    depth = wp.max(offset[i] - gap, offset.dtype(0.0))
+    push = stiffness[i] * depth
+    energy[i] = offset.dtype(0.5) * push * depth
     corner_force[4 * i] = push * g0[i]
     corner_force[4 * i + 1] = push * g1[i]
     corner_force[4 * i + 2] = push * g2[i]
@@ -99,7 +101,7 @@ class SelfContact:
 
     name = "self_contact"
 
-    def __init__(self, level: Level, gaps: Gaps) -> None:
+    def __init__(self, level: Level, gaps: PairConstraints) -> None:
         """Take the pairs."""
         self.gaps, self._level = gaps, level
         along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
@@ -115,16 +117,18 @@ class SelfContact:
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """k w^2 / 3 of the pairs that push, summed at each vertex [N/m]."""
-        value = (self.gaps.lacks(x) > 0).to(x).unsqueeze(1) * self.gaps.stiffness.unsqueeze(1) * self.gaps.weight**2
+        value = (
+            (self.gaps.penetration(x) > 0).to(x).unsqueeze(1) * self.gaps.stiffness.unsqueeze(1) * self.gaps.weight**2
+        )
         # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
         out = torch.zeros_like(x[:, 0])
         return out.index_put_((self.gaps.corners.long().reshape(-1),), value.reshape(-1) / 3.0, accumulate=True)
 
     def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
         """Which vertices belong to a pair."""
-        seen = torch.zeros_like(level.free)
-        seen[self.gaps.corners.long().reshape(-1)] = True
-        return seen
+        near = torch.zeros_like(level.free)
+        near[self.gaps.corners.long().reshape(-1)] = True
+        return near
 
     def rest_matrix(self) -> sp.csr_matrix | None:
         """None: at rest nothing touches."""

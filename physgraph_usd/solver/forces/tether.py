@@ -44,7 +44,7 @@ class Tether:
         self._predicted = predicted
 
     def aim(self, predicted: Float[Tensor, "vertices 3"], stiffness: float) -> None:
-        """Tie to other positions [m], as stiffly as told [1/s^2], in place."""
+        """Tie to other positions [m], with another stiffness [1/s^2], in place."""
         self._predicted.copy_(predicted)
         self._weight.copy_(stiffness * self._density * self._area)
 

@@ -17,7 +17,7 @@ from ..forces.guide import Guide, GuideMap
 from ..forces.stretch import PAPER_SPRING, garment_area
 from ..forces.tether import Tether
 from ..integrate.base import ForceField, Preconditioner, System
-from ..integrate.metric import Metric, kept_to_edges
+from ..integrate.metric import Metric, on_edges
 from ..integrate.saddle import facets
 from ..level import Level
 from ..mesh.stencil import Stencil
@@ -133,7 +133,7 @@ def build_forces(
         *body_terms(level, fabrics, gravity=gravity, potential=potential),
     )
     guide = Guide(level, guide_map, torch.as_tensor(stiffness), relative_weight=relative)
-    matrix = kept_to_edges(ForceModule((*terms, guide)).rest_matrix(), level.edges.cpu().numpy())
+    matrix = on_edges(ForceModule((*terms, guide)).rest_matrix(), level.edges.cpu().numpy())
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
     return LevelForces(level, terms, guide, metric, density, any(fabric.bend > 0 for fabric in fabrics))

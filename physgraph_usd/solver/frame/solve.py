@@ -112,7 +112,7 @@ def solve_one_level(
         view, terms = view.terms(x, listed=pairs)
         touched |= bool(terms)
         system = problem.system(view, terms, x, last=last)
-        resume = carry if last is not None and system.shares_metric(last) else None
+        resume = carry if last is not None and system.has_same_metric(last) else None
         of_round = _round_budget(budget, system, first=not made, steps=STEPS if terms else LONGEST)
         carry, report = descend(system, problem.integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)

@@ -1,4 +1,4 @@
-"""What an integrator is, and what it is shown of the physics: forces, a metric, and nothing else."""
+"""Integrators, and the little of the physics that they see: forces and a metric."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class System:
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
-        self._kept = free.to(spacing.dtype)  # A factor of the vectors' own type saves a conversion at each product.
+        self._mask = free.to(spacing.dtype)  # A factor of the vectors' own type saves a conversion at each product.
         self.evaluations = self.metric_solves = self.failed = 0
 
     @property
@@ -96,7 +96,7 @@ class System:
         """Evaluations, metric solves and failed evaluations so far."""
         return self.evaluations, self.metric_solves, self.failed
 
-    def shares_metric(self, other: System) -> bool:
+    def has_same_metric(self, other: System) -> bool:
         """Whether what was learned of the curvature under another system holds under this one."""
         return self.metric is other.metric
 
@@ -104,7 +104,7 @@ class System:
         """Energy [J] and force [N]; the force on vertices that may not move is zero."""
         self.evaluations += 1
         energy, force = self.field.energy_and_force(x)
-        return float(energy), force if self._all_free else force * self._kept
+        return float(energy), force if self._all_free else force * self._mask
 
     def apply_metric_inverse(
         self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
@@ -117,7 +117,7 @@ class System:
         """
         self.metric_solves += 1
         move = self.metric.solve(force) if solver is None else solver(force)
-        return move if self._all_free else move * self._kept
+        return move if self._all_free else move * self._mask
 
     def apply_smooth_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m] by the smooth part alone of a metric that has two."""
@@ -125,7 +125,7 @@ class System:
         if smooth is None:
             return self.apply_metric_inverse(force)
         self.metric_solves += 1
-        return smooth(force) * self._kept
+        return smooth(force) * self._mask
 
     @cached_property
     def _smooth(self) -> Callable[[Tensor], Tensor] | None:
@@ -144,7 +144,7 @@ class System:
     @cached_property
     def reach(self) -> Float[Tensor, " vertices"]:
         """The spacing [m], and 0 where a vertex may not move."""
-        return self.spacing * self._kept.squeeze(1)
+        return self.spacing * self._mask.squeeze(1)
 
     def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
         """RMS of H0^-1 F over the free vertices, in local edge lengths."""
@@ -158,7 +158,7 @@ class System:
 
 @dataclass(frozen=True, eq=False)
 class Carry:
-    """What an integrator hands from one step to the next.
+    """The state that an integrator hands from one step to the next.
 
     Attributes:
         x: Positions [m].
@@ -182,7 +182,7 @@ class Carry:
     remaining: float | None = None
 
     def moved_by(self, mover: str) -> Carry:
-        """The same carry under another mover's name."""
+        """This carry under another mover's name."""
         return replace(self, mover=mover)
 
 
@@ -222,7 +222,7 @@ class Following(Protocol):
     """An integrator that learns from steps that another makes."""
 
     def follow(self, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
-        """Evaluate x [m] and remember the way from the carry to there as a step of its own."""
+        """Evaluate x [m] and remember the displacement from the carry to there as a step of its own."""
         ...
 
 

@@ -28,7 +28,7 @@ NOWHERE = 1 << 40
 
 @dataclass(frozen=True, eq=False)
 class Received:
-    """What the nodes of a batch receive from one child each; `NOWHERE` where there is none.
+    """Entries that the nodes of a batch receive from one child each; `NOWHERE` where there is none.
 
     Attributes:
         rows: First places of the rows of its update, shape (nodes, border).
@@ -45,29 +45,29 @@ class Received:
 class Batch:
     """Nodes of one depth that are eliminated together, their fronts padded to one size.
 
-    A front has a node's own vertices first, its border from ``own`` on, and one more row and column for padding.
+    A front has a node's own vertices first, its border from ``inner`` on, and one more row and column for padding.
 
     Attributes:
-        own: Most own vertices of a node.
+        inner: Most vertices of a node.
         side: Width of the fronts.
         unit: Places on the diagonals of the flat fronts that no vertex has.
         source: Entries of the matrix that the fronts begin with, shape (entries,).
         target: Their places in the flat fronts, shape (entries,).
         received: From a first and from a second child.
-        rows: First places of the own rows in the way up, shape (nodes, own).
+        rows: First places of the inner rows in the pass up, shape (nodes, inner).
         columns: Places in such a row, shape (nodes, width).
-        down: First places, in the way down, of what a node adds to the rows of its border, shape (nodes, border).
+        down: First places, in the pass down, of what a node adds to the rows of its border, shape (nodes, border).
         updates: First places of the rows of the border's matrix in the depth's updates, shape (nodes, border).
         ranks: Places in such a row, shape (nodes, border).
     """
 
-    own: int
+    inner: int
     side: int
     unit: Int[Tensor, " padded"]
     source: Int[Tensor, " entries"]
     target: Int[Tensor, " entries"]
     received: tuple[Received, ...]
-    rows: Int[Tensor, "nodes own"]
+    rows: Int[Tensor, "nodes inner"]
     columns: Int[Tensor, "nodes width"]
     down: Int[Tensor, "nodes border"]
     updates: Int[Tensor, "nodes border"]
@@ -99,16 +99,16 @@ def joined(
 class Tree:
     """The nodes of a dissection with the borders that a pattern gives them; vertices in the order of elimination.
 
-    The way up has a row for each vertex: its node's vertices, then the node's border. The way down has one, too: the
+    The pass up has a row for each vertex: its node's vertices, then the node's border. The pass down has one, too: the
     vertices of each node that has it in its border.
 
     Attributes:
         stages: First node of each depth, deepest first, and the number of nodes.
         updates: Entries of the borders' matrices of each depth.
-        up_starts: First entry of each row of the way up, and their number, shape (V + 1,).
-        up_lists: Where the columns of each row of the way up begin among ``up_columns``, shape (V,).
+        up_starts: First entry of each row of the pass up, and their number, shape (V + 1,).
+        up_lists: Where the columns of each row of the pass up begin among ``up_columns``, shape (V,).
         up_columns: Columns of each node's rows; a vertex of the border counts from V, shape (columns,).
-        down_starts: First entry of each row of the way down, and their number, shape (V + 1,).
+        down_starts: First entry of each row of the pass down, and their number, shape (V + 1,).
         down_columns: Columns of the rows, shape (entries,).
     """
 
@@ -126,8 +126,8 @@ class Tree:
         place = np.empty(count, np.int64)
         place[dissection.order] = np.arange(count)
         row, column = place[np.repeat(np.arange(count), np.diff(pattern.indptr))], place[pattern.indices]
-        kept = np.flatnonzero(column >= self._first[node[row]])
-        self._entry = kept[np.argsort(node[row[kept]], kind="stable")]
+        valid = np.flatnonzero(column >= self._first[node[row]])
+        self._entry = valid[np.argsort(node[row[valid]], kind="stable")]
         self._row, self._column = row[self._entry], column[self._entry]
         self._entries = np.searchsorted(node[self._row], np.arange(len(self._size) + 1))
         self._keys = self._borders(node[self._row], dissection.parent)
@@ -139,23 +139,23 @@ class Tree:
         squares = np.concatenate([[0], np.cumsum(self._border**2)])
         self.updates = np.diff(squares[self.stages])
         self._update = squares[:-1] - squares[self.stages[depth]]
-        self._lay_out_ways(node)
+        self._lay_out_passes(node)
 
     def _borders(self, owner: np.ndarray, parent: np.ndarray) -> np.ndarray:
         """Node times number of vertices plus vertex, of all vertices of all borders, ascending."""
         beyond = self._column >= self._last[owner]
-        own, ends = owner[beyond] * self._count + self._column[beyond], np.searchsorted(owner[beyond], self.stages)
+        inner, ends = owner[beyond] * self._count + self._column[beyond], np.searchsorted(owner[beyond], self.stages)
         found, below = [], np.zeros(0, np.int64)
         for begin, end in pairwise(ends):
             child, vertex = np.divmod(below, max(self._count, 1))
             above = vertex >= self._last[parent[child]]
             passed = parent[child[above]] * self._count + vertex[above]
-            below = np.unique(np.concatenate([own[begin:end], passed]))
+            below = np.unique(np.concatenate([inner[begin:end], passed]))
             found.append(below)
         return np.concatenate(found)
 
-    def _lay_out_ways(self, node: np.ndarray) -> None:
-        """The rows and columns of both ways; ``node`` is each vertex's."""
+    def _lay_out_passes(self, node: np.ndarray) -> None:
+        """The rows and columns of both passes; ``node`` is each vertex's."""
         width = self._size + self._border
         lists = np.cumsum(width) - width
         self.up_starts = np.concatenate([[0], np.cumsum(width[node])])
@@ -183,62 +183,62 @@ class Tree:
 
     def batch(self, nodes: np.ndarray, *, device: str) -> Batch:
         """A batch of nodes of one depth, on a device."""
-        own, most = max(int(self._size[nodes].max()), 1), int(self._border[nodes].max())
-        side, mine, theirs = own + most + 1, np.arange(own), np.arange(most)
+        inner, most = max(int(self._size[nodes].max()), 1), int(self._border[nodes].max())
+        side, parent_rows, child_rows = inner + most + 1, np.arange(inner), np.arange(most)
         size, border = self._size[nodes, None], self._border[nodes, None]
-        inside, beyond = mine < size, theirs < border
+        inside, beyond = parent_rows < size, child_rows < border
         unit = np.flatnonzero(~inside.ravel())
         up = np.concatenate([self.up_starts, [NOWHERE]])
         down = np.concatenate([self._down, [NOWHERE]])
-        columns = [np.where(inside, mine, NOWHERE), np.where(beyond, size + theirs, NOWHERE)]
-        received = [self._received(nodes, own, side, slot=slot) for slot in (0, 1)]
+        columns = [np.where(inside, parent_rows, NOWHERE), np.where(beyond, size + child_rows, NOWHERE)]
+        received = [self._received(nodes, inner, side, slot=slot) for slot in (0, 1)]
 
         def put(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, device=device)
 
-        source, target = self._begun(nodes, own, side)
+        source, target = self._begun(nodes, inner, side)
         return Batch(
-            own=own,
+            inner=inner,
             side=side,
-            unit=put(unit // own * side**2 + unit % own * (side + 1)),
+            unit=put(unit // inner * side**2 + unit % inner * (side + 1)),
             source=put(source),
             target=put(target),
             received=tuple(Received(*map(put, each)) for each in received if each is not None),
-            rows=put(up[np.where(inside, self._first[nodes, None] + mine, -1)]),
+            rows=put(up[np.where(inside, self._first[nodes, None] + parent_rows, -1)]),
             columns=put(np.concatenate(columns, axis=1)),
-            down=put(down[np.where(beyond, self._starts[nodes, None] + theirs, -1)]),
-            updates=put(np.where(beyond, self._update[nodes, None] + theirs * border, NOWHERE)),
-            ranks=put(np.where(beyond, theirs, NOWHERE)),
+            down=put(down[np.where(beyond, self._starts[nodes, None] + child_rows, -1)]),
+            updates=put(np.where(beyond, self._update[nodes, None] + child_rows * border, NOWHERE)),
+            ranks=put(np.where(beyond, child_rows, NOWHERE)),
         )
 
-    def _begun(self, nodes: np.ndarray, own: int, side: int) -> tuple[np.ndarray, np.ndarray]:
+    def _begun(self, nodes: np.ndarray, inner: int, side: int) -> tuple[np.ndarray, np.ndarray]:
         """`Batch.source` and `Batch.target`."""
         counts = self._entries[nodes + 1] - self._entries[nodes]
         chosen, number = ranges(self._entries[nodes], counts), np.repeat(np.arange(len(nodes)), counts)
         row = self._row[chosen] - self._first[nodes[number]]
-        column = self._place(nodes[number], self._column[chosen], own)
-        beyond = column >= own
+        column = self._place(nodes[number], self._column[chosen], inner)
+        beyond = column >= inner
         target = np.concatenate([row * side + column, (column * side + row)[beyond]])
         number = np.concatenate([number, number[beyond]])
         return np.concatenate([self._entry[chosen], self._entry[chosen[beyond]]]), number * side**2 + target
 
-    def _received(self, nodes: np.ndarray, own: int, side: int, *, slot: int) -> tuple[np.ndarray, ...] | None:
-        """What `Received` is made of, or None where no node has a child in that place."""
+    def _received(self, nodes: np.ndarray, inner: int, side: int, *, slot: int) -> tuple[np.ndarray, ...] | None:
+        """The arrays of `Received`, or None where no node has a child in that place."""
         child = self._children[nodes, slot, None]
         border = np.where(child >= 0, self._border[child], 0)
         if not border.any():
             return None
-        theirs = np.arange(border.max())
-        kept = theirs < border
-        vertex = self._vertex[np.where(kept, self._starts[child] + theirs, 0)]
-        places = np.where(kept, self._place(np.broadcast_to(nodes[:, None], kept.shape), vertex, own), side - 1)
-        rows = np.where(kept, self._update[child] + theirs * border, NOWHERE)
-        return rows, np.where(kept, theirs, NOWHERE), places
+        child_rows = np.arange(border.max())
+        valid = child_rows < border
+        vertex = self._vertex[np.where(valid, self._starts[child] + child_rows, 0)]
+        places = np.where(valid, self._place(np.broadcast_to(nodes[:, None], valid.shape), vertex, inner), side - 1)
+        rows = np.where(valid, self._update[child] + child_rows * border, NOWHERE)
+        return rows, np.where(valid, child_rows, NOWHERE), places
 
-    def _place(self, node: np.ndarray, vertex: np.ndarray, own: int) -> np.ndarray:
+    def _place(self, node: np.ndarray, vertex: np.ndarray, inner: int) -> np.ndarray:
         """Row of a vertex in the front of a node."""
         rank = np.searchsorted(self._keys, node * self._count + vertex) - self._starts[node]
-        return np.where(vertex < self._last[node], vertex - self._first[node], own + rank)
+        return np.where(vertex < self._last[node], vertex - self._first[node], inner + rank)
 
 
 def ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -103,11 +103,11 @@ class FusedPhysgraph:
             self._reach = reach
             self._combine.change({2: wp.from_torch(reach, requires_grad=False)})
         if self._frames:
-            seen = frame()
-            changed[4] = seen.positions
-            if self._mesh is not seen.mesh:
-                self._mesh = seen.mesh
-                changed |= dict(enumerate(seen.mesh, start=5))
+            surface = frame()
+            changed[4] = surface.positions
+            if self._mesh is not surface.mesh:
+                self._mesh = surface.mesh
+                changed |= dict(enumerate(surface.mesh, start=5))
         self._see(changed)
         h = self._features
         biases = [self._biases[0] + self._clock * clock_of(step), *self._biases[1:]]
@@ -219,8 +219,8 @@ def _comparing(parts: Parts, families: Families) -> Any:
     kinds, rows = 1 + max(family for family, _ in families), 1 + max(row for row, _ in parts)
     table = wp.types.matrix(shape=(rows, 3), dtype=wp.float32)
     column = wp.types.vector(length=kinds, dtype=wp.float32)
-    known = {row: family for (row, _), (family, _) in reversed(tuple(zip(parts, families, strict=True)))}
-    of = tuple(known.get(row, 0) for row in range(rows))
+    family_of = {row: family for (row, _), (family, _) in reversed(tuple(zip(parts, families, strict=True)))}
+    of = tuple(family_of.get(row, 0) for row in range(rows))
     counts = tuple(a for a, (_, counts) in enumerate(families) if counts)
     inverse_count = tuple(1.0 / sum(families[a][0] == kind for a in counts) for kind in range(kinds))
 
@@ -245,7 +245,7 @@ def _comparing(parts: Parts, families: Families) -> Any:
 def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
     """The function that writes what the network sees of a vertex: squares, products, logarithms of the mean squares."""
     every = wp.types.vector(length=len(parts), dtype=wp.float32)
-    shown = (*((a, a) for a in range(len(parts))), *pairs)
+    terms = (*((a, a) for a in range(len(parts))), *pairs)
 
     @wp.func
     def show(i: wp.int32, unit: Any, size: Any, across: wp.vec3f, features: wp.array(dtype=wp.float32, ndim=2)):
@@ -253,19 +253,19 @@ def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
         for a in range(wp.static(len(parts))):
             if wp.static(parts[a][1]):
                 height[a] = wp.dot(unit[wp.static(parts[a][0])], across)
-        for p in range(wp.static(len(shown))):
-            a, b = wp.static(shown[p][0]), wp.static(shown[p][1])
-            if wp.static(parts[shown[p][0]][1] and parts[shown[p][1]][1]):
+        for p in range(wp.static(len(terms))):
+            a, b = wp.static(terms[p][0]), wp.static(terms[p][1])
+            if wp.static(parts[terms[p][0]][1] and parts[terms[p][1]][1]):
                 product = height[a] * height[b]
-            elif wp.static(parts[shown[p][0]][1]):
-                product = height[a] * wp.dot(unit[wp.static(parts[shown[p][1]][0])], across)
-            elif wp.static(parts[shown[p][1]][1]):
-                product = height[b] * wp.dot(unit[wp.static(parts[shown[p][0]][0])], across)
+            elif wp.static(parts[terms[p][0]][1]):
+                product = height[a] * wp.dot(unit[wp.static(parts[terms[p][1]][0])], across)
+            elif wp.static(parts[terms[p][1]][1]):
+                product = height[b] * wp.dot(unit[wp.static(parts[terms[p][0]][0])], across)
             else:
-                product = wp.dot(unit[wp.static(parts[shown[p][0]][0])], unit[wp.static(parts[shown[p][1]][0])])
+                product = wp.dot(unit[wp.static(parts[terms[p][0]][0])], unit[wp.static(parts[terms[p][1]][0])])
             features[i, p] = product
         for k in range(wp.static(kinds)):
-            features[i, wp.static(len(shown)) + k] = wp.float32(wp.static(LOG_SCALE)) * wp.log(size[k]) + wp.float32(
+            features[i, wp.static(len(terms)) + k] = wp.float32(wp.static(LOG_SCALE)) * wp.log(size[k]) + wp.float32(
                 wp.static(LOG_OFFSET)
             )
 

@@ -13,7 +13,7 @@ from .quasi_newton import backtrack
 from .truncation import truncated
 
 PATIENCE = 4
-"""Corrections in a row after which an integrator gives way to its spare."""
+"""Corrections in a row after which an integrator is replaced by its spare."""
 
 
 class Guard:
@@ -59,7 +59,7 @@ class Guard:
         if math.isfinite(proposed.energy) and proposed.energy <= carry.energy:
             return proposed
         corrected = replace(self._corrected(system, carry, proposed), setbacks=carry.setbacks + 1)
-        if corrected.mover == "stayed" and self._spare is not None:  # It may know a way where H0^-1 F leads nowhere.
+        if corrected.mover == "stayed" and self._spare is not None:  # It may lower the energy where H0^-1 F does not.
             return replace(self._spare.step(system, self._spare.start(system, carry.x)), setbacks=PATIENCE)
         spare = self._spare_of(corrected)
         if spare is None:

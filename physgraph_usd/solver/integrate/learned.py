@@ -143,17 +143,17 @@ class LearnedMetric:
 
         Those of the last few systems that are met again are kept, and the last of another.
         """
-        known = self._recordings.pop(system, None)
-        if known is None:
+        recording = self._recordings.pop(system, None)
+        if recording is None:
             # A recording keeps what its kernels write to: what is cached for all may be dropped.
             propose = partial(self._combined, system=system, fused=self._fused(system))
-            known = Recording(system, propose, dot=self._dot(system))
+            recording = Recording(system, propose, dot=self._dot(system))
             for other in [each for each in self._recordings if not (each.lasting or system.lasting)]:
                 del self._recordings[other]
-        self._recordings[system] = known
+        self._recordings[system] = recording
         while len(self._recordings) > RECORDINGS:
             del self._recordings[next(iter(self._recordings))]
-        return known
+        return recording
 
 
 def _secant_direction(carry: Carry) -> Tensor:

@@ -40,8 +40,8 @@ def updated_edges(
     """
     count, latent = edge.shape
     layers = _laid_out(perceptron, latent)
-    shown = [from_receiver.contiguous(), from_sender.contiguous(), *ends]
-    _update_edges[_blocks(count)](edge, *shown, *layers, count, latent, ROWS, num_warps=WARPS)
+    inputs = [from_receiver.contiguous(), from_sender.contiguous(), *ends]
+    _update_edges[_blocks(count)](edge, *inputs, *layers, count, latent, ROWS, num_warps=WARPS)
     return edge
 
 
@@ -96,18 +96,18 @@ def _update_vertices(
     rows = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     inside = (rows < count)[:, None]
     place = rows.to(tl.int64)[:, None] * L + tl.arange(0, L)[None, :]
-    shown = tl.load(gathered + place, mask=inside, other=0.0)
+    inputs = tl.load(gathered + place, mask=inside, other=0.0)
     h = tl.load(from_vertex + place, mask=inside, other=0.0)
-    h = _layers(shown, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L)
+    h = _layers(inputs, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L)
     tl.store(gathered + place, h, mask=inside)
 
 
 @triton.jit
-def _layers(shown, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L: tl.constexpr):
+def _layers(inputs, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L: tl.constexpr):
     """Three layers and a LayerNorm; ``h`` is what the first one has made of everything else."""
     columns = tl.arange(0, L)
     square = columns[:, None] * L + columns[None, :]
-    h += tl.dot(shown.to(tl.float16), tl.load(w1 + square)) + tl.load(b1 + columns)[None, :]
+    h += tl.dot(inputs.to(tl.float16), tl.load(w1 + square)) + tl.load(b1 + columns)[None, :]
     h = tl.dot(tl.maximum(h, 0.0).to(tl.float16), tl.load(w2 + square)) + tl.load(b2 + columns)[None, :]
     h = tl.dot(tl.maximum(h, 0.0).to(tl.float16), tl.load(w3 + square)) + tl.load(b3 + columns)[None, :]
     h -= tl.sum(h, axis=1)[:, None] / L

@@ -27,7 +27,7 @@ REGULARISATION = 1e-7
 """Added to the diagonal, relative to its mean: keeps loose parts without a guide definite."""
 
 
-def kept_to_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
+def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
     """A graph Laplacian with a matrix's negative couplings along the edges and its row sums.
 
     The rest form of bending also couples vertices across two triangles. Those entries double the time of a solve, and
@@ -64,7 +64,7 @@ class Metric:
             free: False where a vertex may not move: its row becomes the identity's.
             dtype: Scalar type of the right-hand sides.
         """
-        self._kept, self._free, self._matrix = free.to(dtype), free.squeeze(1), matrix
+        self._mask, self._free, self._matrix = free.to(dtype), free.squeeze(1), matrix
         self._merged: MergedMetric | None = None
         keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
         couplings = sp.csr_matrix(keep @ (matrix - sp.diags(matrix.diagonal())) @ keep)
@@ -86,7 +86,7 @@ class Metric:
             label: A number for each vertex, shape (V,).
         """
         if self._merged is None or not np.array_equal(self._merged.label, label):
-            self._merged = MergedMetric(self._matrix, label, free=self._free.unsqueeze(1), dtype=self._kept.dtype)
+            self._merged = MergedMetric(self._matrix, label, free=self._free.unsqueeze(1), dtype=self._mask.dtype)
         return self._merged
 
     def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
@@ -97,22 +97,22 @@ class Metric:
         scale = 1.0 / float(moved.mean()) if (moved > 0).any() else 1.0
         diagonal = torch.where(self._free, scale * stiffness + REGULARISATION, 1.0)
         self._solver = self._factors.factorised(scale, diagonal)
-        self._scaled = scale * self._kept
+        self._scaled = scale * self._mask
         self.diagonal = torch.where(self._free, diagonal / scale, 1.0)
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero where a vertex may not move."""
-        return self._solver(force * self._scaled).mul_(self._kept)
+        return self._solver(force * self._scaled).mul_(self._mask)
 
     def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
         """The solve of R H0^-1 R F [m], R a diagonal, in no more passes than that of H0^-1 F."""
-        before, after = self._scaled * factor, self._kept * factor
+        before, after = self._scaled * factor, self._mask * factor
         return lambda force: self._solver(force * before).mul_(after)
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
-        """As of `Preconditioner`."""
-        own = self.diagonal.to(stiffness)
-        return self.between((own / torch.maximum(own, stiffness)).sqrt().unsqueeze(1))
+        """R H0^-1 R, as `Preconditioner` has it."""
+        diagonal = self.diagonal.to(stiffness)
+        return self.between((diagonal / torch.maximum(diagonal, stiffness)).sqrt().unsqueeze(1))
 
 
 class MergedMetric(Metric):
@@ -134,13 +134,13 @@ class MergedMetric(Metric):
             dtype: Scalar type of the right-hand sides.
         """
         _, first, group = np.unique(label, return_index=True, return_inverse=True)
-        own, count = first[group], len(label)
+        representative, count = first[group], len(label)
         members = np.bincount(group)
-        joined = sp.csr_matrix((np.ones(count), (own, np.arange(count))), shape=(count, count))
+        joined = sp.csr_matrix((np.ones(count), (representative, np.arange(count))), shape=(count, count))
         held = np.bincount(group, ~free[:, 0].cpu().numpy())[group] > 0
-        device, moves = free.device, (own == np.arange(count)) & ~held
+        device, moves = free.device, (representative == np.arange(count)) & ~held
         self.label = label
-        self._own = torch.as_tensor(own, device=device)
+        self._representative = torch.as_tensor(representative, device=device)
         self._several = torch.as_tensor(np.flatnonzero(members[group] > 1), device=device)
         self._members = torch.as_tensor(members[group], device=device).double()
         super().__init__(
@@ -150,27 +150,27 @@ class MergedMetric(Metric):
         )
 
     def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
-        """As of `Metric`; what holds one of a label holds all."""
+        """The metric held by springs [N/m]; what holds one vertex of a label holds all."""
         return super().plus(self._gathered(springs))
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 of each label's force together [m], the same move for all of it."""
-        return super().solve(self._gathered(force))[self._own]
+        return super().solve(self._gathered(force))[self._representative]
 
     def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
-        """As of `Metric`."""
+        """The solve of R H0^-1 R F [m], each label's force together."""
         return lambda force: self.solve(force * factor).mul_(factor)
 
     def _gathered(self, values: Tensor) -> Tensor:
         """The sum of each label's values at its first vertex."""
         out, each = values.clone(), self._several
         out[each] = 0.0
-        return add_at(out, self._own[each], values[each])
+        return add_at(out, self._representative[each], values[each])
 
     def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
-        """As of `Metric`; each vertex shows its share of the diagonal."""
+        """Factorise with a diagonal [N/m], of which each vertex shows its part."""
         super()._hold(stiffness)
-        self.diagonal = self.diagonal[self._own] / self._members
+        self.diagonal = self.diagonal[self._representative] / self._members
 
 
 class HostFactors:
@@ -210,7 +210,7 @@ def _of_scipy(matrix: sp.coo_matrix) -> Solver:
 
 
 class DeviceFactors:
-    """The same on CUDA, where only the first passes through the host."""
+    """Factors of such matrices on CUDA, where only the first passes through the host."""
 
     def __init__(self, couplings: sp.csr_matrix, dtype: torch.dtype, device: str) -> None:
         """Find where all but the diagonal goes, shape (V, V)."""

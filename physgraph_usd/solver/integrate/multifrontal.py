@@ -54,7 +54,7 @@ class Elimination:
         order: Vertices in the order of their elimination, shape (V,).
         device: "cpu" or a CUDA device.
         rows: First vertex of each depth in that order, deepest first, and their number.
-        tables: Of the way down and of the way up: first entries of the rows, first columns of the rows, columns.
+        tables: Of the pass down and of the pass up: first entries of the rows, first columns of the rows, columns.
     """
 
     def __init__(self, pattern: sp.csr_matrix, *, device: str, leaf: int | None = None) -> None:
@@ -72,7 +72,8 @@ class Elimination:
         down = (tree.down_starts, tree.down_starts, tree.down_columns)
         up = (tree.up_starts, tree.up_lists, tree.up_columns)
         self.tables = tuple(
-            tuple(wp.array(part.astype(np.int32), dtype=wp.int32, device=device) for part in way) for way in (down, up)
+            tuple(wp.array(part.astype(np.int32), dtype=wp.int32, device=device) for part in each)
+            for each in (down, up)
         )
         self._sizes = int(tree.down_starts[-1]), int(tree.up_starts[-1])
         self._depths = [
@@ -81,7 +82,7 @@ class Elimination:
         ]
 
     def factor(self, values: Float[Tensor, " entries"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """The entries of the way down and of the way up, each with one more that means nothing.
+        """The entries of the pass down and of the pass up, each with one more that means nothing.
 
         Args:
             values: Entries of a positive definite matrix in the order of the pattern's, float64.
@@ -96,14 +97,16 @@ class Elimination:
         for size, batches in self._depths:
             updates = values.new_empty(size + 1)
             for batch in batches:
-                fronts, own = batch.fronts(values, before), batch.own
-                inverse, info = _inverse(fronts[:, :own, :own])
+                fronts, inner = batch.fronts(values, before), batch.inner
+                inverse, info = _inverse(fronts[:, :inner, :inner])
                 failed |= info.any()
-                w = fronts[:, own:, :own] @ inverse
-                down[joined(batch.down, batch.columns[:, :own], down)] = w.to(dtype)
+                w = fronts[:, inner:, :inner] @ inverse
+                down[joined(batch.down, batch.columns[:, :inner], down)] = w.to(dtype)
                 upward = torch.cat([inverse, -w.mT], dim=2)
                 up[joined(batch.rows, batch.columns, up)] = upward.to(dtype)
-                updates[joined(batch.updates, batch.ranks, updates)] = fronts[:, own:, own:] - w @ fronts[:, :own, own:]
+                updates[joined(batch.updates, batch.ranks, updates)] = (
+                    fronts[:, inner:, inner:] - w @ fronts[:, :inner, inner:]
+                )
             updates[-1] = 0.0
             before = updates
         if bool(failed):
@@ -136,12 +139,12 @@ class DissectedSolver:
         device, rows, count = elimination.device, elimination.rows, len(elimination.order)
         self._count, self._order, self._cuda = count, elimination.order, device != "cpu"
         self._state = torch.zeros((2 * count, 3), dtype=dtype, device=device)
-        self._ways = elimination.factor(values, dtype)
+        self._passes = elimination.factor(values, dtype)
         self._launches = []
         block = BLOCK if self._cuda else 1
         depths = range(1, len(rows) - 1), range(len(rows) - 2, -1, -1)
-        for table, way, target, stages in zip(elimination.tables, self._ways, (0, count), depths, strict=True):
-            arrays = [*table, wp.from_torch(way), vectors(self._state)]
+        for table, each, target, stages in zip(elimination.tables, self._passes, (0, count), depths, strict=True):
+            arrays = [*table, wp.from_torch(each), vectors(self._state)]
             for first, size in ((rows[stage], rows[stage + 1] - rows[stage]) for stage in stages):
                 if size:
                     inputs = [first, target, *arrays]

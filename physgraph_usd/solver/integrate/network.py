@@ -23,7 +23,7 @@ WHOLE = ("metric", "metric1", "metric2", "move1", "move2", "diagonal", "diagonal
 """Vectors of a vertex: H0^-1 F now and one and two steps ago, the last displacements, the force over H0's diagonal now
 and before, the L-BFGS direction."""
 VECTORS = (*WHOLE, *(f"{name}.{part}" for name in WHOLE for part in PARTS))
-"""What can be combined: those and their parts."""
+"""Vectors that can be combined: those and their parts."""
 
 FLOOR = 1e-9
 """Lengths below this many edges count as none."""

@@ -171,16 +171,16 @@ class Normaliser(nn.Module):
     def forward(self, features: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
         """Scaled features."""
         if self.training and float(self.calls) < self._most:
-            shown = features.detach().double()
+            values = features.detach().double()
             self.calls += 1
-            self.count += len(shown)
-            self.total += shown.sum(dim=0)
-            self.square += shown.square().sum(dim=0)
+            self.count += len(values)
+            self.total += values.sum(dim=0)
+            self.square += values.square().sum(dim=0)
         count = self.count.clamp_min(1.0)
         mean = self.total / count
         deviation = (self.square / count - mean.square()).clamp_min(1e-16).sqrt()
-        known = self.count > 0
-        mean, deviation = torch.where(known, mean, 0.0), torch.where(known, deviation, 1.0)
+        counted = self.count > 0
+        mean, deviation = torch.where(counted, mean, 0.0), torch.where(counted, deviation, 1.0)
         return (features - mean.to(features)) / deviation.to(features)
 
 

@@ -121,7 +121,7 @@ class QuasiNewton:
 
 @dataclass(frozen=True, eq=False)
 class _Memory:
-    """What is remembered from step to step.
+    """The memory of the steps made.
 
     Attributes:
         secants: Secants, oldest first.

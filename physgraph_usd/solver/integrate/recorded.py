@@ -90,7 +90,7 @@ class Recording:
         like = {"dtype": system.spacing.dtype, "device": system.spacing.device}
         self._fields = torch.zeros((FIELDS, len(system.spacing), 3), **like)
         self._after, self._nothing = torch.zeros_like(self._fields), torch.zeros_like(self._fields[0])
-        self._known_after = torch.zeros(2, dtype=torch.float64, device=like["device"])
+        self._scalars_after = torch.zeros(2, dtype=torch.float64, device=like["device"])
         self._step = torch.zeros((), device=like["device"])
         self._spans = (slice(0, len(system.spacing)),) if system.level is None else system.level.spans
         self._products = torch.zeros((len(self._spans), COMBINED, COMBINED), **like)
@@ -108,7 +108,7 @@ class Recording:
         self._run()
         self._system.evaluations += 1
         after = self._carry_of(self._after.clone(), step + 1)
-        energy, remaining = self._known_after.tolist()  # One wait for both.
+        energy, remaining = self._scalars_after.tolist()  # One wait for both.
         return replace(after, energy=energy, remaining=remaining)
 
     def _fields_of(self, carry: Carry) -> list[Tensor]:
@@ -167,7 +167,7 @@ class Recording:
         image = system.apply_smooth_inverse(force)
         memory = before.memory.after(before, move, force, image, dot=self._dot)
         torch.stack(self._fields_of(Carry(x, math.nan, force, image, memory=memory)), out=self._after)
-        self._known_after.copy_(torch.stack([energy.double(), system.relative_move(image)]))
+        self._scalars_after.copy_(torch.stack([energy.double(), system.relative_move(image)]))
 
 
 @functools.cache
@@ -215,12 +215,12 @@ def two_loops(
     if inverse[n - 1] > inverse.dtype(0.0):
         gamma = gamma / (inverse[n - 1] * products[g, 2 * n - 1, 3 * n - 1])
     for i in range(n):
-        seen = gamma * products[g, n + i, 3 * n + 1]
+        projected = gamma * products[g, n + i, 3 * n + 1]
         for j in range(n):
-            seen = seen - gamma * weight[j] * products[g, n + i, 2 * n + j]
+            projected = projected - gamma * weight[j] * products[g, n + i, 2 * n + j]
         for j in range(i):
-            seen = seen + amount[j] * products[g, n + i, j]
-        amount[i] = weight[i] - inverse[i] * seen
+            projected = projected + amount[j] * products[g, n + i, j]
+        amount[i] = weight[i] - inverse[i] * projected
     for i in range(n):
         out[g, i] = amount[i]
         out[g, n + i] = inverse.dtype(0.0)

@@ -63,11 +63,11 @@ def leave_saddle(
     Returns:
         Positions [m] of no more energy than x; x itself where nothing is compressed and flat.
     """
-    lack, normal = _lacking_slope(level, x)
-    if not bool((lack > 0).any()):
+    missing, normal = _missing_slope(level, x)
+    if not bool((missing > 0).any()):
         return x
     sign = _pattern(level.vertex_count).to(x) * outward.to(x)[level.vertex_garment.long()]
-    offset = (AMPLITUDE * level.spacing * lack * sign).unsqueeze(1) * normal * level.free
+    offset = (AMPLITUDE * level.spacing * missing * sign).unsqueeze(1) * normal * level.free
     energy = system.energy_and_force(x)[0]
     for halving in range(TRIES):
         trial = x + 0.5**halving * offset
@@ -76,7 +76,7 @@ def leave_saddle(
     return x
 
 
-def _lacking_slope(
+def _missing_slope(
     level: Level, x: Float[Tensor, "vertices 3"]
 ) -> tuple[Float[Tensor, " vertices"], Float[Tensor, "vertices 3"]]:
     """How much steeper each vertex's edges would have to be, over sqrt(2), and the normals."""

@@ -51,7 +51,7 @@ class Budget:
 
 @dataclass(eq=False)
 class LevelReport:
-    """What one level's solve did.
+    """Record of one level's solve.
 
     Attributes:
         level: Level index.
@@ -156,8 +156,10 @@ def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) ->
 def _remaining_move(system: System, carry: Carry) -> float:
     if carry.remaining is not None:
         return carry.remaining
-    known = carry.preconditioned
-    return system.remaining_move(known if known is not None else system.apply_metric_inverse(carry.force))
+    preconditioned = carry.preconditioned
+    return system.remaining_move(
+        preconditioned if preconditioned is not None else system.apply_metric_inverse(carry.force)
+    )
 
 
 def _require_finite(carry: Carry, level: int) -> None:

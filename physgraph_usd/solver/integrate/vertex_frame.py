@@ -39,9 +39,9 @@ class VertexFrame:
     def __init__(self, level: Level, x: Float[Tensor, "vertices 3"]) -> None:
         """Look from positions x [m]; no gradients flow through what is seen."""
         self._x = x.detach()
-        if level not in _KNOWN:
-            _KNOWN[level] = _Tables(level)
-        self._tables = _KNOWN[level]
+        if level not in _TABLES:
+            _TABLES[level] = _Tables(level)
+        self._tables = _TABLES[level]
 
     def part(self, vector: Float[Tensor, "vertices 3"], name: str) -> Float[Tensor, "vertices 3"]:
         """One of `PARTS` of a vector."""
@@ -111,7 +111,7 @@ class _Smooth(torch.autograd.Function):
         return ctx.tables._back.apply(gradients[0].contiguous()), None
 
 
-_KNOWN: WeakKeyDictionary[Level, _Tables] = WeakKeyDictionary()
+_TABLES: WeakKeyDictionary[Level, _Tables] = WeakKeyDictionary()
 
 
 @wp.func

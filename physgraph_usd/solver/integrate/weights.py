@@ -137,8 +137,8 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def _config(kind: str, values: dict[str, Any]) -> PhysgraphConfig | PaperConfig:
     if kind == "physgraph-paper":
         return PaperConfig(**values)
-    own: dict[str, Any] = values | {"vectors": tuple(values["vectors"])}
-    config = PhysgraphConfig(**own)
+    converted: dict[str, Any] = values | {"vectors": tuple(values["vectors"])}
+    config = PhysgraphConfig(**converted)
     unknown = [name for name in config.vectors if name not in VECTORS]
     if unknown:
         raise ValueError(f"unknown vectors {unknown}")

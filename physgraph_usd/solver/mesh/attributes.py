@@ -1,4 +1,4 @@
-"""What rides on a mesh when it is refined: values on vertices, faces and corners, and subsets.
+"""Attributes of a mesh that is refined: values on vertices, faces and corners, and subsets.
 
 Values of floating type are interpolated linearly, in float64, and come back in their own type. Of anything else
 (integers, booleans, strings) a fine element takes the value of its nearest parent: the one of largest weight, then of
@@ -109,10 +109,10 @@ def corner_values(
     topology = PolygonMesh(counts, indices, len(values))
     if not refinements:
         return topology.indices, values
-    own = subdivide_times(topology, len(refinements))
-    if not np.array_equal(own[-1].mesh.counts, refinements[-1].mesh.counts):
+    chain = subdivide_times(topology, len(refinements))
+    if not np.array_equal(chain[-1].mesh.counts, refinements[-1].mesh.counts):
         raise ValueError(f"corner values for {topology.face_count} faces do not fit the faces of the refined mesh")
-    return own[-1].mesh.indices, vertex_values(own, values)
+    return chain[-1].mesh.indices, vertex_values(chain, values)
 
 
 def face_subset(refinements: Sequence[Refinement], faces: np.ndarray) -> np.ndarray:

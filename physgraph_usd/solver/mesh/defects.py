@@ -1,4 +1,4 @@
-"""What is wrong with a mesh, named element by element. Nothing here stops a refinement but indices out of range."""
+"""Defects of a mesh, named element by element. Nothing here stops a refinement but indices out of range."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def defects(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[Defect]
     found = [
         Defect("index-out-of-range", int(face), f"face {face} uses a vertex that does not exist") for face in bad_faces
     ]
-    kept = np.setdiff1d(np.arange(mesh.face_count), bad_faces)
+    valid = np.setdiff1d(np.arange(mesh.face_count), bad_faces)
     corners = ~np.isin(mesh.corner_face, bad_faces)
-    sound = PolygonMesh(mesh.counts[kept], mesh.indices[corners], mesh.vertex_count) if len(bad_faces) else mesh
-    found += _face_defects(sound, points, kept)
+    sound = PolygonMesh(mesh.counts[valid], mesh.indices[corners], mesh.vertex_count) if len(bad_faces) else mesh
+    found += _face_defects(sound, points, valid)
     return found + _edge_defects(sound) + _vertex_defects(sound)
 
 
@@ -98,7 +98,11 @@ def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
         for row in crowded
     ]
     return found + [
-        Defect("inconsistent-winding", int(row), f"both faces run through edge {_pair(half.edges[row])} the same way")
+        Defect(
+            "inconsistent-winding",
+            int(row),
+            f"both faces run through edge {_pair(half.edges[row])} in the same direction",
+        )
         for row in twisted
     ]
 

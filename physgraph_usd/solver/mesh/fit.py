@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 STEPS = 40
 """After these the edges of no shot tried came nearer to their medians by more than a thousandth of their length."""
 HOLD = 1e-6
-"""What ties the shape to its place, in mean stiffnesses: enough for a factor, nothing to a length."""
+"""Stiffness that ties the shape to its place, in mean stiffnesses: enough for a factor, nothing to a length."""
 SHORTEST = 1e-3
 """In mean edges; shorter ones pull no harder."""
 

@@ -1,4 +1,4 @@
-"""Whether an edge passes through a triangle, decided the same way for every pair that shares an edge or a side."""
+"""Whether an edge passes through a triangle, decided alike for every pair that shares an edge or a side."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false
@@ -15,7 +15,7 @@ def volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 @wp.func
 def wide(v: wp.vec3f):
-    """The same in double precision."""
+    """A vector in double precision."""
     return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
 
 

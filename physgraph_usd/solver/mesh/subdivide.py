@@ -297,9 +297,9 @@ def _vertex_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     left = np.where(polygon, mesh.vertex_count + edge[corners], mesh.indices[mesh.next_corner[corners]])
     right = np.where(polygon, mesh.vertex_count + edge[before], mesh.indices[before])
     centre = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], here)
-    own = 1 / valence - 2 * ring
+    centre_weight = 1 / valence - 2 * ring
     return _stack(
         here,
         [left, right, centre, here],
-        [ring, ring, np.where(polygon, ring, own), np.where(polygon, own - ring, 0.0)],
+        [ring, ring, np.where(polygon, ring, centre_weight), np.where(polygon, centre_weight - ring, 0.0)],
     )

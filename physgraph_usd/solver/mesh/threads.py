@@ -24,7 +24,7 @@ _STDERR = 2
 LEAST_PER_THREAD = 4000
 """Items below which another thread costs more than it saves."""
 LEAST_QUERIES = 250
-"""The same where each item asks a hierarchy or stands for many elements."""
+"""Such items where each asks a hierarchy or stands for many elements."""
 SLICES, LEAST_SLICE = 8, 32
 """Slices a thread there, and what they have at least on average: some items cost a hundred times as much as others, so
 whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
@@ -44,7 +44,7 @@ def compile_kernels(device: str) -> None:
     wp.force_load(device)
 
 
-def kernels_are_kept() -> bool:
+def kernels_are_compiled() -> bool:
     """Whether some of our kernels were compiled for this user and version of Warp before."""
     start_warp()
     package = __name__.split(".", maxsplit=1)[0]
@@ -55,7 +55,7 @@ def kernels_are_kept() -> bool:
 def _stderr_to_nowhere() -> Iterator[None]:
     """Keep off the terminal what C code prints; does nothing in a program that has no standard error."""
     try:
-        kept = os.dup(_STDERR)
+        saved = os.dup(_STDERR)
     except OSError:
         yield
         return
@@ -64,8 +64,8 @@ def _stderr_to_nowhere() -> Iterator[None]:
         os.dup2(nowhere, _STDERR)
         yield
     finally:
-        os.dup2(kept, _STDERR)
-        os.close(kept)
+        os.dup2(saved, _STDERR)
+        os.close(saved)
         os.close(nowhere)
 
 
@@ -138,7 +138,7 @@ def _tapered(size: int, slices: int) -> list[int]:
 
 
 def _part(whole: wp.Launch, begin: int, end: int) -> wp.Launch:
-    """The same launch over some of its items: packing all parameters anew would take longer than many a slice."""
+    """A launch over some of its items: packing all parameters anew would take longer than many a slice."""
     part = copy.copy(whole)
     part.params = list(whole.params)
     part.fwd_args = list(whole.fwd_args or ())  # They keep the arrays alive.

@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 TIE = 1e-5
-"""Relative difference below which two ways to split a face count as equal. Then the lowest vertex number decides, not
+"""Relative difference below which two splits of a face count as equal. Then the lowest vertex number decides, not
 rounding, the rotation of the cloth, its winding or the corner that a face starts at."""
 
 
