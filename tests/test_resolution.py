@@ -24,7 +24,7 @@ from physgraph_usd.solver.resolution import (
     LEAST_STRAIN,
     LIMIT,
     MOST,
-    SHARP_SHARE,
+    SHARP_FRACTION,
     LevelChoice,
     choose_levels,
     finer,
@@ -149,7 +149,7 @@ def folds(coat: dict[str, Any], shares: dict[float | None, float]) -> str:
 def test_a_word_when_folds_are_too_sharp_for_the_mesh():
     coat = {"path": "/coat", "level": 2, "level_needed": 2, "fine_edge_mm": 8.0, "wavelength_mm": 40.0}
     assert not folds(coat, {})
-    assert not folds(coat, {1.0: SHARP_SHARE})
+    assert not folds(coat, {1.0: SHARP_FRACTION})
     said = folds(coat, {1.0: 0.0, 7.0: 0.034, 9.0: 0.02})
     assert "</coat> at time code 7: 3% of the edges fold by more than 45 degrees: edges of 8.0 mm" in said
     assert said.endswith(finer(2, 2, 8e-3))

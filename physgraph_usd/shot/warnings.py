@@ -12,7 +12,7 @@ from shlex import join
 from typing import Any
 
 from ..errors import counted
-from ..solver.resolution import EDGES_PER_WAVE, FEWEST_EDGES, SHARP_SHARE, LevelChoice, finer
+from ..solver.resolution import EDGES_PER_WAVE, FEWEST_EDGES, SHARP_FRACTION, LevelChoice, finer
 from ..solver.strain import SHRUNK, StrainedPart
 from .report import RefineReport
 from .settled import COLLAPSED, LIMITED, UNSOLVED, Unsettled
@@ -242,7 +242,7 @@ def of_folds(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
     """A warning where a garment's mesh was too coarse for its folds, with its worst frame."""
     shares = {time: entry.get("sharp_folds", 0.0) for time, entry in entries.items()}
     worst = max(shares, key=lambda time: shares[time], default=None)
-    if not shares or shares[worst] <= SHARP_SHARE:
+    if not shares or shares[worst] <= SHARP_FRACTION:
         return
     path, level, needed, edge = (garment[name] for name in ("path", "level", "level_needed", "fine_edge_mm"))
     known = needed > level and garment["wavelength_mm"] < FEWEST_EDGES * edge  # "coarse" has said what to do.

@@ -98,11 +98,7 @@ def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
         for row in crowded
     ]
     return found + [
-        Defect(
-            "inconsistent-winding",
-            int(row),
-            f"both faces run through edge {_pair(half.edges[row])} in the same direction",
-        )
+        Defect("inconsistent-winding", int(row), f"both faces run through edge {_pair(half.edges[row])} the same way")
         for row in twisted
     ]
 
