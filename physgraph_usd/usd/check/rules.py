@@ -37,14 +37,14 @@ class Problem:
         path: Prim or property path; "/" for the layer.
         time: Time code, or None for the default or at all times.
         message: What is wrong, with the values found.
-        rule: Name of the rule that found it.
+        rule: Name of the rule that found it, filled in by `validate`.
     """
 
     severity: str
     path: str
     time: float | None
     message: str
-    rule: str
+    rule: str = ""
 
     def __str__(self) -> str:
         """Place, time and message in one line."""
@@ -105,9 +105,9 @@ class Fine:
         return "" if good else str(reason)
 
     def problem(self, name: str, message: str, time: float | None = None, *, severity: str = "error") -> Problem:
-        """Name a problem with one of the prim's properties; ``rule`` is filled in by `validate`."""
+        """A problem with the prim or one of its properties."""
         path = self.prim.GetPath().AppendProperty(name) if name else self.prim.GetPath()
-        return Problem(severity, str(path), time, message, "")
+        return Problem(severity, str(path), time, message)
 
 
 def opinions_together(fine: Fine) -> Iterator[Problem]:
@@ -252,13 +252,13 @@ def subsets(fine: Fine) -> Iterator[Problem]:
         if element not in sizes:
             continue
         if array.size and array.dtype.kind not in "iu":
-            yield Problem("error", path, None, f"is a {type(value).__name__}, not an array of integers", "")
+            yield Problem("error", path, None, f"is a {type(value).__name__}, not an array of integers")
             continue
         indices = array.astype(np.int64).reshape(-1)
         if len(indices) and not 0 <= indices.min() <= indices.max() < sizes[element]:
-            yield Problem("error", path, None, f"names {element} {indices.max()} of {sizes[element]}", "")
+            yield Problem("error", path, None, f"names {element} {indices.max()} of {sizes[element]}")
         elif len(np.unique(indices)) != len(indices):
-            yield Problem("error", path, None, f"names a {element} twice", "")
+            yield Problem("error", path, None, f"names a {element} twice")
         families.setdefault((element, subset.GetFamilyNameAttr().Get() or ""), []).append(indices)
     for (element, family), parts in families.items():
         kind = UsdGeom.Subset.GetFamilyType(imageable, family)
@@ -333,8 +333,8 @@ RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
 
 
 def _error(message: str, path: str = "/", time: float | None = None) -> Problem:
-    """An error; ``rule`` is filled in by `validate`."""
-    return Problem("error", path, time, message, "")
+    """An error."""
+    return Problem("error", path, time, message)
 
 
 def record(layer: Sdf.Layer) -> Iterator[Problem]:
@@ -355,13 +355,13 @@ def time_scale(layer: Sdf.Layer) -> Iterator[Problem]:
 def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
     """All samples of the shot were refined: outside those that were, the cloth stands still."""
     for path, message in (read_record(layer) or {}).get("left_out", {}).items():
-        yield Problem("warning", path, None, f"was refined without {message}, where it stands still (--frames)", "")
+        yield Problem("warning", path, None, f"was refined without {message}, where it stands still (--frames)")
     chunk = read_chunk(layer)
     if chunk is not None and chunk.times != chunk.every:
         message = (
             f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch it to the others"
         )
-        yield Problem("warning", "/", None, message, "")
+        yield Problem("warning", "/", None, message)
 
 
 def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:

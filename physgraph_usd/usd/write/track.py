@@ -99,7 +99,7 @@ class PointTrack:
         """
         same_matrix = self._matrix is not None and to_metres is not None and np.array_equal(self._matrix, to_metres)
         if not changed and same_matrix and self._last is not None and time is not None:
-            self._repeat(_Sample(time, self._last.points))
+            self._take(_Sample(time, self._last.points), moved=False)
             return
         self._matrix = to_metres
         if to_metres is not None:
@@ -110,40 +110,32 @@ class PointTrack:
         if time is None:
             self.box = extent_of(points)
             return
-        sample = _Sample(time, points)
-        if self._last is None:
-            self._begin(sample)
-        elif np.array_equal(points, self._last.points):
-            self._repeat(sample)
-        else:
-            self._move(sample)
+        self._take(_Sample(time, points), moved=self._last is None or not np.array_equal(points, self._last.points))
 
-    def _begin(self, sample: _Sample) -> None:
-        """Take the first sample."""
+    def _take(self, sample: _Sample, *, moved: bool) -> None:
+        """Author a sample, and the end of the run before it; one that equals the last is the end of a run."""
+        last = self._last
+        if last is not None and not moved:
+            if self._rate is None or self._still:
+                self._run_end = sample.time
+            else:
+                self._emit(sample)
+            return
+        if last is None:
+            self.box = extent_of(sample.points)
+        elif self._still:
+            self._still = False
+            self._emit(last)
+        self._end_run()
         self._last = sample
-        self.box = extent_of(sample.points)
         if not self._still:
             self._emit(sample)
 
-    def _repeat(self, sample: _Sample) -> None:
-        """Take a sample that equals the last one."""
-        if self._rate is not None and not self._still:
-            self._emit(sample)
-        else:
-            self._run_end = sample.time
-
-    def _move(self, sample: _Sample) -> None:
-        """Take a sample that differs from the last one, and close the run before it."""
-        last = self._last
-        assert last is not None
-        if self._still:
-            self._still = False
-            self._emit(last)
-        if self._run_end is not None:
-            self._emit(_Sample(self._run_end, last.points))
+    def _end_run(self) -> None:
+        """Author the last of a run of equal samples."""
+        if self._run_end is not None and self._last is not None and not self._still:
+            self._emit(_Sample(self._run_end, self._last.points))
             self._run_end = None
-        self._last = sample
-        self._emit(sample)
 
     def _emit(self, sample: _Sample) -> None:
         """Author one sample, and the velocity of the one before it."""
@@ -151,22 +143,17 @@ class PointTrack:
         if self._rate is None:
             return
         self._queue.append(sample)
-        if len(self._queue) == 2:
-            self._author_velocity(self._queue[0], self._queue[0], self._queue[1])
-        elif len(self._queue) == 3:
-            self._author_velocity(self._queue[1], self._queue[0], self._queue[2])
-            self._queue.pop(0)
+        if len(self._queue) > 1:
+            self._author_velocity(self._queue[-2], self._queue[0], sample)
+            del self._queue[:-2]
 
     def finish(self, *, hold: bool = False) -> None:
         """Author the last velocity, and with ``hold`` the end of a run of equal samples that others are to follow."""
-        if hold and self._run_end is not None and self._last is not None and not self._still:
-            self._emit(_Sample(self._run_end, self._last.points))
-            self._run_end = None
-        if len(self._queue) == 1:
-            self._author_velocity(self._queue[0], self._queue[0], self._queue[0])
-        elif self._queue:
-            self._author_velocity(self._queue[-1], self._queue[-2], self._queue[-1])
-        self._queue.clear()
+        if hold:
+            self._end_run()
+        if self._queue:
+            self._author_velocity(self._queue[-1], self._queue[0], self._queue[-1])
+            self._queue.clear()
 
     def _author(self, time: float | None, points: np.ndarray) -> None:
         """Author points, normals and extent at one time."""
@@ -298,8 +285,7 @@ class ModelHints:
         """Grow the hints by the local extent of the fine mesh, shape (2, 3), at a time code."""
         if not self._models:
             return
-        code = timecode(time)
-        cache = UsdGeom.XformCache(code)
+        cache = UsdGeom.XformCache(timecode(time))
         corners = np.array([[box[i][0], box[j][1], box[k][2], 1.0] for i, j, k in product((0, 1), repeat=3)])
         local = np.array(cache.GetLocalToWorldTransform(self._prim))
         for model in self._models:
@@ -313,10 +299,9 @@ class ModelHints:
         attribute = model.GetAttribute(ATTRIBUTE)
         time = time if attribute.GetNumTimeSamples() > 0 else None
         path = model.GetPath().AppendProperty(ATTRIBUTE)
-        code = timecode(time)
         spec = self._stream.attribute(path, Sdf.ValueTypeNames.Float3Array)
         grown = self._stream.layer.QueryTimeSample(path, time) if time is not None else spec.default
-        value = attribute.Get(code) if grown is None else grown
+        value = attribute.Get(timecode(time)) if grown is None else grown
         rows = np.array(value if value is not None else [], np.float32).reshape(-1, 3)
         empty = np.tile(np.array([[np.finfo(np.float32).max], [-np.finfo(np.float32).max]], np.float32), (1, 3))
         while len(rows) < self._row + 2:
