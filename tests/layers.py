@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
+from stages import new_stage, sheet_faces, vec3
 
 from physgraph_usd.solver.mesh.attributes import vertex_values
 from physgraph_usd.solver.mesh.subdivide import Refinement, subdivide_times
@@ -25,16 +26,7 @@ def grid(columns: int = 4, rows: int = 3, *, quads: bool = True) -> tuple[np.nda
     """Points in the plane, counts and indices of a sheet that faces +Z."""
     x, y = np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0))
     points = np.stack([x, y, 0.1 * np.sin(x)], axis=-1).reshape(-1, 3)
-    ids = np.arange(points.shape[0]).reshape(rows + 1, columns + 1)
-    faces = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
-    if not quads:
-        faces = np.stack([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
-    return points, np.full(len(faces), faces.shape[1], np.int32), faces.reshape(-1).astype(np.int32)
-
-
-def vec3(array: np.ndarray) -> Vt.Vec3fArray:
-    """Points for USD."""
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(array, np.float32))
+    return points, *sheet_faces("quads" if quads else "triangles", (columns, rows))
 
 
 def make_shot(
@@ -49,16 +41,8 @@ def make_shot(
     default: bool = True,
 ) -> Usd.Stage:
     """A coat under a moving rig, in memory of a new layer; saved, and returned for more edits."""
-    stage = Usd.Stage.CreateNew(str(path))
-    stage.SetTimeCodesPerSecond(30.0)
-    stage.SetFramesPerSecond(30.0)
-    UsdGeom.SetStageMetersPerUnit(stage, metres)
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    world = UsdGeom.Xform.Define(stage, "/World")
-    stage.SetDefaultPrim(world.GetPrim())
-    rig = UsdGeom.Xform.Define(stage, "/World/rig")
-    operation = rig.AddTransformOp()
-    operation.Set(matrix or Gf.Matrix4d(1.0))
+    stage = new_stage(path, metres=metres, up="Z", rate=30.0)
+    UsdGeom.Xform.Define(stage, "/World/rig").AddTransformOp().Set(matrix or Gf.Matrix4d(1.0))
     points, counts, indices = grid(*size, quads=quads)
     if orientation == "leftHanded":
         indices = indices.reshape(len(counts), -1)[:, ::-1].reshape(-1).copy()

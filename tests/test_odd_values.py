@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz.damage import replace
 from layers import COAT, dress_up, errors, make_shot, write_layer
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_shot
@@ -24,12 +25,7 @@ CLOTH = "/World/cloth"
 
 def retype(stage: Usd.Stage, path: str, kind: str, value: object) -> None:
     """Author an attribute with another type than its schema's."""
-    layer, where = stage.GetRootLayer(), Sdf.Path(path)
-    prim = Sdf.CreatePrimInLayer(layer, where.GetPrimPath())
-    if where.name in prim.properties:
-        prim.RemoveProperty(prim.properties[where.name])
-    type_name = Sdf.ValueTypeNames.Find(kind)  # pyright: ignore[reportCallIssue]  the stubs know no argument
-    Sdf.AttributeSpec(prim, where.name, type_name, Sdf.VariabilityVarying).default = value
+    replace(stage, Sdf.Path(path), kind, value)
 
 
 class TestGravity:

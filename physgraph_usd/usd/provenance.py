@@ -28,7 +28,7 @@ FAILED, UNSOLVED, UNSETTLED, CROSSED = "failed", "unsolved", "unsettled", "cross
 """Entries of the record: time codes without a sample; frames of garments that were not solved and follow their cage;
 those that were written though they did not settle; edges left through faces, where over a tenth of the input's are."""
 LACKING = (FAILED, UNSOLVED, UNSETTLED, CROSSED)
-"""What a layer lacks; the first two make every run one that was done in part, the others a strict one."""
+"""Defects of a layer; the first two make every run one that was done in part, the others a strict one."""
 _LIST = (Vt.StringArray, list)
 _TYPES: dict[str, Any] = {
     "garments": _LIST,

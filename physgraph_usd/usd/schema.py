@@ -28,7 +28,7 @@ SI = " SI, whatever the stage's metersPerUnit."
 REFINEMENT, FABRIC, CONTACT, PAINTED, COLLISION = "Refinement", "Fabric", "Contact", "Painted Maps", "Collider"
 """Display groups."""
 SIDES = ("auto", "winding", "start", "front", "back")
-"""How to tell on which side of a mesh cloth belongs.
+"""Rules for the side of a mesh on which cloth belongs.
 
 "auto": outside of pieces that are closed, and of the others the side on which the coarse cloth around a vertex is.
 "winding": outside of every piece, closed or not, by the generalised winding number.

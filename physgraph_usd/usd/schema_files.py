@@ -44,7 +44,7 @@ def _number(row: Property, value: float | str) -> str:
 
 
 def _otherwise(row: Property) -> str:
-    """What is taken where nothing gives a property, in words; "" when that means something else."""
+    """The fallback of a property in words, or ""."""
     return "" if row.fallback is None else _number(row, row.fallback).strip('"')
 
 
@@ -129,8 +129,8 @@ def _table_row(row: Property) -> str:
     kind = f"uniform {row.type}" if row.uniform else row.type
     unit = ", ".join(part for part in (row.unit, _ends(row, row.minimum, row.maximum) or ", ".join(row.tokens)) if part)
     soft = _ends(row, *(row.soft or (None, None)))
-    message = row.doc.removesuffix(SI)
-    return f"| `{row.name}` | {row.label} | {kind} | {_otherwise(row)} | {unit} | {soft} | {message} |"
+    columns = (f"`{row.name}`", row.label, kind, _otherwise(row), unit, soft, row.doc.removesuffix(SI))
+    return f"| {' | '.join(columns)} |"
 
 
 def _ends(row: Property, low: float | None, high: float | None) -> str:

@@ -52,7 +52,7 @@ class Notice:
     Attributes:
         path: Prim path, or "" for the stage.
         time: Time code, or None when it holds at all times.
-        message: What was found and what was done about it.
+        message: The finding, and what was done about it.
     """
 
     path: str
@@ -65,7 +65,7 @@ class Notice:
 
 
 def at_time(time: float | None) -> str:
-    """Where in time, as messages end a place: " at time code 3", or "" for None."""
+    """The end of a place in messages: " at time code 3", or "" for None."""
     return "" if time is None else f" at time code {time:g}"
 
 
@@ -112,7 +112,7 @@ class GarmentSource:
 
     @property
     def left_out_said(self) -> str:
-        """How many of its samples are outside the range, and where; "" when none is."""
+        """Number and place of its samples outside the range; "" when there are none."""
         before, after = ([f"{t:g}" for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
         spans = " and ".join(" to ".join(dict.fromkeys([span[0], span[-1]])) for span in (before, after) if span)
         return f"{len(self.left_out)} of {len(self.left_out) + len(self.times)} samples, {spans}" if spans else ""

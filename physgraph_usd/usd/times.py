@@ -1,4 +1,4 @@
-"""Which time codes a garment has, in composed stage time."""
+"""Time codes of garments, in composed stage time."""
 
 from __future__ import annotations
 

@@ -22,10 +22,10 @@ class StageView:
         root: Root layer, the stage's own: edits that are not saved are in it and in the layers that it names.
         session: A copy of the session layer.
         muted: Identifiers of muted layers.
-        load: Which payloads are loaded.
-        population: Which prims are on the stage.
-        context: What asset paths are resolved with, an ``Ar.ResolverContext``.
-        interpolation: How values between samples are found.
+        load: Rules for loading payloads.
+        population: Prims on the stage.
+        context: Context of asset paths, an ``Ar.ResolverContext``.
+        interpolation: Interpolation between samples.
     """
 
     root: Sdf.Layer

@@ -36,7 +36,7 @@ class Problem:
         severity: ``error``: readers will fail or show something wrong; ``warning``: look at it.
         path: Prim or property path; "/" for the layer.
         time: Time code, or None for the default or at all times.
-        message: What is wrong, with the values found.
+        message: The fault, with the values found.
         rule: Name of the rule that found it, filled in by `validate`.
     """
 
@@ -97,7 +97,7 @@ class Fine:
         return np.zeros(0, np.int32) if array is None else array
 
     def topology_fault(self, time: float | None) -> str:
-        """What is wrong with counts, indices and points at one time, or ""."""
+        """The fault in counts, indices and points at one time, or ""."""
         points, counts, indices = (self.value(name, time) for name in TOGETHER[:3])
         if points is None or counts is None or indices is None:
             return "there are no points or no faces"
@@ -225,7 +225,7 @@ def heat_maps(fine: Fine) -> Iterator[Problem]:
 
 
 def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) -> str:
-    """What is wrong with a primvar at one time, or ""."""
+    """The fault in a primvar at one time, or ""."""
     value = primvar.Get(timecode(time))
     if value is None:
         return ""

@@ -66,7 +66,7 @@ class GarmentReader:
         values: Sources of its animated values.
         points: Its points.
         edges: Its edges, shape (E, 2).
-        notices: What is odd about it.
+        notices: Warnings about it.
     """
 
     garment: Garment

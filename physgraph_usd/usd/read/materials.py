@@ -72,7 +72,7 @@ class Values:
         found: Source of each value, by short name.
         volumetric: Whether the density is per volume, to be multiplied by the thickness.
         thickness: Thickness at each point over the mean, shape (V,), where stiffnesses follow it; else None.
-        notices: What is odd about the values.
+        notices: Warnings about the values.
     """
 
     found: dict[str, Found]

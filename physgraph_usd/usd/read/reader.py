@@ -61,7 +61,7 @@ class Shot:
         sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
         selections: Variant selections in force on what the garments depend on, as paths `/World/coat{fit=loose}`.
-        warnings: What the user should know; grows as frames are read.
+        warnings: Warnings for the user; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
     """
 

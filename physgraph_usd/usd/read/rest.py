@@ -34,7 +34,7 @@ class Rest:
     Attributes:
         points: Rest positions [m], shape (V, 3), float64.
         source: Their source in words, for the report.
-        notices: What is odd about them.
+        notices: Warnings about them.
     """
 
     points: np.ndarray

@@ -54,7 +54,7 @@ class Survey:
         path: The shot file, or the name of a stage that has none.
         metres_per_unit: Length of one stage unit [m].
         meshes: Every mesh.
-        notices: What is odd about the stage itself.
+        notices: Warnings about the stage itself.
     """
 
     path: str

@@ -20,7 +20,7 @@ from ...errors import LayerError, UsageError
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 """Flag of `os.open` that follows no link; Windows has none."""
 ASSET_PATHS = ("relative", "absolute")
-"""How one file may name another: from its own folder, or from the root of the file system."""
+"""Forms of a path in a file: from the file's folder, or from the root of the file system."""
 HOST = re.sub(r"[^\w-]", "_", socket.gethostname()) or "host"
 """This machine in the names of temporary files."""
 

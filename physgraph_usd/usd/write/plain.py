@@ -119,7 +119,7 @@ class PlainStage:
 
     Attributes:
         name: Name of the default prim.
-        doc: What the shot is for, one sentence.
+        doc: Purpose of the shot, one sentence.
         meshes: Its meshes.
         times: Time codes of every sample, ascending.
         skeleton: Skeleton of the skinned meshes, or None.

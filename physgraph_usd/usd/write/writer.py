@@ -63,7 +63,7 @@ class LayerWriter:
             velocities: Whether to author velocities, by finite differences, where the shot has none too.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
-            chunk: Which frames of the shot the layer is for; garments without a sample there are not in it. None for
+            chunk: Frames of the shot that the layer is for; garments without a sample there are not in it. None for
                 all.
 
         Raises:
