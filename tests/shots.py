@@ -9,33 +9,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from click.testing import CliRunner, Result
 from layers import errors, open_over, world_metres
 from pxr import Sdf
 from stages import add_sheet, new_stage, save, vec3
 
+from physgraph_usd.cli import main
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.shot.report import RefineReport
 
-VALID = {
-    "01_newton_shirt_dab_cm.usdc": ["/shot/char/shirt_geo"],
-    "02_makehuman_usdskel_dm.usdc": ["/shot/char/top", "/shot/char/shorts"],
-    "06_torus_pull.usda": ["/shot/cloth"],
-    "07_flag_quads_nocollider.usda": ["/shot/flag"],
-    "08_sphere_spin_xformcollider.usdc": ["/shot/set/cloth"],
-    "09_cesiumman_kilt/shot.usda": ["/shot/kilt"],
-    "12_variants/a_lefthanded_consistent.usdc": ["/shot/shirt"],
-    "12_variants/b_winding_flipped_unflagged.usdc": ["/shot/shirt"],
-    "12_variants/c_zup_cm.usdc": ["/shot/shirt"],
-    "12_variants/d_mixed_quads_tris.usdc": ["/shot/shirt"],
-    "12_variants/e_sparse_samples.usdc": ["/shot/shirt"],
-    "12_variants/f_subframe_times_tcps48.usdc": ["/shot/shirt"],
-    "12_variants/g_nonuniform_scaled_parent.usdc": ["/shot/rig/shirt"],
-    "12_variants/h_holes_creases_normals.usdc": ["/shot/shirt"],
-    "12_variants/j_visibility_purpose.usdc": ["/shot/shirt"],
-    "12_variants/k_static_garment.usda": ["/shot/shirt"],
+SHOTS = {
+    "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], [1426], 56),
+    "02_makehuman_usdskel_dm.usdc": (["/shot/char/top", "/shot/char/shorts"], [1311, 1565], 46),
+    "06_torus_pull.usda": (["/shot/cloth"], [1939], 60),
+    "07_flag_quads_nocollider.usda": (["/shot/flag"], [961], 60),
+    "08_sphere_spin_xformcollider.usdc": (["/shot/set/cloth"], [1939], 60),
+    "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], [1074], 48),
+    "12_variants/a_lefthanded_consistent.usdc": (["/shot/shirt"], [1426], 12),
+    "12_variants/b_winding_flipped_unflagged.usdc": (["/shot/shirt"], [1426], 12),
+    "12_variants/c_zup_cm.usdc": (["/shot/shirt"], [1426], 12),
+    "12_variants/d_mixed_quads_tris.usdc": (["/shot/shirt"], [1426], 12),
+    "12_variants/e_sparse_samples.usdc": (["/shot/shirt"], [1426], 4),
+    "12_variants/f_subframe_times_tcps48.usdc": (["/shot/shirt"], [1426], 12),
+    "12_variants/g_nonuniform_scaled_parent.usdc": (["/shot/rig/shirt"], [1426], 12),
+    "12_variants/h_holes_creases_normals.usdc": (["/shot/shirt"], [1426], 12),
+    "12_variants/j_visibility_purpose.usdc": (["/shot/shirt"], [1426], 12),
+    "12_variants/k_static_garment.usda": (["/shot/shirt"], [1426], 0),
 }
-"""The real shots listed as valid, and their garments."""
+"""The real shots listed as valid: their garments, the numbers of their points, and of frames."""
+VALID = {name: garments for name, (garments, _, _) in SHOTS.items()}
 CLOTH = "/World/cloth"
 EDGE = 0.05
 TIMES = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
@@ -80,6 +83,11 @@ def fine(shot: Path, layer: Path, time: float | None, *, prim: str = CLOTH) -> n
 def faults(layer: Path, shot: Path) -> list[str]:
     """Errors that the validator finds."""
     return errors(layer, shot)
+
+
+def run(*args: object) -> Result:
+    """The command, in this process."""
+    return CliRunner().invoke(main, [str(arg) for arg in args])
 
 
 def command(*args: object, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -7,20 +7,14 @@ import os
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
-from shots import cloth_shot, refine
+from shots import cloth_shot, refine, run
 from stages import clip_shot, save
 
-from physgraph_usd.cli import main
 from physgraph_usd.usd.files import files_of
 
 SMALL = ("--level", "1", "--steps", "2")
 PARTS = ("sub", "under", "reference", "payload", "chosen", "other", "deep", "inactive")
-
-
-def run(*args: object) -> Result:
-    return CliRunner().invoke(main, [str(arg) for arg in args])
 
 
 def asset(path: Path) -> Usd.Stage:

@@ -9,16 +9,9 @@ import pytest
 
 pytest.importorskip("pxr", reason="shots are read with usd-core")
 
-from click.testing import CliRunner, Result
-from shots import cloth_shot
-
-from physgraph_usd.cli import main
+from shots import cloth_shot, run
 
 SMALL = ("--level", "1", "--steps", "2")
-
-
-def run(*args: object) -> Result:
-    return CliRunner().invoke(main, [str(arg) for arg in args])
 
 
 @pytest.fixture

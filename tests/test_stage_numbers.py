@@ -10,21 +10,15 @@ import pytest
 
 pytest.importorskip("pxr", reason="shots are read with usd-core")
 
-from click.testing import CliRunner, Result
 from pxr import Sdf, Usd, UsdPhysics
-from shots import CLOTH, cloth_shot
+from shots import CLOTH, cloth_shot, run
 
-from physgraph_usd.cli import main
 from physgraph_usd.shot.plain_json import to_json
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.usd.schema import GARMENT
 
 NAN, INF = float("nan"), float("inf")
 SMALL = ("--level", "1", "--steps", "2")
-
-
-def run(*args: object) -> Result:
-    return CliRunner().invoke(main, [str(arg) for arg in args])
 
 
 def strict(text: str) -> Any:

@@ -1,4 +1,4 @@
-"""Real shots and odd stages: every valid one opens and gives every frame, every broken one says what is wrong."""
+"""Real shots and odd stages: every valid one gives every frame and a layer without fault, every broken one says why."""
 
 from __future__ import annotations
 
@@ -7,29 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from layers import errors, fine_points, open_over, refine_all, world_metres, write_shot
+from shots import SHOTS, VALID
 
 from physgraph_usd.errors import GarmentError, PhysGraphError, StageError
 from physgraph_usd.usd.read.reader import Shot, open_shot
 from physgraph_usd.usd.read.survey import survey
 
-SHOTS = {
-    "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], [1426], 56),
-    "02_makehuman_usdskel_dm.usdc": (["/shot/char/top", "/shot/char/shorts"], [1311, 1565], 46),
-    "06_torus_pull.usda": (["/shot/cloth"], [1939], 60),
-    "07_flag_quads_nocollider.usda": (["/shot/flag"], [961], 60),
-    "08_sphere_spin_xformcollider.usdc": (["/shot/set/cloth"], [1939], 60),
-    "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], [1074], 48),
-    "12_variants/a_lefthanded_consistent.usdc": (["/shot/shirt"], [1426], 12),
-    "12_variants/b_winding_flipped_unflagged.usdc": (["/shot/shirt"], [1426], 12),
-    "12_variants/c_zup_cm.usdc": (["/shot/shirt"], [1426], 12),
-    "12_variants/d_mixed_quads_tris.usdc": (["/shot/shirt"], [1426], 12),
-    "12_variants/e_sparse_samples.usdc": (["/shot/shirt"], [1426], 4),
-    "12_variants/f_subframe_times_tcps48.usdc": (["/shot/shirt"], [1426], 12),
-    "12_variants/g_nonuniform_scaled_parent.usdc": (["/shot/rig/shirt"], [1426], 12),
-    "12_variants/h_holes_creases_normals.usdc": (["/shot/shirt"], [1426], 12),
-    "12_variants/j_visibility_purpose.usdc": (["/shot/shirt"], [1426], 12),
-    "12_variants/k_static_garment.usda": (["/shot/shirt"], [1426], 0),
-}
 UNOPENABLE = ("framesPerSecond_-1.usda", "framesPerSecond_0.usda")
 VARIANTS = [name for name in SHOTS if name.startswith("12_variants/") and "k_static" not in name]
 
@@ -131,3 +115,20 @@ def read(file: Path, mesh: str, *, valid: bool) -> None:
         return
     shot = open_shot(str(file), garments=[mesh])
     assert np.isfinite(shot.frame(None).garments[0].points).all()
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+@pytest.mark.parametrize("name", VALID)
+def test_a_layer_over_a_real_shot_keeps_every_rule(real_data: Path, tmp_path: Path, name: str, mode: str) -> None:
+    path, out = real_data / "shots" / name, tmp_path / "out.usdc"
+    shot = open_shot(str(path), level=1, garments=VALID[name])
+    steps = refine_all(shot)
+    times = [*shot.scene.times[:2], *shot.scene.times[-1:]] or [None]
+    writer = write_shot(shot, out, times=times, mode=mode, velocities=True)
+    assert errors(out, path) == []
+    stage = open_over(path, out)
+    for time in times:
+        for target, points in zip(writer.targets, fine_points(shot, steps, time), strict=True):
+            size = float(np.ptp(points, axis=0).max())
+            np.testing.assert_allclose(world_metres(stage, str(target), time), points, atol=1e-5 * size)
