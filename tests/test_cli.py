@@ -22,7 +22,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from physgraph_usd import cli, errors
-from physgraph_usd.cli.printing import Saying
+from physgraph_usd.cli.printing import Output
 from physgraph_usd.cli.refine import refine
 from physgraph_usd.errors import counted
 from physgraph_usd.shot.options import INTEGRATORS
@@ -209,7 +209,7 @@ class TestRefine:
         from physgraph_usd.solver.integrate import METHODS
 
         said = run("refine", "--help").output
-        headings = ["Files:", "Scene:", "Solver:", "Layer:", "Several shots, and", "What is said:", "Options:"]
+        headings = ["Files:", "Scene:", "Solver:", "Layer:", "Several shots, and", "Messages:", "Options:"]
         assert [said.index(heading) for heading in headings] == sorted(said.index(heading) for heading in headings)
         assert tuple(METHODS) == INTEGRATORS
         letters = "".join(said.split())
@@ -454,7 +454,7 @@ def test_progress_shows_time_left_on_a_terminal(monkeypatch: pytest.MonkeyPatch)
 
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    with Saying().progress("shot.usda") as progress:
+    with Output().progress("shot.usda") as progress:
         for done in range(1, 5):
             progress(done, 4)
     assert "shot.usda" in terminal.getvalue()

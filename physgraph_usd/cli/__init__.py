@@ -9,21 +9,7 @@ from __future__ import annotations
 import click
 
 from ..version import __version__
-from .commands import (
-    chart,
-    inspect,
-    preview,
-    report_schema,
-    sample,
-    schema_path,
-    stitch,
-    tag,
-    train,
-    tune,
-    validate,
-    warm_up,
-)
-from .refine import refine
+from . import commands
 from .structure import Commands
 
 
@@ -33,19 +19,6 @@ def main() -> None:
     """Refine coarse animated garments in USD shots into fine cloth."""
 
 
-for command in (
-    refine,
-    stitch,
-    inspect,
-    tag,
-    tune,
-    validate,
-    sample,
-    preview,
-    chart,
-    train,
-    schema_path,
-    report_schema,
-    warm_up,
-):
-    main.add_command(command)
+for command in vars(commands).values():
+    if isinstance(command, click.Command):
+        main.add_command(command)

@@ -23,11 +23,11 @@ from .options import (
     scene_options,
     shot_argument,
 )
-from .printing import outline, tell
+from .printing import outline, print_progress
 from .refine import refine
 from .show_file import values_for
 from .structure import DONE, FAILED, imports_uncollected
-from .types import FrameRange, PictureSize
+from .types import FRAME_RANGE, PICTURE_SIZE
 
 PRIMS = "Prim path, glob or collection; repeatable."
 
@@ -36,7 +36,7 @@ PRIMS = "Prim path, glob or collection; repeatable."
 @click.argument("chunks", nargs=-1, required=True, metavar="CHUNK...", type=click.Path(path_type=Path))
 @out_option("LAYER", "Layer to write.", required=False)
 @click.option("--check-seams", is_flag=True, help="Look at the seams of those there, and write nothing.")
-@click.option("--frames", type=FrameRange(), help="Time codes that must be there.  [default: all of the shot]")
+@click.option("--frames", type=FRAME_RANGE, help="Time codes that must be there.  [default: all of the shot]")
 @click.option(
     "--seam-bound",
     type=click.FloatRange(min=0),
@@ -100,8 +100,8 @@ def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str
     """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
     from ..usd.write.tag import tag as tag_shot
 
-    given = {name: value for name, value in options.items() if value is not None}
-    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **given))
+    values = {name: value for name, value in options.items() if value is not None}
+    click.echo(tag_shot(shot, out, garments=garments, colliders=colliders, **values))
 
 
 @click.command()
@@ -160,7 +160,7 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 @out_option("PNG|GIF", "Picture to write.")
 @click.option("--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the one the layer names]")
 @click.option("--time", "times", type=float, multiple=True, metavar="T", help="Time code to draw; repeatable.")
-@click.option("--size", type=PictureSize(), default="1280x640", help="Pixels.")
+@click.option("--size", type=PICTURE_SIZE, default="1280x640", help="Pixels.")
 @click.option("--camera", type=(float, float), metavar="AZIMUTH ELEVATION", help="Where to look from, in degrees.")
 @overwrite_option
 def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
@@ -193,8 +193,8 @@ def chart(shot: str, out: Path, **options: Any) -> None:
     from ..lab.chart.options import ChartOptions
     from ..lab.chart.run import chart_shot
 
-    given = {name: value for name, value in options.items() if value not in (None, ())}
-    done = chart_shot(shot, out, ChartOptions(**given, progress=tell))
+    values = {name: value for name, value in options.items() if value not in (None, ())}
+    done = chart_shot(shot, out, ChartOptions(**values, progress=print_progress))
     click.echo("\n".join(done.lines()))
 
 

@@ -12,7 +12,7 @@ import click
 
 from ..shot.options import OPTIONS, RefineOptions
 from .structure import Option
-from .types import FrameRange, RefineLevel, RestShape
+from .types import FRAME_RANGE, LEVEL, REST
 
 SHOW_HEADINGS = ("Scene", "Solver", "Layer")
 """Headings of the options that a show's file may give, too: they belong to no single run."""
@@ -20,7 +20,7 @@ HEADINGS = ("Files", *SHOW_HEADINGS, "Several shots, and runs that were interrup
 """Headings of the options of `RefineOptions`, in the order of the help."""
 Decorator = Callable[[Callable[..., None]], Callable[..., None]]
 _FIELDS = {field.name: field for field in dataclasses.fields(RefineOptions)}
-_TYPES = {"frames": FrameRange(), "level": RefineLevel(), "rest_frame": RestShape()}
+_TYPES = {"frames": FRAME_RANGE, "level": LEVEL, "rest_frame": REST}
 _PATH = click.Path(path_type=Path)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -78,14 +78,14 @@ def under(heading: str) -> Decorator:
     return together(*(of_field(name) for name, option in OPTIONS.items() if option.heading == heading))
 
 
-_files, *_, _batch, _farm, _said = (
-    partial(click.option, cls=Option, heading=heading) for heading in (*HEADINGS, "What is said")
+_files, *_, _batch, _farm, _messages = (
+    partial(click.option, cls=Option, heading=heading) for heading in (*HEADINGS, "Messages")
 )
 shot_argument = click.argument("shot", type=click.Path(dir_okay=False))
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 overwrite_option = of_field("overwrite")
 scene_options = under("Scene")
-config_option = _said(
+config_option = _messages(
     "--config",
     type=_FILE,
     metavar="FILE.toml",
@@ -104,22 +104,22 @@ run_options = together(
         metavar="EDGES",
         help="With --preroll: fail where a seam to a chunk beside it, in the same folder, moves more (see stitch).",
     ),
-    _farm("--openjd", is_flag=True, help="Say progress in the lines that OpenJD reads."),
+    _farm("--openjd", is_flag=True, help="Print progress in the lines that OpenJD reads."),
     config_option,
-    _said("--progress", is_flag=True, help="Say each frame in a line of its own, into files and pipes too."),
-    _said(
+    _messages("--progress", is_flag=True, help="Print each frame in a line of its own, into files and pipes too."),
+    _messages(
         "-v",
         "--verbose",
         count=True,
         default=0,
         show_default=False,
-        help="Say more: -v each frame, -vv what it measured.",
+        help="Print more: -v each frame, -vv what it measured.",
     ),
-    _said(
+    _messages(
         "--log-file",
         type=_FILE,
         metavar="FILE",
-        help="Also append what is said to a file, with times, each frame included.",
+        help="Also append messages to a file, with times, each frame included.",
     ),
 )
 

@@ -24,15 +24,15 @@ _LINE = "%(asctime)s %(levelname)s %(shot)s: %(message)s"
 
 
 @dataclass(frozen=True)
-class Saying:
-    """How much a command says, and where.
+class Output:
+    """How much a command prints, and where.
 
     Attributes:
         verbose: 0 warnings, 1 each frame too, 2 what was measured in it too.
         log_file: A file to append to, with each frame at least, or None.
-        in_lines: Say progress in lines, into files and pipes too.
+        in_lines: Print progress in lines, into files and pipes too.
         several: Name the shot in each line.
-        openjd: Say progress in the lines that OpenJD reads.
+        openjd: Print progress in the lines that OpenJD reads.
     """
 
     verbose: int = 0
@@ -90,7 +90,7 @@ class Saying:
                     say(f"openjd_progress: {100.0 * done / total:.1f}", err=True)
                     say(f"openjd_status: {done} of {counted(total, 'frame')}, {_left(bar.eta)}", err=True)
                 elif self.in_lines:
-                    tell(bar.pct, bar.eta, f"{done} of {counted(total, 'frame')}")
+                    print_progress(bar.pct, bar.eta, f"{done} of {counted(total, 'frame')}")
 
             yield show
 
@@ -143,7 +143,7 @@ def _to_nowhere(stream: TextIO) -> None:
     os.close(nowhere)
 
 
-def tell(part: float, seconds: float, what: str) -> None:
+def print_progress(part: float, seconds: float, what: str) -> None:
     """One line of progress on stderr.
 
     Args:

@@ -9,13 +9,13 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..errors import LayerError, PhysGraphError, UsageError, counted
 from .options import HEADINGS, out_option, run_options, together, under
-from .printing import LOGGER, Saying, say
+from .printing import LOGGER, Output, say
 from .show_file import values_for
 from .structure import FAILED, GroupedCommand, imports_uncollected
 
@@ -25,20 +25,6 @@ if TYPE_CHECKING:
     from ..shot.summary import Row
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
-NOT_OF_THE_CALL = {
-    "shots",
-    "out",
-    "report",
-    "root",
-    "progress",
-    "summary",
-    "config",
-    "verbose",
-    "log_file",
-    "seam_bound",
-    "openjd",
-}
-"""Options of the command that `RefineOptions` has not, or has one for each shot."""
 RENAMED = {"run-up": "preroll"}
 """Names that options had before, without dashes; they still work and are in no help."""
 
@@ -65,14 +51,14 @@ def refine(
     jobs = _jobs(ctx, shots, out)
     layers = [layer for _, layer, _ in jobs]
     verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
-    saying = Saying(verbose, log_file, in_lines, several=len(jobs) > 1, openjd=ctx.params["openjd"])
+    output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, openjd=ctx.params["openjd"])
     also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
     if also:
         check_jobs(jobs, also=also)
-    with signals_raise(), _folder_of(layers, out, dry_run=dry_run), saying.logged():
-        code = _refine_each(jobs, saying, summary=None if dry_run else summary)
+    with signals_raise(), _folder_of(layers, out, dry_run=dry_run), output.logged():
+        code = _refine_each(jobs, output, summary=None if dry_run else summary)
         if not dry_run:
-            _check_seams(layers, ctx.params["seam_bound"], openjd=saying.openjd)
+            _check_seams(layers, ctx.params["seam_bound"], openjd=output.openjd)
     sys.exit(code)
 
 
@@ -89,22 +75,26 @@ def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -
 
 def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
     """Each shot with its layer and its options, those of its show's file among them."""
-    from ..shot.options import RefineOptions
+    from ..shot.options import OPTIONS, RefineOptions
 
-    report, root = ctx.params["report"], ctx.params["root"]
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
-    none = [None] * len(shots)
-    reports = none if report is None else _one_each(shots, report, "--report", suffix="", accepts=(".json",))
-    roots = none if root is None else _one_each(shots, root, "--root", suffix=".usda", accepts=USD_SUFFIXES)
+    reports = _each_or_none(shots, ctx.params["report"], "--report", suffix="", accepts=(".json",))
+    roots = _each_or_none(shots, ctx.params["root"], "--root", suffix=".usda", accepts=USD_SUFFIXES)
     jobs = []
-    for shot, layer, own_report, own_root in zip(shots, layers, reports, roots, strict=True):
+    for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True):
         values, sources = values_for(ctx, shot, ctx.command)
-        given = {name: value for name, value in values.items() if name not in NOT_OF_THE_CALL}
-        jobs.append((shot, layer, RefineOptions(**given, report=own_report, root=own_root, sources=sources)))
+        options = {name: value for name, value in values.items() if name in OPTIONS and name != "progress"}
+        options |= {"report": report, "root": root, "sources": sources}
+        jobs.append((shot, layer, RefineOptions(**options)))
     return jobs
 
 
-def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -> int:
+def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known: Any) -> Sequence[Path | None]:
+    """Name one output per shot, as `_one_each` does, where any is asked for."""
+    return [None] * len(shots) if to is None else _one_each(shots, to, option, **known)
+
+
+def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -> int:
     """Refine the jobs and say of each what became of it; returns the exit code."""
     from .. import interrupts
     from ..shot.summary import check_summary, exit_code_of, row_of
@@ -114,7 +104,7 @@ def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -
     rows: list[Row] = []
     failed: list[PhysGraphError] = []
     try:
-        for (shot, layer, _), done in zip(jobs, _results(jobs, saying), strict=True):
+        for (shot, layer, _), done in zip(jobs, _results(jobs, output), strict=True):
             rows.append(row_of(shot, layer, done))
             if isinstance(done, PhysGraphError):
                 failed.append(done)
@@ -122,27 +112,27 @@ def _refine_each(jobs: Sequence[Job], saying: Saying, *, summary: Path | None) -
                 say(done.to_json() if done.out is None else str(done.out))
     except (KeyboardInterrupt, SystemExit) as error:
         rows += [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
-        _say_all(rows, saying, summary, exit_code=interrupts.exit_code_of(error) or FAILED)
+        _summarise(rows, output, summary, exit_code=interrupts.exit_code_of(error) or FAILED)
         raise
-    _say_all(rows, saying, summary, exit_code=exit_code_of(rows))
-    if failed and not saying.several:
+    _summarise(rows, output, summary, exit_code=exit_code_of(rows))
+    if failed and not output.several:
         raise failed[0]
-    _say_failed(rows)
+    _print_failed(rows)
     return exit_code_of(rows)
 
 
-def _say_all(rows: Sequence[Row], saying: Saying, summary: Path | None, *, exit_code: int) -> None:
+def _summarise(rows: Sequence[Row], output: Output, summary: Path | None, *, exit_code: int) -> None:
     """Print and write what became of all shots."""
     from ..shot.summary import table_of, write_summary
 
-    if saying.several:
+    if output.several:
         say("\n".join(table_of(rows)), err=True)
     if summary is not None:
         write_summary(summary, rows, exit_code=exit_code)
 
 
-def _say_failed(rows: Sequence[Row]) -> None:
-    """Say which shots failed and why."""
+def _print_failed(rows: Sequence[Row]) -> None:
+    """Print which shots failed and why."""
     failed = [row for row in rows if row.error]
     for row in failed:
         logging.getLogger(LOGGER).error(row.error, extra={"shot": row.shot})
@@ -150,7 +140,7 @@ def _say_failed(rows: Sequence[Row]) -> None:
         say(f"{len(failed)} of {counted(len(rows), 'shot')} failed", err=True)
 
 
-def _results(jobs: Sequence[Job], saying: Saying) -> Iterator[RefineReport | PhysGraphError]:
+def _results(jobs: Sequence[Job], output: Output) -> Iterator[RefineReport | PhysGraphError]:
     """What became of each job: one in this process, several in processes of their own.
 
     What was finished before is passed over without the solver, whose import takes seconds.
@@ -159,41 +149,41 @@ def _results(jobs: Sequence[Job], saying: Saying) -> Iterator[RefineReport | Phy
 
     check_jobs(jobs)
     found = [finished(*job) for job in jobs]
-    yield from in_order(found, _solved([job for job, there in zip(jobs, found, strict=True) if there is None], saying))
+    yield from in_order(found, _solved([job for job, there in zip(jobs, found, strict=True) if there is None], output))
 
 
-def _solved(jobs: Sequence[Job], saying: Saying) -> Generator[RefineReport | PhysGraphError, None, None]:
+def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | PhysGraphError, None, None]:
     """What becomes of the jobs that are not finished."""
     if not jobs:
         return
     with imports_uncollected():
         from ..shot.refine import refine_shots
 
-    if not saying.several:
+    if not output.several:
         try:
-            yield _refine_shown(*jobs[0], saying=saying)
+            yield _refine_shown(*jobs[0], output=output)
         except PhysGraphError as error:
             yield error
         return
     workers = max(options.workers for *_, options in jobs)
-    refine = partial(_refine_logged, saying=saying, alone=workers == 1)
+    refine = partial(_refine_logged, output=output, alone=workers == 1)
     yield from refine_shots(jobs, workers=workers, refine=refine)
 
 
-def _refine_logged(shot: str, layer: Path, options: RefineOptions, *, saying: Saying, alone: bool) -> RefineReport:
+def _refine_logged(shot: str, layer: Path, options: RefineOptions, *, output: Output, alone: bool) -> RefineReport:
     """Refine a shot in a process of its own, which logs for itself."""
-    with saying.logged():
-        return _refine_shown(shot, layer, options, saying=saying, alone=alone)
+    with output.logged():
+        return _refine_shown(shot, layer, options, output=output, alone=alone)
 
 
 def _refine_shown(
-    shot: str, layer: Path, options: RefineOptions, *, saying: Saying, alone: bool = True
+    shot: str, layer: Path, options: RefineOptions, *, output: Output, alone: bool = True
 ) -> RefineReport:
     """Refine a shot and show how far it is where it is alone at work."""
     with imports_uncollected():
         from ..shot.refine import refine_shot
 
-    with saying.progress(Path(shot).name) if alone else nullcontext() as progress:
+    with output.progress(Path(shot).name) if alone else nullcontext() as progress:
         return refine_shot(shot, layer, replace(options, progress=progress))
 
 
@@ -233,9 +223,9 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
             raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
         yield
     finally:
-        for kept in filter(None, map(kept_for, layers)):
-            if not is_held(kept.folder):
-                say(str(kept), err=True)
+        for frames in filter(None, map(kept_for, layers)):
+            if not is_held(frames.folder):
+                say(str(frames), err=True)
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()

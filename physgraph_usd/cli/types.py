@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import click
@@ -10,64 +11,57 @@ import click
 _RANGE = re.compile(r"(-?[\d.]+)-(-?[\d.]+)")
 
 
-class FrameRange(click.ParamType):
+class Text(click.ParamType):
+    """A text that a function turns into a value; its ValueError says what is wrong with it."""
+
+    def __init__(self, name: str, read: Callable[[str], Any]) -> None:
+        """Take the type's name and the function."""
+        self.name, self._read = name, read
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Turn the text into the value; what is no text is one already."""
+        try:
+            return self._read(value) if isinstance(value, str) else value
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+
+def _frame_range(text: str) -> tuple[float, float]:
     """Time codes ``A:B``, or one time code ``A``; ``A-B`` too, as farms write the frames of a task."""
-
-    name = "A:B"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Turn the text into the first and the last time code."""
-        if isinstance(value, tuple):
-            return value
-        first, colon, last = _RANGE.sub(r"\1:\2", value).partition(":")
-        try:
-            span = float(first), float(last if colon else first)
-        except ValueError:
-            self.fail(f"{value!r} is not a frame range; write A:B or A, for example 1001:1024", param, ctx)
-        if not span[0] <= span[1]:
-            self.fail(f"{value!r} ends before it starts", param, ctx)
-        return span
+    first, colon, last = _RANGE.sub(r"\1:\2", text).partition(":")
+    try:
+        span = float(first), float(last if colon else first)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a frame range; write A:B or A, for example 1001:1024") from None
+    if not span[0] <= span[1]:
+        raise ValueError(f"{text!r} ends before it starts")
+    return span
 
 
-class RefineLevel(click.ParamType):
-    """A number of subdivisions, or ``auto``, which is passed on as -1."""
-
-    name = "level"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | None:
-        """Turn the text into a level; none, as of a farm's parameter that was left empty, is the default."""
-        if value == "":
-            return None
-        if value == "auto":
-            return -1
-        if not str(value).isdecimal():
-            self.fail(f"{value!r} is neither a whole number nor 'auto'", param, ctx)
-        return int(value)
+def _level(text: str) -> int | None:
+    """A number of subdivisions; -1 for ``auto``, None, the default, for a farm's parameter that was left empty."""
+    if text in ("", "auto"):
+        return -1 if text else None
+    if not text.isdecimal():
+        raise ValueError(f"{text!r} is neither a whole number nor 'auto'")
+    return int(text)
 
 
-class RestShape(click.ParamType):
+def _rest(text: str) -> float | str:
     """A time code, or ``auto``."""
-
-    name = "rest"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
-        """Turn the text into a time code, unless it is ``auto``."""
-        try:
-            return value if value == "auto" else float(value)
-        except ValueError:
-            self.fail(f"{value!r} is neither a time code nor 'auto'", param, ctx)
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is neither a time code nor 'auto'") from None
 
 
-class PictureSize(click.ParamType):
+def _size(text: str) -> tuple[int, int]:
     """Width and height in pixels, ``1280x640``."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ValueError(f"{text!r} is not a size; write WxH, for example 1280x640")
+    return int(width), int(height)
 
-    name = "WxH"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Turn the text into width and height."""
-        if isinstance(value, tuple):
-            return value
-        width, _, height = value.partition("x")
-        if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-            self.fail(f"{value!r} is not a size; write WxH, for example 1280x640", param, ctx)
-        return int(width), int(height)
+FRAME_RANGE, LEVEL, REST = Text("A:B", _frame_range), Text("level", _level), Text("rest", _rest)
+PICTURE_SIZE = Text("WxH", _size)

@@ -52,8 +52,8 @@ def begin_report(
         | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
         for part in parts
     ]
-    looked = _crowding(opened, frames, options) if before_a_run else ()
-    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=looked).plain()
+    crowding = _crowding(opened, frames, options) if before_a_run else ()
+    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=crowding).plain()
     known = of_levels([garment.path for garment in opened.scene.garments], choices)
     known += _strained(opened, report, frames)
     known += _unfelt(opened, report, frames) if options.contact != "off" else []
@@ -135,7 +135,7 @@ def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict
 
 
 def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> dict[str, Any]:
-    """What can be said of a stage that could not be opened for refining: its meshes, why not, and what may do.
+    """A stage that could not be opened for refining: its meshes, why, and a command that may do.
 
     Raises:
         StageError: The file cannot be opened at all.
@@ -209,7 +209,7 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
 
 
 def _crowding(opened: Shot, frames: Sequence[Frame], options: RefineOptions) -> list[Crowding]:
-    """How crowded the cages are in the frames that are looked at, without what is switched off."""
+    """How crowded the cages are in the frames that are sampled, without what is switched off."""
     if not all(len(garment.mesh.triangulate(garment.rest).triangles) for garment in opened.scene.garments):
         return []
     meter = CrowdingMeter(opened.scene)
@@ -231,12 +231,12 @@ def _unfelt(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list
 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
     """Add to the report the parts of garments that are not of their rest shape's size; returns warnings."""
-    said, up = [], -opened.scene.gravity
+    warnings, up = [], -opened.scene.gravity
     for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
         parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets, up=up)
         report.garments[index]["strained"] = [dataclasses.asdict(part) for part in parts]
-        said += of_strain(garment.path, source.sources["rest"], parts)
-    return said
+        warnings += of_strain(garment.path, source.sources["rest"], parts)
+    return warnings
 
 
 def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:

@@ -122,16 +122,16 @@ def cannot_fit(
     fits = (
         level
         for level in range(max(levels) - 1, -1, -1)
-        if estimate(garments, [min(level, own) for own in levels], frames=frames, workers=workers).memory <= there
+        if estimate(garments, [min(level, each) for each in levels], frames=frames, workers=workers).memory <= there
     )
     level = next(fits, None)
-    said = (
+    problem = (
         f"level {levels[largest]} makes {whole.vertices:,} fine vertices, which need about {whole.memory / 1e9:.3g} GB"
     )
     remedy = "reduce the cage" if level is None else f"use --level {level}"
     fewer = " or fewer --workers" if workers > 1 else ""
     return GarmentError(
-        garments[largest].path, f"{said} of memory; this machine has {there / 1e9:.3g} GB", remedy=remedy + fewer
+        garments[largest].path, f"{problem} of memory; this machine has {there / 1e9:.3g} GB", remedy=remedy + fewer
     )
 
 

@@ -126,8 +126,8 @@ class RefineReport:
         paths = [garment["path"] for garment in self.garments]
         entries = [pair for frame in self.frames for pair in zip(paths, frame.get("garments", ()), strict=False)]
         # Garments that are solved together have one measurement, which each of them tells.
-        own = [entry for path, entry in entries if entry.get("together", [path])[0] == path]
-        found = [entry["contact"] for entry in own if "contact" in entry]
+        alone = [entry for path, entry in entries if entry.get("together", [path])[0] == path]
+        found = [entry["contact"] for entry in alone if "contact" in entry]
         measured = [each for contact in found for each in (contact.get("cloth"), *contact.get("bodies", {}).values())]
         return [each[side]["crossings"] for each in measured if each]
 
@@ -188,9 +188,9 @@ def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
 
 def _for_all(alike: Sequence[str], paths: Sequence[str]) -> str:
     """One warning for many of a kind; its figures are those of the first."""
-    said = [warning.partition(">")[2] for warning in alike]
-    figures = "" if len(set(said)) == 1 else " (the figures are those of the first)"
-    return f"{len(paths):,} prims, e.g. <{paths[0]}>, <{paths[1]}>{said[0]}{figures}"
+    texts = [warning.partition(">")[2] for warning in alike]
+    figures = "" if len(set(texts)) == 1 else " (the figures are those of the first)"
+    return f"{len(paths):,} prims, e.g. <{paths[0]}>, <{paths[1]}>{texts[0]}{figures}"
 
 
 def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:

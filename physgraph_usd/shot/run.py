@@ -84,8 +84,8 @@ class Run:
             frames = None
             if self.out is not None:
                 decides = {"levels": self._solver.levels, "times": times, "report": options.report is not None}
-                kept = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames}
-                frames = stack.enter_context(FrameFolder(frames_folder(self.out), provenance | decides, **kept))
+                settings = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames}
+                frames = stack.enter_context(FrameFolder(frames_folder(self.out), provenance | decides, **settings))
             writer = stack.enter_context(LayerWriter(self.shot, refinements, self.out, provenance=provenance, **made))
             solved = stack.enter_context(closing(self._solved(times, frames)))
             for _ in range(leads):
@@ -153,8 +153,10 @@ class Run:
         for done, outcome in enumerate(solved, start=1):
             written += self._write_frame(writer, outcome)
             LOG.info("frame %d of %d: time code %s", done, count, _name_of(outcome.time), extra=shot)
-            if done == TIMED_FRAMES < count and (said := ending(clock.perf_counter() - began, count, options.workers)):
-                LOG.log(NOTICE, "%s", said, extra=shot)
+            if done == TIMED_FRAMES < count and (
+                message := ending(clock.perf_counter() - began, count, options.workers)
+            ):
+                LOG.log(NOTICE, "%s", message, extra=shot)
             LOG.debug("%s", outcome.record, extra=shot)
             if options.progress:
                 options.progress(done, count)
@@ -183,7 +185,7 @@ class Run:
             self.report.warn(WARNINGS["failed"](name=name, error=error))
             return 0.0
         start = clock.perf_counter()
-        writer.write(outcome.time, outcome.points, changed=[not kept for kept in outcome.reused], heat=outcome.heat)
+        writer.write(outcome.time, outcome.points, changed=[not reused for reused in outcome.reused], heat=outcome.heat)
         return clock.perf_counter() - start
 
 
@@ -199,8 +201,8 @@ def ending(seconds: float, count: int, workers: int) -> str:
         count: Frames of the run.
         workers: Processes that share them; the first one's frames are the first to come.
     """
-    own = -(-count // workers) - TIMED_FRAMES
-    left = own * seconds / TIMED_FRAMES
+    frames = -(-count // workers) - TIMED_FRAMES
+    left = frames * seconds / TIMED_FRAMES
     if left < LONG_RUN:
         return ""
     at = clock.strftime("%H:%M", clock.localtime(clock.time() + left))

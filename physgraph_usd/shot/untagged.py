@@ -26,7 +26,7 @@ from ..usd.view import Stage
 AUTO = "auto"
 """In place of a collider: all that the shot names, and closed meshes that garments touch."""
 MOST_ASKED = 32
-"""Most open meshes that are looked at for garments."""
+"""Most open meshes that are tried as garments."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
 
     Args:
         shot: An open shot.
-        frames: A few of its frames, of which the first, the middle and the last are looked at.
+        frames: A few of its frames, of which the first, the middle and the last are read.
 
     Returns:
         What was found, the one that most of a garment touches first.
@@ -61,16 +61,16 @@ def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
     Raises:
         StageError: USD cannot read the files any more.
     """
-    looked = list(dict.fromkeys(frames[k] for k in (0, len(frames) // 2, -1) if frames))
-    boxes = [bounds_of(np.concatenate([own.points for own in frame.garments])) for frame in looked]
+    sampled = list(dict.fromkeys(frames[k] for k in (0, len(frames) // 2, -1) if frames))
+    boxes = [bounds_of(np.concatenate([garment.points for garment in frame.garments])) for frame in sampled]
     boxes = [box + np.array([[-NEAR], [NEAR]]) for box in boxes]
     least, found = smallest_body(shot.scene.garments), []
-    for path, poses in meshes_beside(shot, [frame.time for frame in looked], boxes, least=least):
+    for path, poses in meshes_beside(shot, [frame.time for frame in sampled], boxes, least=least):
         start_warp()
         body = MeshBody(device="cpu", threads=1)
         for index, pose in poses:
-            cages = zip(shot.scene.garments, looked[index].garments, strict=True)
-            shares = {g.path: share_at(body, pose, g, own.points) for g, own in cages if isinstance(pose, MeshPose)}
+            cages = zip(shot.scene.garments, sampled[index].garments, strict=True)
+            shares = {g.path: share_at(body, pose, g, cage.points) for g, cage in cages if isinstance(pose, MeshPose)}
             touched = {path: share for path, share in shares.items() if share}
             if touched:
                 found.append(Beside(path, touched))
@@ -78,24 +78,24 @@ def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
     return sorted(found, key=lambda each: -max(each.shares.values()))
 
 
-def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequence[str] = (), **given: Any) -> Shot:
+def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequence[str] = (), **options: Any) -> Shot:
     """Open a shot, where `AUTO` among the colliders stands for the meshes of `bodies_beside`.
 
     Args:
         shot: As `open_shot` takes it.
         colliders: As `open_shot` takes them, or `AUTO` among them.
-        given: Its other options.
+        options: Its other options.
 
     Raises:
         UsageError: When an option cannot be used.
         StageError: When the stage cannot be read.
     """
     if AUTO not in colliders:
-        return open_shot(shot, colliders=colliders, **given)
-    with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **given)) as first:
+        return open_shot(shot, colliders=colliders, **options)
+    with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **options)) as first:
         beside = bodies_beside(first, sample_frames(first.scene, first.frame))
         named = [*first.colliders, *(each.path for each in beside)]
-    return open_shot(shot, colliders=named, **given)
+    return open_shot(shot, colliders=named, **options)
 
 
 def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:

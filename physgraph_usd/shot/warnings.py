@@ -53,8 +53,8 @@ class Kind:
         first, *others = times or (None,)
         place = f"<{path}>" if path else ""
         place += "" if first is None else f" at time code {first:g}"
-        said = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
-        return (f"{place}: " if place else "") + "; ".join(filter(None, said))
+        parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
+        return (f"{place}: " if place else "") + "; ".join(filter(None, parts))
 
 
 _MEND = "cache that frame again, or leave it out with --frames"
@@ -234,8 +234,8 @@ def of_frames(report: RefineReport) -> list[str]:
         for index, garment in enumerate(report.garments)
     ]
     checks = (of_folds, _of_bodies_that_passed, _of_jumps, of_contact, of_energy)
-    said = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
-    return [*said, *_of_unsettled(report.unsettled)]
+    found = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
+    return [*found, *_of_unsettled(report.unsettled)]
 
 
 def of_folds(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:

@@ -17,7 +17,7 @@ MARKED = 60
 SCRIPT = """
 for (const svg of document.querySelectorAll("svg.plot")) {
   const plot = JSON.parse(svg.dataset.plot), cursor = svg.querySelector(".cursor");
-  const told = [...document.querySelectorAll(`[data-of="${svg.id}"] b`)];
+  const labels = [...document.querySelectorAll(`[data-of="${svg.id}"] b`)];
   svg.addEventListener("mousemove", (event) => {
     const box = svg.getBoundingClientRect();
     const x = (event.clientX - box.left) / box.width * plot.width;
@@ -26,8 +26,8 @@ for (const svg of document.querySelectorAll("svg.plot")) {
     cursor.setAttribute("x1", plot.at[best]);
     cursor.setAttribute("x2", plot.at[best]);
     cursor.style.visibility = "visible";
-    told[0].textContent = plot.times[best];
-    plot.values.forEach((line, i) => { told[i + 1].textContent = line[best] === null ? "-" : line[best]; });
+    labels[0].textContent = plot.times[best];
+    plot.values.forEach((line, i) => { labels[i + 1].textContent = line[best] === null ? "-" : line[best]; });
   });
 }
 """
@@ -64,25 +64,25 @@ def plot(name: str, title: str, times: Sequence[float], lines: Mapping[str, Sequ
         times: Time codes, ascending.
         lines: For each line, a value at each time code, None where there is none.
     """
-    kept = {label: [_finite(value) for value in values] for label, values in lines.items()}
-    kept = {label: values for label, values in kept.items() if any(value is not None for value in values)}
-    if not kept or not times:
+    shown = {label: [_finite(value) for value in values] for label, values in lines.items()}
+    shown = {label: values for label, values in shown.items() if any(value is not None for value in values)}
+    if not shown or not times:
         return ""
-    known = [value for values in kept.values() for value in values if value is not None]
+    known = [value for values in shown.values() for value in values if value is not None]
     ticks = _ticks(min(0.0, *known), max(known))
     across = Axis(times[0], times[-1], LEFT, WIDTH - RIGHT)
     up = Axis(ticks[0], ticks[-1], HEIGHT - BOTTOM, TOP)
     drawn = "".join(
-        _line(values, times, across, up, colour=COLOURS[i % len(COLOURS)]) for i, values in enumerate(kept.values())
+        _line(values, times, across, up, colour=COLOURS[i % len(COLOURS)]) for i, values in enumerate(shown.values())
     )
     data = {
         "width": WIDTH,
         "times": [f"{time:g}" for time in times],
         "at": [round(across.at(time), 2) for time in times],
-        "values": [[None if v is None else f"{v:.4g}" for v in values] for values in kept.values()],
+        "values": [[None if v is None else f"{v:.4g}" for v in values] for values in shown.values()],
     }
     return (
-        f"<h3>{html.escape(title)}</h3>{_legend(name, list(kept))}"
+        f"<h3>{html.escape(title)}</h3>{_legend(name, list(shown))}"
         f"<svg class='plot' id='{name}' viewBox='0 0 {WIDTH} {HEIGHT}' role='img' aria-label='{html.escape(title)}' "
         f"data-plot='{html.escape(json.dumps(data))}'>{_frame(ticks, times, across, up)}{drawn}"
         f"<line class='cursor' y1='{TOP}' y2='{HEIGHT - BOTTOM}'/></svg>"

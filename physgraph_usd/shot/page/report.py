@@ -61,10 +61,10 @@ def page(report: RefineReport, series: Sequence[Series]) -> str:
     """
     parts = [_head(report), _warnings(report), _pictures(report), _model(report), _garments(report)]
     times = [frame["time"] for frame in report.frames]
-    for index, own in enumerate(series):
-        parts.append(f"<h2>&lt;{html.escape(own.path)}&gt; over time</h2>")
+    for index, garment in enumerate(series):
+        parts.append(f"<h2>&lt;{html.escape(garment.path)}&gt; over time</h2>")
         drawn = [
-            plot(f"{name}-{index}", title, [0.0 if t is None else t for t in times], getattr(own, name))
+            plot(f"{name}-{index}", title, [0.0 if t is None else t for t in times], getattr(garment, name))
             for name, title in PLOTS
         ]
         parts.append("".join(drawn) or "<p>No frame says anything of it.</p>")
@@ -112,10 +112,10 @@ def _picture(report: RefineReport, time: float | None) -> str:
     with tempfile.TemporaryDirectory() as folder:
         file = draw(report.out, Path(folder) / "picture.png", shot=report.shot, times=times, size=SIZE)
         data = base64.b64encode(file.read_bytes()).decode("ascii")
-    said = "the only frame" if time is None else f"time code {time:g}"
+    caption = "the only frame" if time is None else f"time code {time:g}"
     return (
-        f"<figure><img alt='coarse beside refined, {said}' width='{SIZE[0]}' height='{SIZE[1]}' "
-        f"src='data:image/png;base64,{data}'><figcaption>{said}</figcaption></figure>"
+        f"<figure><img alt='coarse beside refined, {caption}' width='{SIZE[0]}' height='{SIZE[1]}' "
+        f"src='data:image/png;base64,{data}'><figcaption>{caption}</figcaption></figure>"
     )
 
 

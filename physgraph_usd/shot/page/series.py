@@ -58,23 +58,23 @@ def read_series(report: RefineReport, index: int) -> Series:
 
 def _said(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, dict[str, float]]:
     """What one frame says of a garment, by field and line."""
-    said: dict[str, dict[str, float]] = {"time": _milliseconds(entry, frame)}
+    lines_of: dict[str, dict[str, float]] = {"time": _milliseconds(entry, frame)}
     if "energy_joules" in entry:
         output, given = entry["energy_joules"]["output"], entry["energy_joules"]["input"]
-        said["energy"] = {name: 1e3 * value for name, value in output.items()}
-        said["energy"] |= {"total": 1e3 * sum(output.values()), "upsampled input": 1e3 * sum(given.values())}
+        lines_of["energy"] = {name: 1e3 * value for name, value in output.items()}
+        lines_of["energy"] |= {"total": 1e3 * sum(output.values()), "upsampled input": 1e3 * sum(given.values())}
     if "strain" in entry:
-        said["strain"] = {name: 100.0 * value for name, value in entry["strain"].items()}
+        lines_of["strain"] = {name: 100.0 * value for name, value in entry["strain"].items()}
     contact = entry.get("contact", {})
     bodies = contact.get("bodies", {}).values()
     for when in ("before", "after"):
         if bodies:
-            said.setdefault("inside", {})[when] = sum(body[when]["inside"] for body in bodies)
-            said.setdefault("depth", {})[when] = max(body[when]["deepest_mm"] for body in bodies)
-            said.setdefault("crossings", {})[f"bodies, {when}"] = sum(body[when]["crossings"] for body in bodies)
+            lines_of.setdefault("inside", {})[when] = sum(body[when]["inside"] for body in bodies)
+            lines_of.setdefault("depth", {})[when] = max(body[when]["deepest_mm"] for body in bodies)
+            lines_of.setdefault("crossings", {})[f"bodies, {when}"] = sum(body[when]["crossings"] for body in bodies)
         if "cloth" in contact:
-            said.setdefault("crossings", {})[f"cloth, {when}"] = contact["cloth"][when]["crossings"]
-    return said
+            lines_of.setdefault("crossings", {})[f"cloth, {when}"] = contact["cloth"][when]["crossings"]
+    return lines_of
 
 
 def _milliseconds(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, float]:
