@@ -184,11 +184,10 @@ def summary(
 
 
 def in_words(network: Network) -> str:
-    """Vectors, width and rounds."""
+    """Vectors and size."""
     config = network.config
     if isinstance(config, PhysgraphConfig):
-        extras = "".join(f", {name}" for name in ("strain", "means") if getattr(config, name))
-        return f"{' '.join(config.vectors)}; W={config.width}, M={config.rounds}{extras}"
+        return f"{' '.join(config.vectors)}; W={config.width}"
     return f"latent {config.latent}, M={config.rounds}, H={config.history}, {config.features} features"
 
 
