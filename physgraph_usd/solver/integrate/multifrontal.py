@@ -17,8 +17,8 @@ tree and one up again:
 The factorisation is multifrontal (Duff and Reid 1983): the fronts of a depth are dense matrices of about one size, so a
 few calls of batched linear algebra in float64 eliminate them all. Where entries go is found once for a pattern; a
 matrix with other values takes milliseconds. Nothing is added to one place twice in a call, so equal matrices give equal
-factors. cuDSS 1.0 takes 1.7 ms for a solve at 330,000 vertices where this takes 0.7 (docs/notes/learned.md), and a graph
-that is captured around it stays empty, so steps could not be recorded.
+factors. cuDSS 1.0 takes 1.7 ms for a solve at 330,000 vertices where this takes 0.7 (docs/notes/learned.md), and a
+graph that is captured around it stays empty, so steps could not be recorded.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
