@@ -77,23 +77,17 @@ def real_problem(*, level: int = 1) -> tuple[System, torch.Tensor]:
 
 
 class TestMetric:
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_solves_its_own_matrix(self, dtype: torch.dtype):
+    @pytest.mark.parametrize(("dtype", "most"), [(torch.float32, 1e-4), (torch.float64, 1e-12)])
+    def test_error_is_the_regularisation_and_no_more(self, dtype: torch.dtype, most: float):
         matrix = 1e-4 * laplacian(40)
-        free = torch.ones((40, 1), dtype=torch.bool)
-        metric = Metric(sp.csr_matrix(matrix), free=free, dtype=dtype)
-        force = start(40).to(dtype)
-        expected = np.linalg.solve(matrix, force.double().numpy())
-        error = np.abs(metric.solve(force).double().numpy() - expected).max() / np.abs(expected).max()
-        assert error < (2e-5 if dtype == torch.float32 else 1e-5), error
-
-    def test_error_is_the_regularisation_and_no_more(self):
-        matrix = laplacian(40)
         shifted = matrix + REGULARISATION * matrix.diagonal().mean() * np.eye(40)
         free = torch.ones((40, 1), dtype=torch.bool)
-        force = start(40)
-        got = Metric(sp.csr_matrix(matrix), free=free, dtype=torch.float64).solve(force).numpy()
-        assert np.allclose(got, np.linalg.solve(shifted, force.numpy()), rtol=1e-12)
+        force = start(40).to(dtype)
+        before = force.clone()
+        got = Metric(sp.csr_matrix(matrix), free=free, dtype=dtype).solve(force).double().numpy()
+        expected = np.linalg.solve(shifted, force.double().numpy())
+        assert np.abs(got - expected).max() < most * np.abs(expected).max()
+        assert torch.equal(force, before)
 
     def test_fixed_vertices_stay_and_the_rest_is_solved_as_if_they_were_held(self):
         matrix, held = laplacian(30), [0, 7, 29]
@@ -110,44 +104,21 @@ class TestMetric:
         metric = Metric(sp.csr_matrix(laplacian(5)), free=free, dtype=torch.float32)
         assert not metric.solve(torch.ones((5, 3))).any()
 
-    def test_force_is_left_alone(self):
-        force = start(10)
-        kept = force.clone()
-        Metric(sp.csr_matrix(laplacian(10)), free=torch.ones((10, 1), dtype=torch.bool), dtype=torch.float64).solve(
-            force
-        )
-        assert torch.equal(force, kept)
 
-
-class TestKeptToEdges:
-    @staticmethod
-    def matrices() -> tuple[sp.csr_matrix, sp.csr_matrix, np.ndarray]:
-        mesh, rest = sheet(6, 4)
-        group = group_of(mesh, rest)
-        level, (system, _) = group.levels[-1], finest_system(group, wave(rest))
-        field = system.field
-        assert isinstance(field, ForceModule)
-        edges = level.edges.numpy()
-        return field.rest_matrix(), on_edges(field.rest_matrix(), edges), edges
-
-    def test_row_sums_are_kept(self):
-        whole, kept, _ = self.matrices()
-        assert np.allclose(kept.sum(axis=1), whole.sum(axis=1), rtol=1e-9, atol=1e-12 * abs(whole).max())
-
-    def test_symmetric_positive_definite(self):
-        _, kept, _ = self.matrices()
-        dense = kept.toarray()
-        assert np.allclose(dense, dense.T, rtol=0, atol=1e-14 * np.abs(dense).max())
-        assert np.linalg.eigvalsh(dense).min() > 0
-
-    def test_couples_edges_only_and_never_positively(self):
-        _, kept, edges = self.matrices()
-        dense = kept.toarray()
-        off = dense - np.diag(dense.diagonal())
-        assert (off <= 0).all()
-        allowed = np.zeros(dense.shape, bool)
-        allowed[edges[:, 0], edges[:, 1]] = allowed[edges[:, 1], edges[:, 0]] = True
-        assert not off[~allowed].any()
+def test_a_rest_form_kept_to_the_edges_is_definite_and_has_its_row_sums():
+    mesh, rest = sheet(6, 4)
+    group = group_of(mesh, rest)
+    level, (system, _) = group.levels[-1], finest_system(group, wave(rest))
+    assert isinstance(system.field, ForceModule)
+    whole, edges = system.field.rest_matrix(), level.edges.numpy()
+    dense = on_edges(whole, edges).toarray()
+    assert np.allclose(dense.sum(axis=1), np.ravel(whole.sum(axis=1)), rtol=1e-9, atol=1e-12 * abs(whole).max())
+    assert np.allclose(dense, dense.T, rtol=0, atol=1e-14 * np.abs(dense).max())
+    assert np.linalg.eigvalsh(dense).min() > 0
+    off = dense - np.diag(dense.diagonal())
+    assert (off <= 0).all()
+    off[edges[:, 0], edges[:, 1]] = off[edges[:, 1], edges[:, 0]] = 0.0
+    assert not off.any()
 
 
 class TestQuasiNewton:
@@ -158,12 +129,6 @@ class TestQuasiNewton:
         carry = method.step(system, method.start(system, start(12)))
         assert float((carry.x - minimum_of(system)).abs().max()) < 1e-4
         assert carry.energy < 1e-8
-
-    def test_exact_diagonal_solves_a_separable_quadratic_in_one_step(self):
-        system = system_of(np.diag(np.geomspace(1, 1e4, 9)))
-        method = QuasiNewton(use_metric=False)
-        carry = method.step(system, method.start(system, start(9)))
-        assert carry.energy < 1e-20
 
     def test_wrong_metric_converges_in_as_many_steps_as_there_are_curvatures(self):
         """Three curvatures seen through an identity metric: about a step for each, and a few for inexact searches."""
@@ -181,22 +146,14 @@ class TestQuasiNewton:
         method = QuasiNewton(use_metric=use_metric)
         carry = method.start(system, x)
         scale = 1.0 / system.diagonal(x).unsqueeze(1)
-        for _ in range(6):
+        for _ in range(8):
             carry = method.step(system, carry)
-        assert len(carry.memory.secants) >= 3
+        assert 3 <= len(carry.memory.secants) <= 5
         for pair in carry.memory.secants:
             expected = system.apply_metric_inverse(pair.yields) if use_metric else scale * pair.yields
             assert float((pair.image - expected).norm() / expected.norm()) < 1e-9
             assert pair.curvature == pytest.approx(float((pair.move * pair.yields).sum()), rel=1e-12)
             assert pair.curvature > 0
-
-    def test_memory_is_bounded(self):
-        system, x = real_problem()
-        method = QuasiNewton(history=2)
-        carry = method.start(system, x)
-        for _ in range(6):
-            carry = method.step(system, carry)
-        assert len(carry.memory.secants) == 2
 
     def test_one_metric_solve_and_mostly_one_force_a_step(self):
         system, x = real_problem()
@@ -291,14 +248,6 @@ class TestNewton:
         expected = torch.as_tensor(np.linalg.solve(matrix, carry.force.numpy()))
         assert float((got - expected).norm() / expected.norm()) < 1e-5
 
-    def test_direction_leaves_a_twentieth_of_the_force_whatever_the_metric(self):
-        matrix = spd(10, 2000.0)
-        system = system_of(matrix, metric=np.eye(10))
-        method = Newton()
-        carry = method.start(system, start(10))
-        left = carry.force - torch.as_tensor(matrix) @ method._direction(system, carry)
-        assert float(left.norm() / carry.force.norm()) < 0.05
-
     def test_converges_faster_than_linearly_on_cloth(self):
         system, x = real_problem()
         moves: list[float] = []
@@ -335,23 +284,14 @@ class TestNewton:
 
 
 class TestWhyItStopped:
-    def test_steps(self):
+    @pytest.mark.parametrize("steps", [0, 7])
+    def test_steps(self, steps: int):
         system, x = real_problem()
-        _, report = solve_level(system, QuasiNewton(), x, level=3, budget=Budget(4))
-        assert (report.stopped, report.steps, report.level) == ("steps", 4, 3)
-
-    def test_no_steps(self):
-        system, x = real_problem()
-        out, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(0))
-        assert (report.stopped, report.steps) == ("steps", 0)
-        assert torch.equal(out, x)
-        assert report.energy_after == report.energy_before
-
-    def test_tolerance_is_met(self):
-        system, x = real_problem()
-        _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(500, 1e-3))
-        assert report.stopped == "tolerance"
-        assert report.remaining_move < 1e-3
+        out, report = solve_level(system, QuasiNewton(), x, level=3, budget=Budget(steps))
+        assert (report.stopped, report.steps, report.level, report.vertices) == ("steps", steps, 3, len(x))
+        assert sum(report.movers.values()) == steps
+        assert report.milliseconds > 0
+        assert torch.equal(out, x) == (report.energy_after == report.energy_before) == (steps == 0)
 
     def test_deadline(self):
         system, x = real_problem()
@@ -370,13 +310,6 @@ class TestWhyItStopped:
         x[2, 1] = bad
         with pytest.raises(SolveError, match=r"level 5: .*not finite"):
             solve_level(system, QuasiNewton(), x, level=5, budget=Budget(3))
-
-    def test_counts(self):
-        system, x = real_problem()
-        _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(7))
-        assert report.vertices == len(x)
-        assert sum(report.movers.values()) == report.steps == 7
-        assert report.milliseconds > 0
 
 
 def test_names():
