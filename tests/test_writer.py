@@ -102,7 +102,7 @@ sys.stdout.write(hashlib.sha256(out.read_bytes()).hexdigest())
 
 def test_the_same_calls_give_the_same_bytes(dressed: Path, tmp_path: Path) -> None:
     digests = set()
-    for _ in range(3):
+    for _ in range(2):
         command = [sys.executable, "-c", DIGEST, str(dressed), str(tmp_path / "out.usdc")]
         digests.add(subprocess.run(command, cwd=ROOT, capture_output=True, check=True, timeout=60).stdout)
     assert len(digests) == 1
