@@ -129,7 +129,7 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     for device in ("cpu", "cuda", "cuda"):
         one = Group.of(garments, chains, down, settings_of(steps=60), dtype=torch.float32, device=device)
         answers.append(solve_frame(one, FrameInput(frames), None))
-    assert answers[0].crossings == answers[1].crossings == (0, 0)
+    assert not any(crossing.any() for answer in answers for crossing in answer.crossing)
     assert np.abs(answers[1].points[0] - answers[0].points[0]).max() < 1e-3 * 0.05
     assert np.array_equal(answers[1].points[0], answers[2].points[0])
     sewn = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points, axis=2) < 1e-9, 1))
