@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bodies import ball
-from click.testing import CliRunner
 from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, command, faults, fine, refine, sample_times
 from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
 
-from physgraph_usd.cli import main
 from physgraph_usd.errors import GarmentError, PhysGraphError, UsageError
 from physgraph_usd.shot.refine import inspect_shot
 
@@ -76,13 +74,6 @@ class TestFramesThatFail:
         report = refine(shot, tmp_path / "fine.usdc")
         assert (report.exit_code, list(report.failed)) == (3, ["4"])
         assert "NaN" in report.failed["4"]
-
-    def test_the_command_ends_with_3(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
-        line = ["refine", str(shot), "-o", str(tmp_path / "fine.usdc"), "--level", "1", "--steps", "4"]
-        result = CliRunner().invoke(main, line)
-        assert result.exit_code == 3
-        assert "time code 3" in result.stderr
 
     def test_an_exception_nobody_foresaw_leaves_nothing(
         self, shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
