@@ -1,7 +1,5 @@
 """Forces, and the sum of them that an integrator sees."""
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -216,7 +214,7 @@ class Elements:
 
 
 def element_overloads(
-    kernel: wp.Kernel, *, width: int, parameters: int, vector_parameters: int = 0
+    kernel: Any, *, width: int, parameters: int, vector_parameters: int = 0
 ) -> dict[torch.dtype, wp.Kernel]:
     """Instantiate a generic element kernel for float32 and float64.
 

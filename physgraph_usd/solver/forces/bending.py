@@ -16,8 +16,6 @@ pressed to theta0 = 3 may pass pi. Its force changes sign half a turn from theta
 Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
 """
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 import math
@@ -63,7 +61,7 @@ def _bending(
     # The floors are relative to the hinge's own size: they act on collapsed triangles only.
     tiny = weight.dtype(1.0e-12) * (square + wp.dot(ik, ik) + wp.dot(il, il))
     square = wp.max(square, tiny + weight.dtype(1.0e-30))
-    length = wp.sqrt(square)
+    length = wp.sqrt(square)  # pyright: ignore[reportArgumentType]
     floor = tiny * square + weight.dtype(1.0e-37)
     s1 = wp.max(wp.dot(n1, n1), floor)
     s2 = wp.max(wp.dot(n2, n2), floor)

@@ -11,8 +11,6 @@
 The planes stay while the term lives, so it is a function of x alone.
 """
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from collections.abc import Sequence

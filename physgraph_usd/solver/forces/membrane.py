@@ -21,8 +21,6 @@ St. Venant-Kirchhoff softens under compression and has no barrier against invers
 either matters, and a flat collapsed triangle still has the energy C11 / 8 per area and axis to gain from unfolding.
 """
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from collections.abc import Sequence

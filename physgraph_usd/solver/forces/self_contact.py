@@ -11,8 +11,6 @@
 Pairs, weights and normals stay while the term lives, so it is a function of x alone, and a convex one.
 """
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from dataclasses import dataclass, fields

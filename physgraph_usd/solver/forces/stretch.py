@@ -15,8 +15,6 @@
 Springs cannot express shear on its own: an isotropic sheet of them has nu = 1/3 and G = 0.375 Y.
 """
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from typing import Any

@@ -14,7 +14,7 @@ of matrices, a kernel of one thread a garment and one more product replace the t
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false, reportReturnType=false
+# pyright: reportReturnType=false
 from __future__ import annotations
 
 import functools

@@ -8,8 +8,6 @@ A vector v of a vertex gives others that turn with the cloth as v does, and that
 | ``v.smooth`` | mean of v over the neighbours | coarse and fine waves want steps of different lengths |
 """
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from functools import cached_property
@@ -77,7 +75,9 @@ class _Tables:
         (corner_starts, corner), (end_starts, end) = (
             [each.cpu().numpy() for each in incidence(elements, count)] for elements in (level.triangles, level.edges)
         )
-        turned = np.take_along_axis(triangles[corner // 3], (corner[:, None] % 3 + [1, 2]) % 3, axis=1)
+        turned = np.take_along_axis(
+            triangles[corner // 3], (corner[:, None] % 3 + np.array([1, 2], np.int32)) % 3, axis=1
+        )
         far = edges[end // 2, 1 - end % 2].astype(np.int32)
         x = vectors(torch.zeros_like(level.rest))
 

@@ -1,7 +1,5 @@
 """Lengths of edges and normals of triangles, one kernel each: torch would take many passes."""
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from collections.abc import Mapping

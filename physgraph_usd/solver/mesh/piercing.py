@@ -1,7 +1,7 @@
 """Whether an edge passes through a triangle, decided alike for every pair that shares an edge or a side."""
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false
+# pyright: reportIndexIssue=false
 from __future__ import annotations
 
 import warp as wp

@@ -3,8 +3,6 @@
 Gathering keeps the order of each sum fixed, so a run repeats bit for bit on either device.
 """
 
-# Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from typing import Any
@@ -43,7 +41,7 @@ SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64}
 """Warp's scalar for each torch scalar type."""
 
 
-def overloads(kernel: wp.Kernel, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
+def overloads(kernel: Any, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
     """A generic kernel of (first, *arrays) for float32 and float64.
 
     Args:
