@@ -39,10 +39,14 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
     opened = layer if isinstance(layer, Sdf.Layer) else open_layer(layer)
     below = shot if shot is not None else recorded_shot(opened)
     lost = isinstance(below, str) and shot is None and not is_there(below)
-    view = None if lost else _view(below)
+    view = None
+    if below is not None and not lost:
+        view = StageView.of(below) if isinstance(below, Usd.Stage) else StageView.of_layer(open_layer(below))
     with pxr_errors(f"cannot read {layer} over {below}", LayerError):
-        if message := _bad_rate(opened, view):
-            return [Problem("error", "/", None, message, "time_scale")]
+        nothing = Usd.StagePopulationMask()
+        stages = [Usd.Stage.OpenMasked(opened, nothing)] + ([] if view is None else [view.open(mask=nothing)])
+        if fault := next(filter(None, map(bad_rate, stages)), ""):
+            return [Problem("error", "/", None, fault, "time_scale")]
         opened = _played(opened)
         problems = check_layer(opened, view)
         if lost:
@@ -51,13 +55,6 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
         elif view is not None and not any(problem.rule == "composition" for problem in problems):
             problems += _own_validators(opened, view)
     return sorted(problems, key=lambda problem: problem.severity != "error")
-
-
-def _bad_rate(layer: Sdf.Layer, shot: StageView | None) -> str:
-    """The fault in the rate of a layer or of its shot, or ""."""
-    nothing = Usd.StagePopulationMask()
-    stages = [Usd.Stage.OpenMasked(layer, nothing)] + ([] if shot is None else [shot.open(mask=nothing)])
-    return next(filter(None, map(bad_rate, stages)), "")
 
 
 def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None = None) -> list[Problem]:
@@ -138,13 +135,6 @@ def _played(layer: Sdf.Layer) -> Sdf.Layer:
             for time in attribute.GetTimeSamples():
                 whole.SetTimeSample(attribute.GetPath(), time, attribute.Get(time))
     return whole
-
-
-def _view(shot: str | Path | Usd.Stage | None) -> StageView | None:
-    """The view of a shot; None for no shot."""
-    if shot is None:
-        return None
-    return StageView.of(shot) if isinstance(shot, Usd.Stage) else StageView.of_layer(open_layer(shot))
 
 
 def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:

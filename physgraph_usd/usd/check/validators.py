@@ -33,10 +33,11 @@ def register() -> bool:
         return False
     for rule in LAYER_RULES:
         registry.RegisterPluginLayerValidator(f"{PLUGIN}:{rule.__name__}", _layer_task(UsdValidation, rule))
+    purpose = "Writes the extent of the points, at the times of the points, into the refined layer."
+    fixer = UsdValidation.ValidationFixer(EXTENT_FIXER, purpose, _fix_extent, _can_fix_extent, [], extent.__name__)
     for rule in RULES:
         name, task = f"{PLUGIN}:{rule.__name__}", _prim_task(UsdValidation, rule)
-        fixers = [_extent_fixer(UsdValidation)] if rule is extent else []
-        registry.RegisterPluginPrimValidator(name, task, fixers)
+        registry.RegisterPluginPrimValidator(name, task, [fixer] if rule is extent else [])
     return True
 
 
@@ -82,11 +83,6 @@ def refined(prim: Usd.Prim) -> Fine | None:
         if str(path) in map(str, (read_record(layer) or {}).get("garments", ())):
             return Fine(prim, layer, (None, *layer.ListTimeSamplesForPath(path.AppendProperty("points"))))
     return None
-
-
-def _extent_fixer(module: Any) -> Any:
-    message = "Writes the extent of the points, at the times of the points, into the refined layer."
-    return module.ValidationFixer(EXTENT_FIXER, message, _fix_extent, _can_fix_extent, [], extent.__name__)
 
 
 def _at(error: Any, target: Usd.EditTarget) -> Fine | None:

@@ -58,8 +58,9 @@ class DrawnStage:
     def __init__(self, shot: Path, over: Path | None = None) -> None:
         """Compose and open."""
         base = open_layer(shot, StageError)
-        self._refined = _refined_times(over) if over is not None else ()
         layers = [open_layer(path, StageError) for path in (over, shot) if path is not None]
+        points = [] if over is None else [f"{path}.points" for path in refined_in(over)]
+        self._refined = merge(time for name in points for time in layers[0].ListTimeSamplesForPath(name))
         self._root = root_over(base, [layer.identifier for layer in layers])
         with pxr_errors(f"cannot open {shot}"), quiet():
             self.stage = Usd.Stage.Open(self._root)
@@ -109,7 +110,9 @@ class DrawnStage:
         drawn = []
         for prim in traverse(self.stage):
             mesh = UsdGeom.Mesh(prim)
-            if not mesh or not _is_seen(mesh, code):
+            if not mesh or mesh.ComputePurpose() not in {"default", "render"}:
+                continue
+            if mesh.ComputeVisibility(code) == UsdGeom.Tokens.invisible:
                 continue
             matrix = np.array(transforms.GetLocalToWorldTransform(prim))
             read = _read(mesh, code, matrix)
@@ -129,18 +132,6 @@ def refined_in(layer: Path) -> tuple[str, ...]:
     """Return the paths whose points a layer authors itself."""
     paths = paths_in(open_layer(layer, StageError))
     return tuple(sorted(str(path.GetPrimPath()) for path in paths if path.IsPropertyPath() and path.name == "points"))
-
-
-def _refined_times(layer: Path) -> tuple[float, ...]:
-    """Time codes at which a refined layer has points."""
-    opened = open_layer(layer, StageError)
-    return merge(time for path in refined_in(layer) for time in opened.ListTimeSamplesForPath(f"{path}.points"))
-
-
-def _is_seen(mesh: UsdGeom.Mesh, code: Usd.TimeCode) -> bool:
-    """Whether a renderer would draw the mesh."""
-    purpose = mesh.ComputePurpose()
-    return purpose in {"default", "render"} and mesh.ComputeVisibility(code) != "invisible"
 
 
 def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMesh | None:

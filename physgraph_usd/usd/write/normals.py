@@ -46,7 +46,9 @@ class VertexNormals:
             areas = self._face @ areas
         normals = self._faces_of @ areas
         lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-        bad = ~(lengths > _tiny(lengths))
+        # Below this a direction is rounding noise.
+        tiny = max(1e-12 * float(lengths.max(initial=0.0)), float(np.finfo(np.float32).tiny))
+        bad = ~(lengths > tiny)
         if bad.any():
             normals[bad] = self._from_neighbours(normals, lengths, bad)
             lengths = np.where(bad, 1.0, lengths)
@@ -86,8 +88,3 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
     out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     return out
-
-
-def _tiny(lengths: np.ndarray) -> float:
-    """Area under which a direction is rounding noise, by the largest area of a vertex."""
-    return max(1e-12 * float(lengths.max(initial=0.0)), float(np.finfo(np.float32).tiny))

@@ -25,6 +25,7 @@ EMPTIED = {
 }
 """Written as empty arrays where authored: a block would read as None at the default time."""
 _REWRITTEN = {"points", "normals", "velocities", "accelerations", "extent", "faceVertexCounts", "faceVertexIndices"}
+_ELSEWHERE = ("primvars:", "skel:", "xformOp", "physgraph:")
 REST_POINTS = "physics:restShapePoints"
 
 
@@ -70,7 +71,7 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
     sizes = {fine.count(kind): kind for kind in ("faceVarying", "uniform", "vertex")}
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
-        if not attribute.GetTypeName().isArray or name in EMPTIED or name in _REWRITTEN or _is_elsewhere(name):
+        if not attribute.GetTypeName().isArray or name in EMPTIED or name in _REWRITTEN or name.startswith(_ELSEWHERE):
             continue
         value = attribute.Get()
         if value is None or len(value) not in sizes:
@@ -83,11 +84,6 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
             message = f"{name} has one entry per {sizes[len(value)]} element of the coarse mesh and stays as authored"
             notices.append(Notice(str(prim.GetPath()), None, message))
     return notices
-
-
-def _is_elsewhere(name: str) -> bool:
-    """Whether another function takes care of an attribute."""
-    return name.startswith(("primvars:", "skel:", "xformOp", "physgraph:"))
 
 
 def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, skinned: bool) -> None:

@@ -9,6 +9,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from ..provenance import export_layer
 from ..schema import fabric_values
+from ..stage import timecode
 from .atomic import prepare_target
 from .plain import Look, PlainMesh, PlainStage, Skeleton
 
@@ -50,7 +51,12 @@ def _write_mesh(stage: Usd.Stage, record: PlainStage, mesh: PlainMesh) -> None:
     usd.CreateSubdivisionSchemeAttr(mesh.scheme)
     usd.CreateOrientationAttr("leftHanded" if mesh.left_handed else "rightHanded")
     usd.CreateDoubleSidedAttr(mesh.role == "garment")
-    _write_points(usd, mesh, record.times)
+    points, extent = usd.CreatePointsAttr(), usd.CreateExtentAttr()
+    samples = {} if mesh.samples is None else dict(zip(record.times.tolist(), mesh.samples, strict=True))
+    for time, values in {None: mesh.points, **samples}.items():
+        vectors = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
+        points.Set(vectors, timecode(time))
+        extent.Set(UsdGeom.PointBased.ComputeExtent(vectors), timecode(time))
     if mesh.transforms is not None:
         op = usd.AddTransformOp()
         for time, matrix in zip(record.times, mesh.transforms, strict=True):
@@ -61,22 +67,6 @@ def _write_mesh(stage: Usd.Stage, record: PlainStage, mesh: PlainMesh) -> None:
         _write_garment(usd.GetPrim(), mesh)
     elif mesh.role == "collider":
         usd.GetPrim().AddAppliedSchema("PhysGraphColliderAPI")
-
-
-def _write_points(usd: UsdGeom.Mesh, mesh: PlainMesh, times: np.ndarray) -> None:
-    """Author default points, samples and extents."""
-    points, extent = usd.CreatePointsAttr(), usd.CreateExtentAttr()
-    _set_points(points, extent, mesh.points, Usd.TimeCode.Default())
-    if mesh.samples is not None:
-        for time, sample in zip(times, mesh.samples, strict=True):
-            _set_points(points, extent, sample, Usd.TimeCode(float(time)))
-
-
-def _set_points(points: Usd.Attribute, extent: Usd.Attribute, values: np.ndarray, time: Usd.TimeCode) -> None:
-    """Author points and their extent at one time."""
-    vectors = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
-    points.Set(vectors, time)
-    extent.Set(UsdGeom.PointBased.ComputeExtent(vectors), time)
 
 
 def _write_primvars(usd: UsdGeom.Mesh, mesh: PlainMesh) -> None:

@@ -112,16 +112,13 @@ class LayerStream:
         """
         leave_if_asked()
         if self.target is not None:
-            self._save()
+            try:
+                saved = self.layer.Save()
+            except Tf.ErrorException as error:
+                raise self._failure(error) from error
+            if not saved:
+                raise LayerError(f"cannot write {self.target}: saving failed without a reason")
         self._pending = 0
-
-    def _save(self) -> None:
-        try:
-            saved = self.layer.Save()
-        except Tf.ErrorException as error:
-            raise self._failure(error) from error
-        if not saved:
-            raise LayerError(f"cannot write {self.target}: saving failed without a reason")
 
     def commit(self) -> Path | None:
         """Move the layer to its final path and return it; None for a layer in memory, which stays in ``layer``.

@@ -124,7 +124,10 @@ class LayerWriter:
             raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
         _check_sizes(self._meshes, len(self._shot.sources), points, heat=heat, time=time)
         if self._time == -np.inf:
-            self._author_values(time)
+            frame = self._shot.frame(time)
+            for index in self._meshes:
+                source, garment = self._shot.sources[index], self._shot.scene.garments[index]
+                author_used_values(self._stream, source, garment, frame.garments[index])
         for index, mesh in self._meshes.items():
             if (array := points[index]) is not None:
                 different = True if changed is None else bool(changed[index])
@@ -148,13 +151,6 @@ class LayerWriter:
             if (array := points[index]) is not None
         }
         self._chunk = replace(self._chunk, preroll={**self._chunk.preroll, time: found})
-
-    def _author_values(self, time: float | None) -> None:
-        """Author the values used on the coarse prims."""
-        frame = self._shot.frame(time)
-        for index in self._meshes:
-            source, garment = self._shot.sources[index], self._shot.scene.garments[index]
-            author_used_values(self._stream, source, garment, frame.garments[index])
 
     @property
     def targets(self) -> list[Sdf.Path]:
