@@ -105,7 +105,7 @@ class TestAgainstEveryPair:
     @pytest.mark.parametrize("level", [0, 1, 2])
     def test_of_random_crumples(self, kind: str, level: int):
         finest, count = levels_of(named(square(4, kind=kind)), level=level)[-1], 0
-        for seed in range(6):
+        for seed in range(6 if level < 2 else 2):
             for size in (0.2, 0.5, 0.8):
                 points = crumpled(finest.rest.double().numpy(), seed, size=size) @ rotation(seed)
                 x = torch.as_tensor(points, dtype=finest.dtype)

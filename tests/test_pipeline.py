@@ -73,15 +73,6 @@ def test_level_zero_solves_the_cage():
 
 
 class TestReuse:
-    @pytest.mark.parametrize("temporal", ["tether", "warm", "off"])
-    def test_equal_frames_are_reused_bitwise(self, temporal: str):
-        one = refiner(temporal=temporal)
-        first = one.solve(frame_of(wave(REST), 1.0))
-        second = one.solve(frame_of(wave(REST).copy(), 2.0))
-        assert second.points[0].tobytes() == first.points[0].tobytes()
-        assert (first.reused, second.reused) == ((False,), (True,))
-        assert second.time == 2.0
-
     @pytest.mark.parametrize(
         "change",
         [

@@ -57,6 +57,7 @@ def test_s35_a_hundred_equal_frames_are_one(temporal: str):
     states = list(refiner.refine(frame_of(wave(REST), float(time)) for time in range(100)))
     assert len({state.points[0].tobytes() for state in states}) == 1
     assert [state.reused for state in states] == [(False,)] + [(True,)] * 99
+    assert [state.time for state in states] == list(range(100))
     assert all("reused" in str(state.telemetry[0]["start"]) for state in states[1:])
 
 
