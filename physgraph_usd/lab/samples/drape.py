@@ -49,16 +49,7 @@ class DrapeOptions:
 
 
 class Drape:
-    """A cloth with positions and velocities that is stepped through time.
-
-    Args:
-        rest: Rest positions [m], shape (V, 3).
-        faces: Triangles or quads, shape (F, 3) or (F, 4).
-        pinned: Vertices that follow targets, shape (K,).
-        options: How the cloth behaves.
-        project: Moves positions out of colliders, in place of contact forces; or None.
-        start: Positions at the beginning when they differ from ``rest``.
-    """
+    """A cloth with positions and velocities that is stepped through time."""
 
     def __init__(
         self,
@@ -70,7 +61,16 @@ class Drape:
         project: Callable[[np.ndarray, float], np.ndarray] | None = None,
         start: np.ndarray | None = None,
     ) -> None:
-        """Factorise the constant system."""
+        """Factorise the constant system.
+
+        Args:
+            rest: Rest positions [m], shape (V, 3).
+            faces: Triangles or quads, shape (F, 3) or (F, 4).
+            pinned: Vertices that follow targets, shape (K,).
+            options: How the cloth behaves.
+            project: Moves positions out of colliders at a time, in place of contact forces; or None.
+            start: Positions at the beginning when they differ from ``rest``.
+        """
         self.options = options or DrapeOptions()
         self.pinned, self._project = pinned, project
         self.points = np.array(rest if start is None else start, dtype=float)
@@ -104,20 +104,11 @@ class Drape:
         """Stiffness that holds points where they were moved to [N/m]."""
         return self.options.contact * self.options.spring * self._touching
 
-    def step(self, targets: np.ndarray, *, force: np.ndarray | None = None) -> np.ndarray:
-        """Advance one time step.
-
-        Args:
-            targets: Positions of the pinned vertices [m], shape (K, 3).
-            force: Acceleration besides gravity [m/s^2], shape (V, 3), or None.
-
-        Returns:
-            The new positions [m], shape (V, 3).
-        """
+    def step(self, targets: np.ndarray) -> np.ndarray:
+        """Positions after one time step [m], shape (V, 3), from those of the pinned vertices [m], shape (K, 3)."""
         step = self.options.step
         self.time += step
-        pull = GRAVITY if force is None else GRAVITY + force
-        free = self.points + step * (1.0 - self.options.drag * step) * self.velocity + step * step * pull
+        free = self.points + step * (1.0 - self.options.drag * step) * self.velocity + step * step * GRAVITY
         right = self._inertia[:, None] * free
         right[self.pinned] += self._hold[self.pinned, None] * targets
         points = free
