@@ -149,4 +149,5 @@ def test_every_mesh_is_told_and_broken_ones_say_why(tmp_path: Path) -> None:
 
 
 def test_meshes_inside_instances_are_told(tmp_path: Path) -> None:
-    assert [mesh.instanced for mesh in survey(instanced_shot(tmp_path)).meshes] == [True, True]
+    meshes = survey(instanced_shot(tmp_path)).meshes
+    assert [mesh.path for mesh in meshes] == ["/World/one/cloth", "/World/two/cloth"]

@@ -81,15 +81,8 @@ class Fine:
     @cached_property
     def sizes(self) -> dict[str, int]:
         """Number of elements by interpolation, at the default time."""
-        points, counts, indices = (self.entries(name, None) for name in TOGETHER[:3])
-        vertices = len(points)
-        return {
-            "vertex": vertices,
-            "varying": vertices,
-            "uniform": len(counts),
-            "faceVarying": len(indices),
-            "constant": 1,
-        }
+        points, faces, corners = (len(self.entries(name, None)) for name in TOGETHER[:3])
+        return {"vertex": points, "varying": points, "uniform": faces, "faceVarying": corners, "constant": 1}
 
     def entries(self, name: str, time: float | None) -> np.ndarray:
         """An attribute's composed array as numpy; empty where there is none."""
@@ -199,9 +192,7 @@ def primvars(fine: Fine) -> Iterator[Problem]:
     sizes = fine.sizes
     for primvar in UsdGeom.PrimvarsAPI(fine.prim).GetPrimvarsWithAuthoredValues():
         name, interpolation = primvar.GetAttr().GetName(), primvar.GetInterpolation()
-        if name in STALE:
-            continue
-        if not primvar.GetTypeName().isArray or interpolation not in sizes:
+        if name in STALE or not primvar.GetTypeName().isArray or interpolation not in sizes:
             continue
         for time in (each for each in fine.times if each is None or each in primvar.GetTimeSamples()):
             if fault := _primvar_fault(primvar, time, sizes[interpolation]):

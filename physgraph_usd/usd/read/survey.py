@@ -12,9 +12,8 @@ from ..schema import GARMENT_API
 from ..stage import Notice, list_meshes, open_stage, pxr_errors, quiet, read_units, shot_name
 from ..times import garment_times
 from .cage import PointReader, read_cage
-from .find import has_schema, instance_roots
+from .find import has_schema
 from .placement import check_placement
-from .skinning import skel_root
 
 
 @dataclass(frozen=True)
@@ -24,8 +23,6 @@ class MeshReport:
     Attributes:
         path: Prim path.
         garment: Whether it has PhysGraphGarmentAPI.
-        skinned: Whether it is below a skel root.
-        instanced: Whether it is inside an instance.
         points: Number of points; 0 when they cannot be read.
         faces: Number of faces that would be refined.
         is_open: Whether most of its faces are in pieces that are not closed.
@@ -36,8 +33,6 @@ class MeshReport:
 
     path: str
     garment: bool
-    skinned: bool
-    instanced: bool
     points: int = 0
     faces: int = 0
     is_open: bool = False
@@ -76,8 +71,7 @@ def survey(shot: str | Usd.Stage) -> Survey:
 def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
     """One mesh; never raises, a broken one has a problem."""
     path = str(prim.GetPath())
-    kind = (has_schema(prim, GARMENT_API), skel_root(prim) is not None, bool(instance_roots(prim)))
-    count = 0
+    garment, count = has_schema(prim, GARMENT_API), 0
     try:
         with pxr_errors(f"cannot read <{path}>"):
             times = garment_times(prim)
@@ -89,6 +83,6 @@ def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
             pieces = pieces_of(placed, cage.mesh.triangulate(placed).triangles)
             odd = check_placement(prim, metres, times)
     except StageError as error:
-        return MeshReport(path, *kind, points=count, problem=str(error))
+        return MeshReport(path, garment, points=count, problem=str(error))
     is_open, notices = len(pieces.open) > len(pieces.closed), (*cage.notices, *odd)
-    return MeshReport(path, *kind, count, len(cage.kept_faces), is_open, times, notices=notices)
+    return MeshReport(path, garment, count, len(cage.kept_faces), is_open, times, notices=notices)

@@ -87,7 +87,7 @@ def _may_meet(
     for time, box in zip(times, boxes, strict=True):
         bound = UsdGeom.BBoxCache(timecode(time), every).ComputeWorldBound(prim).ComputeAlignedRange()
         bounds = metres * np.array([bound.GetMin(), bound.GetMax()], dtype=np.float64)
-        if not bound.IsEmpty() and _overlap(bounds, box) and np.ptp(bounds, axis=0).max() >= least:
+        if not bound.IsEmpty() and _meets(bounds, box, least):
             return True
     return False
 
@@ -99,13 +99,14 @@ def _meeting(poses: Iterable[Pose | None], boxes: Sequence[Box], *, least: float
         points = points[np.isfinite(points).all(axis=1)]
         if pose is None or not len(points):
             continue
-        bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-        if _overlap(bounds, box) and np.ptp(bounds, axis=0).max() >= least:
+        if _meets(np.stack([points.min(axis=0), points.max(axis=0)]), box, least):
             yield index, pose
 
 
-def _overlap(a: Box, b: Box) -> bool:
-    return bool((a[0] <= b[1]).all() and (b[0] <= a[1]).all())
+def _meets(bounds: Box, box: Box, least: float) -> bool:
+    """Whether bounds overlap a box and are large enough."""
+    overlap = (bounds[0] <= box[1]).all() and (box[0] <= bounds[1]).all()
+    return bool(overlap and np.ptp(bounds, axis=0).max() >= least)
 
 
 def _same_place(a: Pose | None, b: Pose | None) -> bool:

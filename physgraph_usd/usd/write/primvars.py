@@ -67,11 +67,7 @@ def _hide(stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar) -> No
 
 
 def _carry(
-    stream: LayerStream,
-    target: Sdf.Path,
-    primvar: UsdGeom.Primvar,
-    fine: FineMap,
-    span: tuple[float, float] | None,
+    stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar, fine: FineMap, span: tuple[float, float] | None
 ) -> None:
     """Author one primvar at its default and each of its times."""
     path = target.AppendProperty(primvar.GetAttr().GetName())
@@ -100,11 +96,9 @@ def _refined(
     """Fine values and indices at one time, as numpy; either may be None."""
     array, smooth = to_numpy(value)
     size = primvar.GetElementSize()
-    grouped = array
-    if size > 1:
-        if len(array) % size:
-            raise ValueError(f"has {len(array)} values, no multiple of its elementSize {size}")
-        grouped = array.reshape(-1, size, *array.shape[1:])
+    if size > 1 and len(array) % size:
+        raise ValueError(f"has {len(array)} values, no multiple of its elementSize {size}")
+    grouped = array.reshape(-1, size, *array.shape[1:]) if size > 1 else array
     indices = np.asarray(primvar.GetIndices(code), np.int32) if primvar.IsIndexed() else None
     values, indices = fine.primvar(primvar.GetInterpolation(), grouped, indices=indices, smooth=smooth)
     return (None if values is None else values.reshape(-1, *array.shape[1:])), indices
@@ -199,18 +193,9 @@ class FineMap:
         return self.kept_corners[values[indices]]
 
     def count(self, interpolation: str) -> int:
-        """Number of authored elements of an interpolation.
-
-        Raises:
-            ValueError: The interpolation depends on no topology.
-        """
-        vertices = self.cage.vertex_count
-        counts = {
-            "vertex": vertices,
-            "varying": vertices,
-            "uniform": self._face_count,
-            "faceVarying": int(self._starts[-1]),
-        }
+        """Number of authored elements of an interpolation; ValueError when it depends on no topology."""
+        counts = dict.fromkeys(("vertex", "varying"), self.cage.vertex_count)
+        counts |= {"uniform": self._face_count, "faceVarying": int(self._starts[-1])}
         if interpolation not in counts:
             raise ValueError(f"has interpolation {interpolation!r}; known: constant, {', '.join(counts)}")
         return counts[interpolation]
@@ -268,15 +253,12 @@ class FineMap:
         return (refined[fine], None) if indices is None else (refined, fine.astype(np.int32))
 
     def subset(self, element: str, indices: np.ndarray, *, exclusive: bool = False) -> np.ndarray:
-        """Refine the indices of a subset.
+        """Fine indices of a subset, ascending, int32.
 
         Args:
             element: ``face``, ``point`` or ``edge``.
             indices: Authored indices; pairs of vertices for edges.
             exclusive: Whether a vertex must not fall into two subsets of the family, and none may be lost.
-
-        Returns:
-            Fine indices, ascending, int32.
 
         Raises:
             ValueError: The element type is unknown or an index is out of range.
