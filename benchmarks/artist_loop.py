@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 from pxr import Usd, UsdGeom
 
-from benchmarks.sleeve import say
+from benchmarks.rows import say
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import preview

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 import time
 from dataclasses import replace
 from typing import Any
 
 import trimesh
 
+from benchmarks.rows import say
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.contact.settings import ContactSettings
@@ -122,12 +122,6 @@ def _refiner(scene: Scene, form: str, cloth: str, *, device: str, temporal: str 
     contact = ContactSettings(form, cloth=cloth)
     settings = SolveSettings(method_named("quasi-newton"), temporal=temporal, contact=contact)
     return Refiner(replace(scene), settings, device=device, threads=THREADS)
-
-
-def say(line: str) -> None:
-    """Write a line to standard output."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from benchmarks.sleeve import say
+from benchmarks.rows import say
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import label, surface_of

@@ -10,7 +10,6 @@ pushed out by so many cage edges, in place of half of one.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ import click
 import numpy as np
 
 from benchmarks.crossing_count import crossing_count
+from benchmarks.rows import say
 from benchmarks.temporal import detail_of
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.solve import prepare_device
@@ -222,12 +222,6 @@ def _row(name: str, form: str, sums: Sums) -> str:
         f"| {sums.deepest:.2f} | {sums.pinched} | {arrows[1]} | {arrows[2]} | {sums.counted} | {arrows[3]} "
         f"| {sums.worse} | {sums.jumps} | {sums.strain:.3f} | {sums.seconds:.2f} |"
     )
-
-
-def say(line: str) -> None:
-    """Write a line to standard output."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from benchmarks.crossing_count import crossing_count
+from benchmarks.rows import say
 from benchmarks.shots import opened, problem_of
-from benchmarks.sleeve import say
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import label, surface_of

@@ -16,11 +16,11 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.rows import say
 from physgraph_usd.lab.chart.reference import Reference
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.integrate.base import Integrator
@@ -189,12 +189,6 @@ def in_words(network: Network) -> str:
     if isinstance(config, PhysgraphConfig):
         return f"{' '.join(config.vectors)}; W={config.width}"
     return f"latent {config.latent}, M={config.rounds}, H={config.history}, {config.features} features"
-
-
-def say(line: str) -> None:
-    """Write a line to standard output."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

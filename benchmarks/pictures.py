@@ -9,7 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.sleeve import say
+from benchmarks.rows import say
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import preview

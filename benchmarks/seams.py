@@ -22,7 +22,8 @@ import click
 import numpy as np
 from pxr import Sdf
 
-from benchmarks.contact_shots import REAL, say
+from benchmarks.contact_shots import REAL
+from benchmarks.rows import say
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot

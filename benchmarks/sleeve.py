@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import os
 import statistics
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import torch
 
+from benchmarks.rows import say
 from benchmarks.unseen import reference_of
 from physgraph_usd.lab.chart.reference import Reference
 from physgraph_usd.lab.samples import write_sample
@@ -161,12 +161,6 @@ def median_seconds(call, repeats: int = 30) -> float:
         call()
         times.append(time.perf_counter() - began)
     return statistics.median(times)
-
-
-def say(line: str) -> None:
-    """Write a line to standard output."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import cast
@@ -22,6 +21,7 @@ from typing import cast
 import numpy as np
 import torch
 
+from benchmarks.rows import say
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.group import Group
@@ -141,12 +141,6 @@ def least(edges: int, config: PhysgraphConfig | PaperConfig, tflops: float, *, r
         operations = 2 * config.rounds * (2 * edges * 5 * w * w + vertices * 4 * w * w)
         moved = config.rounds * 4 * w * (2 * edges * 2 + vertices * 2)
     return 1e3 * max(operations / (1e12 * tflops), moved / (1e9 * rate))
-
-
-def say(line: str) -> None:
-    """Write a line to standard output."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from benchmarks.sleeve import say
+from benchmarks.rows import say
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.studio.session import Shown, TuneSession
 from physgraph_usd.studio.values import TUNABLES

@@ -32,6 +32,8 @@ HARMLESS = 0.02
 """Fraction of the energy at the start below which the logarithm of the gap stops to reward."""
 TWINS = 1 / 3
 """Fraction of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
+EVERY = 60.0
+"""Seconds between measurements on held-out patches."""
 SCHEDULES = ((5, 5, 5), (10, 10, 5))
 """Steps a level at which held-out patches are measured."""
 
@@ -118,11 +120,10 @@ class Trainer:
         self.iteration, self.seconds = 0, 0.0
         self.curve: list[dict[str, Any]] = []
 
-    def train(self, *, every: float = 60.0, say: Any = None, keep: Path | None = None) -> None:
+    def train(self, *, say: Any = None, keep: Path | None = None) -> None:
         """Train until the time or the iterations are spent.
 
         Args:
-            every: Seconds between measurements on held-out patches.
             say: Called with a line at each measurement.
             keep: File for checkpoints, or None.
         """
@@ -132,7 +133,7 @@ class Trainer:
             began = time.perf_counter()
             losses.append(self.iterate())
             self.seconds += time.perf_counter() - began
-            if self.seconds - measured >= every or self.progress >= 1.0:
+            if self.seconds - measured >= EVERY or self.progress >= 1.0:
                 measured = self.seconds
                 row = {"iteration": self.iteration, "minutes": self.seconds / 60, "loss": float(np.mean(losses))}
                 row |= {"held_out": self.held_out_ratios()} if config.held_out else {}
