@@ -1,10 +1,7 @@
 """What a shot will cost, from its cages alone: fine vertices, memory, the layer's size and time.
 
-``python -m benchmarks.estimate`` measures what is behind each constant and says by what factor the estimate is off. On
-the samples memory and size are within a factor of 2. What a frame takes is decided by how crowded its cage is. The
-times are fitted to three frames each at 31 places of eight real shots, at one and two subdivisions, where all but the
-first one measured are within a factor of 2.1. At six places more the first frame was within 1.9, three frames within
-2.8, and the two later ones alone within 4: where cloth jumps from frame to frame, no cage tells.
+``python -m benchmarks.estimate`` measures the constants. Memory and size are within a factor of 2; times, which how
+crowded a cage is decides, within 2.8 for a few frames of real shots, and 4 for single ones where cloth jumps.
 """
 
 from __future__ import annotations
