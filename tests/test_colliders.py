@@ -7,7 +7,7 @@ import pytest
 import torch
 from bodies import around, ball, box, distances, endless, flipped, split, surfaces, together, tube
 
-from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.solver.colliders.mesh import Faces, MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.orient import pieces_of
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose, moved_rigidly
 from physgraph_usd.solver.colliders.primitives import ShapeSurface
@@ -161,16 +161,16 @@ class TestMeshes:
         later = MeshPose((points + move * np.array([-1.0, 0.0, 0.0])) @ turn.T + 0.3, triangles)
         body, every = MeshBody(device="cpu", threads=1), torch.arange(len(triangles), dtype=torch.int32)
         (surface,) = body.pose(MeshPose(points, triangles))
-        surface._is_mute(every)
-        asked, lifted = list[int](), MeshSurface._lifted_inside
+        surface._faces.is_mute(every)
+        asked, lifted = list[int](), Faces._lifted_inside
         monkeypatch.setattr(
-            MeshSurface, "_lifted_inside", lambda self, which: asked.append(len(which)) or lifted(self, which)
+            Faces, "_lifted_inside", lambda self, which: asked.append(len(which)) or lifted(self, which)
         )
         body.pose(later)
         (fresh,) = surfaces((later.points, triangles))
-        found = surface._is_mute(every)
+        found = surface._faces.is_mute(every)
         assert sum(asked) == (0 if rigid else len(points))
-        assert torch.equal(found, fresh._is_mute(every))
+        assert torch.equal(found, fresh._faces.is_mute(every))
         assert 50 < int(found.sum()) < 0.5 * len(found)
         x = torch.as_tensor(around((later.points, triangles)) - surface.origin)
         assert torch.equal(surface.closest(x, endless(len(x))).side, fresh.closest(x, endless(len(x))).side)
@@ -241,7 +241,7 @@ class TestBuried:
         of_one = np.arange(len(every)) < len(every) // 2
         deep, near = (np.where(of_one, other < 0.15 + by, one < 0.2 + by) for by in (-2e-3, 2e-3))
         asked = self.asked(monkeypatch)
-        buried = surface._lifted_inside(every).numpy()
+        buried = surface._faces._lifted_inside(every).numpy()
         assert deep.sum() > 100
         assert buried[deep].all()
         assert not buried[~near].any()
@@ -250,7 +250,7 @@ class TestBuried:
     def test_a_ball_takes_none(self, monkeypatch: pytest.MonkeyPatch):
         (surface,) = surfaces(ball(level=4))
         asked = self.asked(monkeypatch)
-        assert not surface._lifted_inside(torch.arange(len(surface.mesh.points))).any()
+        assert not surface._faces._lifted_inside(torch.arange(len(surface.mesh.points))).any()
         assert sum(asked) == 0
 
     def test_through_a_hole_one_sees_the_sky_from_inside(self):
@@ -260,14 +260,14 @@ class TestBuried:
         radius = np.linalg.norm(surface.mesh.points.numpy() + surface.origin, axis=1)
         inner = torch.as_tensor(np.flatnonzero(radius < 0.051))
         assert len(inner) > 100
-        assert surface._lifted_inside(inner).all()
+        assert surface._faces._lifted_inside(inner).all()
 
     def test_corners_without_a_normal_take_one(self, monkeypatch: pytest.MonkeyPatch):
         points, triangles = ball(level=2)
         (surface,) = surfaces((points, triangles))
-        surface._up = torch.zeros((len(points), 3))
+        surface._faces._up = torch.zeros((len(points), 3))
         asked = self.asked(monkeypatch)
-        surface._lifted_inside(torch.arange(7))
+        surface._faces._lifted_inside(torch.arange(7))
         assert sum(asked) == 7
 
     @staticmethod

@@ -123,32 +123,26 @@ class MeshSurface:
         self.triangles = triangles
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         self.edges, shared = np.unique(sides, axis=0, return_counts=True)
-        self._device, self._threads = device, threads
+        self.device, self.threads = device, threads
         self._used = np.unique(triangles)
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
-        self._corners = torch.as_tensor(triangles, device=device).long()
+        self.corners = torch.as_tensor(triangles, device=device).long()
         # At a hole or where more than two faces meet a pseudonormal says nothing.
         ragged = np.isin(triangles, self.edges[shared != 2]).any(axis=1)
-        self._ragged, self._has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
-        self._asked: Tensor | None = None
-        self._buried: Tensor | None = None
-        self._overlaps: Tensor | None = None
-        self._mute: Tensor | None = None
-        self._up: Tensor | None = None
-        self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
+        self.ragged, self.has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
         self._judged = pose.points[self._used]
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
+        self._faces = Faces(self)
 
     def repose(self, pose: MeshPose) -> None:
         """Move the surface to another pose of the same topology; turned alone, it passes through itself as before."""
-        wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self._device))
+        wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self.device))
         self.mesh.refit()
-        self._up = None
-        self._skins.clear()
         posed = pose.points[self._used]
-        if not moved_rigidly(self._judged, posed):
-            self._judged, self._buried, self._overlaps, self._mute = posed, None, None, None
+        rigid = moved_rigidly(self._judged, posed)
+        self._judged = self._judged if rigid else posed
+        self._faces = self._faces.turned() if rigid else Faces(self)
 
     def _place(self, pose: MeshPose) -> np.ndarray:
         """Recentre a pose; vertices that no face uses are put on one that a face does."""
@@ -172,7 +166,7 @@ class MeshSurface:
             return replace(found, side=1.0 - 2.0 * self.inside(x).to(x))
         if self.closed and len(x):
             tied = ((x - found.point) * found.normal).sum(dim=1) * found.side < 0
-            found.side[self._is_mute(found.face) | tied] = 0.0
+            found.side[self._faces.is_mute(found.face) | tied] = 0.0
         return found
 
     def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
@@ -185,7 +179,7 @@ class MeshSurface:
         if count:
             outputs = [wp.from_torch(distance), *(_vectors(each) for each in (point, normal)), wp.from_torch(face)]
             outputs += [_vectors(weight), wp.from_torch(side)]
-            self._run(_closest, mesh, count, [_vectors(asked), wp.from_torch(limit), *outputs])
+            self.run(_closest, mesh, count, [_vectors(asked), wp.from_torch(limit), *outputs])
         rim = self._on_rim(face.long(), weight) & distance.isfinite()
         return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
 
@@ -198,7 +192,7 @@ class MeshSurface:
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
             asked = x.to(torch.float32).contiguous()
-            self._run(
+            self.run(
                 _winding,
                 self.mesh,
                 len(x),
@@ -214,9 +208,9 @@ class MeshSurface:
         """
         if not self.closed or not len(x):
             return found
-        way = self._closest_bare(x, found, whole=False) if bool(self._is_buried(found.face).any()) else found
+        way = self._closest_bare(x, found, whole=False) if bool(self._faces.is_buried(found.face).any()) else found
         lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
-        doubtful = torch.nonzero(self._is_unsure(way.face)).squeeze(1)
+        doubtful = torch.nonzero(self._faces.is_unsure(way.face)).squeeze(1)
         doubtful = doubtful[self.inside(way.point[doubtful] + lift * way.normal[doubtful])]
         if not len(doubtful):
             return way
@@ -224,20 +218,59 @@ class MeshSurface:
 
     def _closest_bare(self, x: Tensor, known: Nearest, *, whole: bool) -> Nearest:
         """The closest points on faces that lie bare, or do so as a whole; what is known where there are none."""
-        skin = self._bare(whole)
+        skin = self._faces.bare(whole)
         if skin is None:
             return known
         mesh, faces = skin
         bare = self._closest(mesh, x, torch.full_like(known.distance, float("inf")))
         return replace(bare, face=faces[bare.face.long()])
 
-    def _is_mute(self, face: Tensor) -> Bool[Tensor, " points"]:
+    def run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
+        """Launch over points in slices on several threads."""
+        given = {"device": self.device, "threads": self.threads, "least": LEAST_QUERIES}
+        Launch(kernel, count, [mesh.id, *inputs], **given)({})
+
+    def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
+        """Whether closest points lie on a rim edge or a rim vertex."""
+        if self._rim is None:
+            return torch.zeros(len(face), dtype=torch.bool, device=face.device)
+        edges, corners = (each[face] for each in self._rim)
+        low = weight < ON_EDGE
+        at_corner = weight > 1.0 - 2.0 * ON_EDGE
+        return (edges & low).any(dim=1) | (corners & at_corner).any(dim=1)
+
+
+class Faces:
+    """What is known of a surface's faces in one pose: which are buried in it, pass through others, or lie bare.
+
+    Each vertex and each face is asked for once. The surface passes through itself as before while it only turns and
+    shifts.
+    """
+
+    def __init__(self, surface: MeshSurface) -> None:
+        """Know nothing yet."""
+        self._surface = surface
+        self._asked: Tensor | None = None
+        self._buried: Tensor | None = None
+        self._overlaps: Tensor | None = None
+        self._mute: Tensor | None = None
+        self._up: Tensor | None = None
+        self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
+
+    def turned(self) -> Faces:
+        """What is still known of the surface in a pose to which it turned and shifted."""
+        other = Faces(self._surface)
+        other._asked, other._buried = self._asked, self._buried
+        other._overlaps, other._mute = self._overlaps, self._mute
+        return other
+
+    def is_mute(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Whether the normals of faces do not tell the side; each face is asked for once a pose.
 
         On CUDA all are asked for together, where they are not too many: that takes as long as asking for a few.
         """
         if self._mute is None:
-            every = torch.arange(len(self._corners), dtype=torch.int32, device=face.device)
+            every = torch.arange(len(self._surface.corners), dtype=torch.int32, device=face.device)
             together = face.is_cuda and len(every) <= TOGETHER
             self._mute = self._tells_nothing(every) if together else torch.full_like(every, -1, dtype=torch.int8)
         new = face[self._mute[face.long()] < 0]
@@ -248,14 +281,14 @@ class MeshSurface:
 
     def _tells_nothing(self, face: Tensor) -> Tensor:
         """1 where a face's normal does not tell the side, else 0."""
-        return (self._is_buried(face) | self._is_unsure(face)).to(torch.int8)
+        return (self.is_buried(face) | self.is_unsure(face)).to(torch.int8)
 
-    def _is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
+    def is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Whether faces have a corner inside the surface; each corner is asked for once a pose."""
-        count = len(self.mesh.points)
+        count = len(self._surface.mesh.points)
         if self._buried is None or self._asked is None:
             self._asked, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
-        corners = self._corners[face.long()]
+        corners = self._surface.corners[face.long()]
         needed = torch.zeros(count, dtype=torch.bool, device=face.device)
         needed[corners.ravel()] = True
         new = torch.nonzero(needed & ~self._asked).squeeze(1)
@@ -263,14 +296,16 @@ class MeshSurface:
         self._asked[new] = True
         return self._buried[corners].any(dim=1)
 
-    def _is_unsure(self, face: Tensor) -> Bool[Tensor, " points"]:
+    def is_unsure(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Whether faces pass through others or are at a hole; each face is asked for once a pose."""
         if self._overlaps is None:
-            self._overlaps = torch.full((len(self._corners),), -1, dtype=torch.int8, device=face.device)
-        needed = torch.zeros(len(self._corners), dtype=torch.bool, device=face.device)
+            self._overlaps = torch.full((len(self._surface.corners),), -1, dtype=torch.int8, device=face.device)
+        needed = torch.zeros(len(self._surface.corners), dtype=torch.bool, device=face.device)
         needed[face.long()] = True
         new = torch.nonzero(needed & (self._overlaps < 0)).squeeze(1)
-        self._overlaps[new] = (overlapping(self.mesh, new, threads=self._threads) | self._ragged[new]).to(torch.int8)
+        self._overlaps[new] = (
+            overlapping(self._surface.mesh, new, threads=self._surface.threads) | self._surface.ragged[new]
+        ).to(torch.int8)
         return self._overlaps[face.long()] > 0
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
@@ -283,52 +318,40 @@ class MeshSurface:
             return out
         if self._up is None:
             self._up = self._normals()
-        size, up = np.ptp(self.bounds, axis=0), self._up[vertices]
-        asked = wp.to_torch(self.mesh.points)[vertices] + LIFT * float(size.max()) * up
-        if self._has_holes:
-            return self.inside(asked)
+        size, up = np.ptp(self._surface.bounds, axis=0), self._up[vertices]
+        asked = wp.to_torch(self._surface.mesh.points)[vertices] + LIFT * float(size.max()) * up
+        if self._surface.has_holes:
+            return self._surface.inside(asked)
         far = wp.float32(2.0 * float(np.linalg.norm(size)))
-        self._run(_meets, self.mesh, len(vertices), [_vectors(asked), _vectors(up), far, wp.from_torch(out)])
+        self._surface.run(
+            _meets, self._surface.mesh, len(vertices), [_vectors(asked), _vectors(up), far, wp.from_torch(out)]
+        )
         met = torch.nonzero(out | (up == 0.0).all(dim=1)).squeeze(1)  # Flat faces have no normal to look along.
-        out[met] = self.inside(asked[met])
+        out[met] = self._surface.inside(asked[met])
         return out
 
     def _normals(self) -> Float[Tensor, "vertices 3"]:
         """Unit normals of the vertices."""
-        points = wp.to_torch(self.mesh.points)
-        a, b, c = (points[self._corners[:, corner]] for corner in range(3))
+        points = wp.to_torch(self._surface.mesh.points)
+        a, b, c = (points[self._surface.corners[:, corner]] for corner in range(3))
         area = torch.linalg.cross(b - a, c - a)
         # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
         normal = torch.zeros_like(points)
         for corner in range(3):
-            normal.index_put_((self._corners[:, corner],), area, accumulate=True)
+            normal.index_put_((self._surface.corners[:, corner],), area, accumulate=True)
         return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
-    def _bare(self, whole: bool) -> tuple[wp.Mesh, Tensor] | None:
+    def bare(self, whole: bool) -> tuple[wp.Mesh, Tensor] | None:
         """The faces that lie bare, or that no other passes through besides, and their numbers; None without any."""
         if whole not in self._skins:
-            every = torch.arange(len(self._corners), device=self._device)
-            hidden = self._is_buried(every)
-            faces = torch.nonzero(~(hidden | self._is_unsure(every)) if whole else ~hidden).squeeze(1)
+            every = torch.arange(len(self._surface.corners), device=self._surface.device)
+            hidden = self.is_buried(every)
+            faces = torch.nonzero(~(hidden | self.is_unsure(every)) if whole else ~hidden).squeeze(1)
             if not len(faces):
                 return None
-            triangles = self.triangles[faces.cpu().numpy()]
-            self._skins[whole] = (_hierarchy(self.mesh.points, triangles, False), faces.to(torch.int32))
+            triangles = self._surface.triangles[faces.cpu().numpy()]
+            self._skins[whole] = (_hierarchy(self._surface.mesh.points, triangles, False), faces.to(torch.int32))
         return self._skins[whole]
-
-    def _run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
-        """Launch over points in slices on several threads."""
-        given = {"device": self._device, "threads": self._threads, "least": LEAST_QUERIES}
-        Launch(kernel, count, [mesh.id, *inputs], **given)({})
-
-    def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
-        """Whether closest points lie on a rim edge or a rim vertex."""
-        if self._rim is None:
-            return torch.zeros(len(face), dtype=torch.bool, device=face.device)
-        edges, corners = (each[face] for each in self._rim)
-        low = weight < ON_EDGE
-        at_corner = weight > 1.0 - 2.0 * ON_EDGE
-        return (edges & low).any(dim=1) | (corners & at_corner).any(dim=1)
 
 
 class MeshBody:
