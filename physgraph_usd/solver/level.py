@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .mesh.defects import FLAT
-from .mesh.lengths import EdgeLengths, TriangleNormals
+from .mesh.lengths import LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, on_triangles, smooth, subdivide_times
 from .mesh.topology import TriangleSplit, edges_of, find_edges, hinges_of, quad_edges
@@ -133,17 +133,14 @@ class Level:
         return ((self.pin < 1.0 - PIN_MARGIN) & (self.vertex_area > 0)).unsqueeze(1)
 
     @cached_property
-    def lengths(self) -> EdgeLengths:
+    def lengths(self) -> ElementValues:
         """Gives the edges' lengths at positions [m]."""
-        return EdgeLengths(self.edges, self.rest, threads=self.threads)
-
-    def normals(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
-        """The triangles' normals at x [m], twice their areas long [m^2]."""
-        return self._normals(x)
+        return ElementValues(LENGTHS, self.edges, self.rest, shape=(), threads=self.threads)
 
     @cached_property
-    def _normals(self) -> TriangleNormals:
-        return TriangleNormals(self.triangles, self.rest, threads=self.threads)
+    def normals(self) -> ElementValues:
+        """Gives the triangles' normals at positions [m], twice their areas long [m^2]."""
+        return ElementValues(NORMALS, self.triangles, self.rest, shape=(3,), threads=self.threads)
 
     @cached_property
     def base(self) -> Stencil:

@@ -39,55 +39,43 @@ def _normals(
     normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)
 
 
-_LENGTHS, _NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
+LENGTHS, NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
+"""Of edges [m], and of triangles, twice their areas long [m^2]: kernels for `ElementValues`."""
 
 
-class EdgeLengths:
-    """The lengths of some edges, wherever their vertices are."""
+class ElementValues:
+    """A value of some elements, wherever their vertices are."""
 
-    def __init__(self, edges: Int[Tensor, "edges 2"], like: Float[Tensor, "vertices 3"], *, threads: int = 1) -> None:
+    def __init__(
+        self,
+        kernels: Mapping[torch.dtype, wp.Kernel],
+        elements: Int[Tensor, "elements corners"],
+        like: Float[Tensor, "vertices 3"],
+        *,
+        shape: tuple[int, ...],
+        threads: int = 1,
+    ) -> None:
         """Prepare the launch.
 
         Args:
-            edges: End vertices, int32.
+            kernels: For each scalar type a kernel of (first, elements, x, values).
+            elements: Corner vertices, int32.
             like: Any positions, for their type and device.
+            shape: Of an element's value.
             threads: Most threads on the CPU.
         """
-        self._launch = _Measure(_LENGTHS, edges, like, corners=wp.vec2i, threads=threads)
-
-    def __call__(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " edges"]:
-        """The lengths at x [m]."""
-        return self._launch(x, x.new_empty(self._launch.count))
-
-
-class TriangleNormals:
-    """The normals of some triangles, twice their areas long, wherever their vertices are."""
-
-    def __init__(
-        self, triangles: Int[Tensor, "triangles 3"], like: Float[Tensor, "vertices 3"], *, threads: int = 1
-    ) -> None:
-        """Prepare the launch; arguments are those of `EdgeLengths`, with corners for ends."""
-        self._launch = _Measure(_NORMALS, triangles, like, corners=wp.vec3i, threads=threads)
-
-    def __call__(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
-        """The normals at x [m^2]."""
-        return self._launch(x, x.new_empty(self._launch.count, 3))
-
-
-class _Measure:
-    """One kernel over elements, launched anew for other positions and another result."""
-
-    def __init__(
-        self, kernels: Mapping[torch.dtype, wp.Kernel], elements: Tensor, like: Tensor, *, corners: type, threads: int
-    ) -> None:
         start_warp()  # Views of tensors do not start Warp by themselves.
-        self.count, self._elements, self._launch = len(elements), elements.contiguous(), None
+        self._shape, self._elements = (len(elements), *shape), elements.contiguous()
+        self._launch = None
         if len(elements):  # Empty tensors keep strides that Warp refuses.
-            out = like.new_empty(len(elements), *([3] if kernels is _NORMALS else []))
-            inputs = [wp.from_torch(self._elements, dtype=corners), vectors(like), _packed(out)]
+            corners = wp.types.vector(length=elements.shape[1], dtype=wp.int32)
+            packed = wp.from_torch(self._elements, dtype=corners)
+            inputs = [packed, vectors(like), _packed(like.new_empty(self._shape))]
             self._launch = Launch(kernels[like.dtype], len(elements), inputs, device=str(like.device), threads=threads)
 
-    def __call__(self, x: Tensor, out: Tensor) -> Tensor:
+    def __call__(self, x: Float[Tensor, "vertices 3"]) -> Tensor:
+        """The values at positions x [m], shape (elements, *shape)."""
+        out = x.new_empty(self._shape)
         if self._launch is not None:
             self._launch({1: vectors(x.contiguous()), 2: _packed(out)})
         return out
