@@ -3,8 +3,8 @@
 The buckling wavelength is 2 pi sqrt(D / (Y strain)), with the compression of the cage's edges, 90th percentile over
 a few frames. It is the shortest wave in which the cloth can fold; settled folds are longer (`benchmarks.levels`).
 A level resolves it when its mean edge is under a fifth of it, and carries nothing of it when two edges are longer. That
-is for the choice beforehand. Afterwards the folds tell: on too coarse a mesh wrinkles of its own size appear, and edges
-fold sharply (S39).
+is for the choice beforehand. Afterwards the folds show it: on too coarse a mesh wrinkles of its own size appear, and edges
+fold sharply.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class LevelChoice:
 
     @property
     def advice(self) -> str:
-        """As `finer` says it."""
+        """The remedy, in words."""
         return finer(self.level, self.needed, self.edge)
 
 
@@ -72,7 +72,7 @@ def finer(level: int, needed: int, edge: float) -> str:
 
     Args:
         level: The garment's number of subdivisions.
-        needed: The least level that resolves its shortest waves; at most ``level`` where folds alone tell.
+        needed: The least level that resolves its shortest waves; at most ``level`` where folds alone show it.
         edge: Mean rest edge at its level [m].
 
     Returns:
@@ -157,7 +157,7 @@ def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame])
 
 
 def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
-    """Share of the hinges that fold by more than 45 degrees; every fourth hinge is looked at."""
+    """Share of the hinges that fold by more than 45 degrees; every fourth hinge is measured."""
     hinges = level.hinges[::4].cpu().numpy()
     if not len(hinges):
         return 0.0

@@ -1,6 +1,6 @@
 """The nouns of the solver: what a shot is and what one time code gives.
 
-Everything here is SI, in world space, and knows no USD. Only ``usd/`` converts.
+Everything here is SI, in world space, without USD. Only ``usd/`` converts.
 """
 
 from __future__ import annotations

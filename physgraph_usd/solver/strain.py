@@ -1,7 +1,7 @@
 """Which parts of a garment the animation holds at another size than the rest shape's.
 
 Where the rest shape is not the cloth's, refined cloth goes back to its size: a puffed sleeve deflates. Cloth that is
-pushed together in most frames is reported only, since folding it is what refining is for; a warning tells of the other.
+pushed together in most frames is reported only, since folding it is what refining is for; the opposite gets a warning.
 """
 
 from __future__ import annotations

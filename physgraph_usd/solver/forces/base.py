@@ -45,7 +45,7 @@ class _Last:
     """The last answer of terms that do not change, on the CPU: on CUDA recorded steps write into tensors unseen."""
 
     def __init__(self) -> None:
-        """Nothing was asked yet."""
+        """Start without an answer."""
         self._asked: tuple[Tensor, int] | None = None
         self._answer: tuple[Tensor, Tensor] | None = None
 
@@ -73,7 +73,7 @@ class ForceModule:
 
         Args:
             forces: The terms.
-            remembers: Whether what they answered last serves again at the same positions: for terms that do not change.
+            remembers: Whether their last answer is reused at the same positions: for terms that do not change.
         """
         self.forces = tuple(forces)
         self._lasting, self._last = self.forces, _Last() if remembers else None

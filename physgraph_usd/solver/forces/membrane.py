@@ -13,7 +13,7 @@
 | A_t | ``level.triangle_area`` | rest area [m^2] |
 
 With G = 0.375 Y the sheet is isotropic and equals the edge springs of an equilateral mesh for small strains. Otherwise
-the material's axes matter: `triangle_shape` says how a triangle gets them. Painted stretch scales multiply all three
+the material's axes matter: `triangle_shape` defines them for a triangle. Painted stretch scales multiply all three
 constants. The paper has no membrane: with potential="paper" each triangle is weighted by 2 A_t / A, which is what the
 paper's springs are to the continuum's on an equilateral mesh.
 

@@ -19,7 +19,7 @@ Solver = Callable[[Tensor], Tensor]
 
 @runtime_checkable
 class ForceField(Protocol):
-    """The only face of the physics that an integrator meets."""
+    """The only part of the physics that an integrator sees."""
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N] at positions x [m]."""
@@ -64,8 +64,8 @@ class System:
         free: False where a vertex may not move, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
         level: The level's mesh; None for a system that has none.
-        lasting: Whether it is met again, in the next frame or for another descent.
-        expected: Most steps that are to be made; recording them pays where they are many, or where it is met again.
+        lasting: Whether it is used again, in the next frame or for another descent.
+        expected: Most steps that are to be made; recording them pays where they are many, or where the system is used again.
         field: The forces.
         metric: H0.
         evaluations: Number of force evaluations so far.
@@ -129,7 +129,7 @@ class System:
 
     @cached_property
     def _smooth(self) -> Callable[[Tensor], Tensor] | None:
-        """The smooth part of a metric that has two; asked once, for asking a protocol reads all of its properties."""
+        """The smooth part of a metric that has two; found once, since testing for a protocol reads all properties."""
         return self.metric.smooth if isinstance(self.metric, Layered) else None
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
@@ -203,7 +203,7 @@ class Integrator(Protocol):
 
 @runtime_checkable
 class Resumable(Protocol):
-    """An integrator that can go on where it was when the forces change a little."""
+    """An integrator that can continue when the forces change a little."""
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions under the system's forces, keeping what was learned of their curvature."""

@@ -83,7 +83,7 @@ class Batch:
         flat[self.target] = values[self.source]
         first = torch.arange(count, device=values.device).mul_(side * side)[:, None, None]
         for child in self.received:
-            # A place that two children add to is met once in each turn.
+            # Each child adds in a turn of its own, so no place is added to twice in a call.
             where = first + child.places[:, :, None] * side + child.places[:, None, :]
             flat[where] += updates[joined(child.rows, child.columns, updates)]
         return flat.reshape(count, side, side)[:, :-1, :-1]

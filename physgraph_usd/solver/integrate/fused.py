@@ -147,9 +147,9 @@ def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], families: Fami
 
     Args:
         parts: Row of each vector, and whether it is the normal part of that.
-        pairs: The vectors whose products are shown.
+        pairs: The vectors whose products are features.
         smoothed: Rows whose means over the neighbours are the last rows.
-        families: Family of each vector, over whose mean square its products are shown, and whether it counts in that.
+        families: Family of each vector, over whose mean square its products are taken, and whether it counts in that.
     """
     # Warp's hash of a kernel does not see all values that functions of any type are made with; the name carries them.
     made = hashlib.sha256(repr((parts, pairs, smoothed, families)).encode()).hexdigest()[:16]

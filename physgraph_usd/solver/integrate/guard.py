@@ -19,14 +19,13 @@ PATIENCE = 4
 class Guard:
     """Wraps any integrator; with it no descent ends above its start, whatever the integrator proposes.
 
-    That is the upsampled cage in a cold frame, and in a warm one the last frame's detail: a frame that ends above its
-    upsampled cage is warned of (`settled.told_energy`).
+    The start is the upsampled cage in a cold frame, and the last frame's detail in a warm one.
 
     A step that raises the energy is truncated where it turns triangles (`truncation`), then halved, quartered, and
     replaced by a step along H0^-1 F with a line search.
-    From a shortened step the integrator goes on with what it has learned, if it can follow another's step. From one
-    that was replaced it starts anew: what it had learned misled it. After `PATIENCE` corrections in a row the spare
-    integrator, where there is one, makes the level's other steps. ``Carry.mover`` says who moved.
+    From a shortened step the integrator continues with its memory, if it can take over another's step. From one that
+    was replaced it starts anew: its memory misled it. After `PATIENCE` corrections in a row the spare
+    integrator, where there is one, makes the level's other steps. ``Carry.mover`` names the mover.
     """
 
     def __init__(self, inner: Integrator, *, spare: Integrator | None = None) -> None:

@@ -44,7 +44,7 @@ LONGEST = 5.0
 RECORDINGS = 6
 """Recordings kept: of the levels of a garment, or of two."""
 WORTH = 6
-"""Steps from which those of a system that is met only once are recorded: recording costs as much as four."""
+"""Steps from which those of a system that is used only once are recorded: recording costs as much as four."""
 
 
 class LearnedMetric:
@@ -133,7 +133,7 @@ class LearnedMetric:
         return dot if waits else partial(garment_dot, system.level)
 
     def records(self, system: System) -> bool:
-        """Whether a system's steps are recorded: on CUDA, once trained, where it is met again or takes many."""
+        """Whether a system's steps are recorded: on CUDA, once trained, where it is used again or takes many."""
         few = system.level is None or len(system.level.spans) <= MOST_GARMENTS
         pays = system.lasting or system.expected >= WORTH
         return self._record and pays and system.spacing.is_cuda and few
@@ -141,7 +141,7 @@ class LearnedMetric:
     def _recording(self, system: System) -> Recording:
         """The recording of a system's steps.
 
-        Those of the last few systems that are met again are kept, and the last of another.
+        Those of the last few lasting systems are kept, and the last of another.
         """
         recording = self._recordings.pop(system, None)
         if recording is None:

@@ -168,7 +168,7 @@ class MergedMetric(Metric):
         return add_at(out, self._representative[each], values[each])
 
     def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
-        """Factorise with a diagonal [N/m], of which each vertex shows its part."""
+        """Factorise with a diagonal [N/m], of which each vertex has its part."""
         super()._hold(stiffness)
         self.diagonal = self.diagonal[self._representative] / self._members
 

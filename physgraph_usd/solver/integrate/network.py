@@ -1,7 +1,7 @@
-"""The network of the learned integrator `physgraph`; it sees numbers without units and knows no force.
+"""The network of the learned integrator `physgraph`; its inputs are numbers without units, of no force by name.
 
-It looks at a few vectors per vertex and answers with the coefficients of their combination. It is shown only what a
-rotation does not change: scalar products over the mean square, and the logarithm of that. So the displacement turns
+It gives the coefficients by which a few vectors per vertex are combined. Its features are only what a rotation does not
+change: scalar products over the mean square, and the logarithm of that. So the displacement turns
 with the cloth exactly, whatever the weights; and each vertex sees its own surroundings alone, so that a patch moves as
 it would in any garment.
 """

@@ -47,7 +47,7 @@ class PaperConfig:
     Attributes:
         latent: Numbers per vertex and edge inside.
         rounds: Rounds of message passing.
-        history: Displacements and forces shown (H).
+        history: Past displacements and forces among the features (H).
         shared: All rounds have the same weights.
         features: "scaled" without units or "paper", metres and newtons as they are.
     """

@@ -61,7 +61,7 @@ class QuasiNewton:
         """One secant step with a backtracking line search; the energy never rises by more than rounding.
 
         A step that had to be shortened much drops the secants: they misled it, and its own is mostly rounding. Where
-        the next one has to be, too, the metric misled both, and the one after knows the present state's stiffness.
+        the next one has to be, too, the metric misled both, and the one after uses the present state's stiffness.
         """
         memory = self._softened(system, carry) if carry.memory.stiff >= self._history else carry.memory
         direction = secant_direction(carry.force, memory.image, memory.secants)
@@ -98,7 +98,7 @@ class QuasiNewton:
         return Carry(x, energy, force, memory.image if self._use_metric else None, self.name, memory)
 
     def _present(self, system: System, x: Tensor) -> Solver:
-        """A guess of the inverse Hessian that knows how stiff the present state is."""
+        """A guess of the inverse Hessian by the present state's stiffness."""
         stiffness = system.diagonal(x)
         return system.metric.stiffened(stiffness) if self._use_metric else (1.0 / stiffness.unsqueeze(1)).mul
 
@@ -145,7 +145,7 @@ def backtrack(
 
     Everywhere by quadratic interpolation.
 
-    Near rest what it falls by is lost in its rounding, but not in the force's: there, by the force, a step also serves
+    Near rest what it falls by is lost in its rounding, but not in the force's: there, by the force, a step is also accepted
     that does not go past the least energy by farther than it started before it (Hager and Zhang 2005, the approximate
     Wolfe rule).
 
@@ -154,7 +154,7 @@ def backtrack(
         carry: Where the step starts.
         direction: Displacement of the full step [m].
         slope: force . direction [J].
-        by_force: Whether that rule serves too; the energy may then rise by its rounding.
+        by_force: Whether that rule is used too; the energy may then rise by its rounding.
 
     Returns:
         Positions, energy and force after the step, or None when no step lowers the energy.

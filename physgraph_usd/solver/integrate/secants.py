@@ -7,7 +7,7 @@
 | rho_i | 1 / ``curvature`` | 1 / s_i.y_i |
 | gamma | s.y / y.z of the newest secant | scales H0^-1 to the curvature last seen |
 
-Scalar products are numbers for cloth that is one problem, or tensors: one for each garment, shown at its vertices, so
+Scalar products are numbers for cloth that is one problem, or tensors: one for each garment, at its vertices, so
 that garments do not mix, nobody waits for a number and gradients flow through.
 """
 
@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 Dot = Callable[[Tensor, Tensor], Any]
-"""The scalar product of two fields: a float, or a tensor of one number a garment, shown at each of its vertices."""
+"""The scalar product of two fields: a float, or a tensor of one number a garment, at each of its vertices."""
 
 
 def dot(a: Tensor, b: Tensor) -> float:

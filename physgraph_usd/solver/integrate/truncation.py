@@ -3,7 +3,7 @@
 The angle between two triangles changes with a move over the height of either. Where an animation squeezes a triangle to
 a thousandth of its area, a move of a thousandth of an edge turns it over, which costs energy, and a handful of such
 triangles would shorten every step of a whole garment to nothing. So a step that fails is cut back at their corners
-first, and nowhere else. That knows no force by name and serves every integrator.
+first, and nowhere else. That depends on no particular force and works for every integrator.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def truncated(
 ) -> Float[Tensor, "vertices 3"] | None:
     """A move [m] cut back at the corners of triangles that it would turn by more than `TURN`; None without any.
 
-    The corners of such triangles are halved until none is left. What is cut turns others, so they are looked at anew.
+    The corners of such triangles are halved until none is left. What is cut turns others, so all are examined again.
 
     Args:
         system: The level.

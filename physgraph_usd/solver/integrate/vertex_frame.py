@@ -32,10 +32,10 @@ PARTS = ("normal", "smooth")
 
 
 class VertexFrame:
-    """The surroundings of every vertex at positions x; each part is found when it is asked for first."""
+    """The surroundings of every vertex at positions x; each part is found when it is first used."""
 
     def __init__(self, level: Level, x: Float[Tensor, "vertices 3"]) -> None:
-        """Look from positions x [m]; no gradients flow through what is seen."""
+        """Take positions x [m]; no gradients flow through the normals."""
         self._x = x.detach()
         if level not in _TABLES:
             _TABLES[level] = _Tables(level)

@@ -31,7 +31,7 @@ def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int3
 def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
     """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces.
 
-    An end at a corner does not: cloth that is sewn together there meets, and rounding says on which side.
+    An end at a corner does not: sewn cloth touches there, and rounding would decide the side.
     """
     for i in range(3):
         if x[e[0]] == x[t[i]] or x[e[1]] == x[t[i]]:

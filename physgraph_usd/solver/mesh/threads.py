@@ -24,7 +24,7 @@ _STDERR = 2
 LEAST_PER_THREAD = 4000
 """Items below which another thread costs more than it saves."""
 LEAST_QUERIES = 250
-"""Such items where each asks a hierarchy or stands for many elements."""
+"""Such items where each queries a hierarchy or stands for many elements."""
 SLICES, LEAST_SLICE = 8, 32
 """Slices a thread there, and what they have at least on average: some items cost a hundred times as much as others, so
 whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
