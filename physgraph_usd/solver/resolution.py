@@ -3,8 +3,8 @@
 The buckling wavelength is 2 pi sqrt(D / (Y strain)), with the compression of the cage's edges, 90th percentile over
 a few frames. It is the shortest wave in which the cloth can fold; settled folds are longer (`benchmarks.levels`).
 A level resolves it when its mean edge is under a fifth of it, and carries nothing of it when two edges are longer. That
-is for the choice beforehand. Afterwards the folds show it: on too coarse a mesh wrinkles of its own size appear, and edges
-fold sharply.
+is for the choice beforehand. Afterwards the folds show it: on too coarse a mesh wrinkles of its own size appear, and
+edges fold sharply.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class System:
         spacing: Mean rest edge length at each vertex [m], shape (V,).
         level: The level's mesh; None for a system that has none.
         lasting: Whether it is used again, in the next frame or for another descent.
-        expected: Most steps that are to be made; recording them pays where they are many, or where the system is used again.
+        expected: Most steps that are to be made; recording pays where they are many or the system is lasting.
         field: The forces.
         metric: H0.
         evaluations: Number of force evaluations so far.

@@ -1,9 +1,9 @@
 """The network of the learned integrator `physgraph`; its inputs are numbers without units, of no force by name.
 
 It gives the coefficients by which a few vectors per vertex are combined. Its features are only what a rotation does not
-change: scalar products over the mean square, and the logarithm of that. So the displacement turns
-with the cloth exactly, whatever the weights; and each vertex sees its own surroundings alone, so that a patch moves as
-it would in any garment.
+change: scalar products over the mean square, and the logarithm of that. So the displacement turns with the cloth
+exactly, whatever the weights; and each vertex sees its own surroundings alone, so that a patch moves as it would in any
+garment.
 """
 
 from __future__ import annotations

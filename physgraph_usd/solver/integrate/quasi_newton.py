@@ -145,7 +145,7 @@ def backtrack(
 
     Everywhere by quadratic interpolation.
 
-    Near rest what it falls by is lost in its rounding, but not in the force's: there, by the force, a step is also accepted
+    Near rest the fall is lost in the energy's rounding, but not in the force's: there, by the force, a step is accepted
     that does not go past the least energy by farther than it started before it (Hager and Zhang 2005, the approximate
     Wolfe rule).
 
