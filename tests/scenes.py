@@ -92,11 +92,11 @@ def on_ball() -> Shot:
     return shot([named(cloth)], [[cloth[1] + [0.0, 0.149, 0.0]]] * 3, bodies)
 
 
-def sleeve(around: int = 12, rows: int = 8) -> Cloth:
+def sleeve(around: int = 12, rows: int = 8, *, edge: float = 0.03) -> Cloth:
     """An open tube of cloth about z, 12 cm wide."""
     angle = 2 * np.pi * np.arange(around) / around
     ring = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    points = np.concatenate([ring + np.array([0.0, 0.0, 0.03 * (row - 0.5 * rows)]) for row in range(rows + 1)])
+    points = np.concatenate([ring + np.array([0.0, 0.0, edge * (row - 0.5 * rows)]) for row in range(rows + 1)])
     faces = []
     for row in range(rows):
         for column in range(around):

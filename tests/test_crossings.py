@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
-from brute import Soup, on_triangles
+from brute import Soup
 from brute import crossings as every
 from cloth import base_of
 from folds import EDGE, SHAPES, Cloth, crumpled, curved, flat, folded, levels_of, named, placed, square, strip
@@ -261,20 +260,6 @@ class TestWhatCounts:
 
 class TestUpsampledOnTriangles:
     """A level's vertices on the triangles of the level below: what does not cross there does not cross here."""
-
-    @pytest.mark.parametrize("kind", ["quads", "mixed", "triangles"])
-    @pytest.mark.parametrize("seed", range(4))
-    def test_they_lie_on_them(self, kind: str, seed: int):
-        levels = levels_of(named(square(4, kind=kind)), level=2, dtype=torch.float64)
-        x = torch.as_tensor(crumpled(levels[0].rest.numpy(), seed, size=0.7))
-        for below, level in pairwise(levels):
-            assert level.flat_from_below is not None
-            above = level.flat_from_below.apply(x)
-            a, b, c = x.numpy()[below.triangles.long().numpy()].transpose(1, 0, 2)
-            for point in above.numpy():
-                foot = on_triangles(np.broadcast_to(point, a.shape), a, b, c)
-                assert np.linalg.norm(foot - point, axis=1).min() < 1e-7
-            x = above
 
     @pytest.mark.parametrize("kind", ["quads", "mixed"])
     def test_quads_are_not_upsampled_by_their_means(self, kind: str):

@@ -14,12 +14,13 @@ from bodies import ball, box, flipped, tube
 from cloth import DOWN, Answer, base_of
 from folds import EDGE, Cloth, curved, frame_with, named, refiner_with, square
 from report_solver import Result, under
+from scenes import shot_of
 from test_contact import MESH as WIDE
 from test_contact import REST as WIDE_REST
 from test_contact import draped, up
 from test_contact_bodies import KINDS, STILL, jaws, pane
 from test_contact_cloth import THICK, WEIGHTLESS, counted, crossed, seam_gap, told, tube_of_cloth
-from test_contact_moving import STEP, needles, pulled, ring
+from test_contact_moving import STEP, needles
 
 from physgraph_usd.solver.colliders.pose import MeshPose
 
@@ -180,8 +181,8 @@ def s26_stacked(method: str) -> Result:
 
 
 def s27_scenes(method: str) -> Result:
-    """New crossings and vertices inside over six frames through a torus and two over needles."""
-    frames = [[frame_with([pulled(0.03 * t)], ring(), time=float(t)) for t in range(6)]]
+    """New crossings and vertices inside over three frames through a torus and two over needles."""
+    frames = [list(shot_of("torus").frames)]
     heights = ((0.0, 0.0005), (1.0, -0.004))
     frames.append([frame_with([REST + np.array([0.0, h, 0.0])], needles(), time=t) for t, h in heights])
     worse = 0

@@ -10,6 +10,7 @@ from bodies import ball
 from brute import between
 from cloth import Answer, base_of, refiner_of
 from folds import EDGE, Cloth, frame_with, named, refiner_with, square
+from scenes import sleeve
 from sheets import garment_of
 from test_tangles import cornered, dented
 
@@ -97,17 +98,8 @@ class TestCrossed:
 
 def tube_of_cloth() -> Cloth:
     """An open upright tube, as a sleeve."""
-    around, rows = 8, 6
-    angle = 2 * np.pi * np.arange(around) / around
-    ring = np.stack([0.06 * np.cos(angle) + 0.002, 0 * angle, 0.06 * np.sin(angle) + 0.003], axis=1)
-    points = np.concatenate([ring + np.array([0.0, EDGE * (row - 2.37), 0.0]) for row in range(rows)])
-    faces = []
-    for r in range(rows - 1):
-        for c in range(around):
-            a, b = r * around + c, r * around + (c + 1) % around
-            faces += [[a, b, b + around], [a, b + around, a + around]]
-    triangles = np.array(faces)
-    return PolygonMesh(np.full(len(triangles), 3), triangles.ravel(), len(points)), points
+    mesh, points = sleeve(8, 5, edge=EDGE)
+    return mesh, points[:, [1, 2, 0]] + np.array([0.002, 0.13 * EDGE, 0.003])
 
 
 class TestContours:

@@ -32,23 +32,6 @@ def no_new(answer: Answer) -> None:
     assert np.isfinite(answer.points[0]).all()
 
 
-def pulled(depth: float, *, hole: float = 0.09) -> np.ndarray:
-    """A sheet whose middle is drawn down through a ring: a rounded funnel, the rest drawn inwards over the tube."""
-    radius = np.linalg.norm(REST[:, [0, 2]], axis=1)
-    drawn = np.maximum(radius - depth * np.clip(1.2 - radius / 0.3, 0.0, 1.0), 0.25 * radius)
-    scale = drawn / np.maximum(radius, 1e-9)
-    steep = 1.0 / (1.0 + (drawn / (0.5 * hole)) ** 4)
-    out = REST * np.array([1.0, 0.0, 1.0]) * scale[:, None]
-    out[:, 1] = 0.055 - (depth + 0.05) * steep * min(1.0, 20 * depth)
-    return out
-
-
-def ring() -> Soup:
-    """A torus lying level."""
-    made = trimesh.creation.torus(major_radius=0.14, minor_radius=0.045, major_sections=48, minor_sections=24)
-    return np.asarray(made.vertices)[:, [0, 2, 1]], np.asarray(made.faces, np.int32)[:, ::-1]
-
-
 def needles() -> Soup:
     """Nine thin cones, tips up."""
     made = []
@@ -64,12 +47,7 @@ def needles() -> Soup:
 
 
 class TestPulled:
-    """S27, after the scenes of C-IPC."""
-
-    def test_s27_pulled_through_a_torus(self):
-        one = refiner_with([named(SHEET)], ["mesh"], times=tuple(range(6)))
-        for time in range(6):
-            no_new(one.solve(frame_with([pulled(0.03 * time)], ring(), time=float(time))))
+    """S27, after the scenes of C-IPC; through a torus: tests/test_frame.py."""
 
     def test_s27_over_a_sphere_that_turns(self):
         """The sheet lies on it; its middle is dragged round, the rim lags behind."""
