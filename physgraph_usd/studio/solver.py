@@ -33,12 +33,7 @@ class FrameSolver:
     """
 
     def __init__(self, shot: Shot, levels: Sequence[int], *, contact: bool) -> None:
-        """Subdivide the garments.
-
-        Args:
-            shot: The shot.
-            levels: Subdivisions of each garment.
-            contact: Whether cloth feels bodies and cloth.
+        """Subdivide each garment so often; ``contact`` lets cloth feel bodies and cloth.
 
         Raises:
             GarmentError: A rest shape cannot be solved on.
@@ -59,10 +54,6 @@ class FrameSolver:
     def solve_soon(self, shot: Shot, time: float | None) -> State:
         """Solve from where the cloth was, in this frame or the one before; else as `solve_as_refine` does.
 
-        Args:
-            shot: The shot, read with the values that are tried.
-            time: Time code.
-
         Raises:
             SolveError: A term of the potential is not finite.
             StageError: The frame cannot be read.
@@ -81,7 +72,7 @@ class FrameSolver:
         """Solve as a run of ``refine`` does that begins here, or where the run that has come to the frame before began.
 
         Args:
-            shot: The shot, read with the values that are tried.
+            shot: The shot, read with the values that are tried, here as in `solve_soon`.
             time: Time code.
             cancelled: Asked before each step: whether nobody waits for the result any more. It is no solution then,
                 and the next quick solve starts from where the cloth was before.

@@ -208,9 +208,7 @@ class Chart:
 def quickest(points: Sequence[tuple[float, float]], gap: float) -> float | None:
     """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there.
 
-    Args:
-        points: Milliseconds and gap of its budgets, the smallest first.
-        gap: The gap to come to.
+    Its points are milliseconds and gap of each budget, the smallest first.
     """
     best: list[tuple[float, float]] = []
     for point in points:

@@ -89,14 +89,11 @@ def rings(across: np.ndarray, height: np.ndarray, deep: np.ndarray, around: int)
 
 
 def lathe(rings: np.ndarray, ends: np.ndarray) -> Solid:
-    """Rings closed by a fan at each end.
+    """Rings closed by a fan at each end; the solid's points are the rings, then the two tips.
 
     Args:
         rings: Rings [m], shape (R, A, 3); seen from the first ring's end they run clockwise.
         ends: Tips of the fans beyond the first and the last ring [m], shape (2, 3).
-
-    Returns:
-        The solid; its points are the rings, then the two tips.
     """
     count, around = rings.shape[:2]
     here = np.arange(around)
@@ -132,13 +129,7 @@ def box(half: np.ndarray) -> Solid:
 
 
 def torus(major: float, minor: float, cells: tuple[int, int]) -> Solid:
-    """A torus of quads about the Y axis.
-
-    Args:
-        major: Radius of the circle in the middle of the tube [m].
-        minor: Radius of the tube [m].
-        cells: Quads around the axis and around the tube.
-    """
+    """A torus of quads about the Y axis: radii of the tube's middle and of the tube [m], quads around either."""
     a, b = np.meshgrid(*(2 * np.pi * np.arange(count) / count for count in cells), indexing="ij")
     radius = major + minor * np.cos(b)
     points = np.stack([radius * np.cos(a), minor * np.sin(b), radius * np.sin(a)], axis=-1).reshape(-1, 3)
@@ -149,12 +140,9 @@ def torus(major: float, minor: float, cells: tuple[int, int]) -> Solid:
 
 
 def ellipsoid(axes: np.ndarray, middle: np.ndarray, cells: tuple[int, int]) -> Solid:
-    """An ellipsoid of quads, with a fan at its top and at its bottom.
+    """An ellipsoid of quads with a fan at its top and at its bottom.
 
-    Args:
-        axes: Half axes [m], shape (3,).
-        middle: Its centre [m], shape (3,).
-        cells: Faces around and from top to bottom.
+    Half axes and centre [m] have shape (3,); ``cells`` are the faces around and from top to bottom.
     """
     down = np.pi * np.arange(1, cells[1]) / cells[1]
     ball = rings(np.sin(down), np.cos(down), np.sin(down), cells[0])

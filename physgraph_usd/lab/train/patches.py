@@ -180,13 +180,7 @@ class Patch:
 
 
 def make_patches(config: PatchConfig, *, seed: int, workers: int = 1) -> list[Patch]:
-    """Make patches; those whose pose is all but at rest are made again.
-
-    Args:
-        config: How they are made.
-        seed: One seed makes the same patches, however many workers there are.
-        workers: Processes that share the work.
-    """
+    """Make patches, the same for a seed with any number of processes; those whose pose is near rest are made again."""
     jobs = [(config, seed, number) for number in range(config.count)]
     if workers <= 1 or len(jobs) < 2 * workers:
         return [_numbered(*job) for job in jobs]
@@ -196,12 +190,9 @@ def make_patches(config: PatchConfig, *, seed: int, workers: int = 1) -> list[Pa
 
 
 def measure(patch: Patch, steps: int, *, presolve: int) -> None:
-    """Find the energies between which a patch's levels move, by nested quasi-Newton.
+    """Find the energies between which a patch's levels move, by nested quasi-Newton of so many steps a level.
 
-    Args:
-        patch: The patch.
-        steps: Steps a level behind the least energy known.
-        presolve: Steps a level of a second, shorter solve whose positions are kept.
+    The positions of a second, shorter solve of ``presolve`` steps a level are starts for training.
     """
     patch.raw, patch.start, patch.least, patch.solved = [], [], [], []
     coarse = patch.group.systems([patch.frame])[1]
