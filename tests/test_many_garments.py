@@ -120,6 +120,10 @@ class TestWarnings:
             "stage: odd": [],
         }
 
+    def test_those_that_name_other_numbers_of_frames_are_of_a_kind(self):
+        more = ["", "; also at time code 2", "; also at time codes 2 and 3", "; also in 9 other frames"]
+        assert len(of_a_kind(f"</g{index}> at time code 1: moves{also}" for index, also in enumerate(more))) == 1
+
     def test_of_a_few_prims_stay_as_they_are(self):
         given = [f"</g{index}>: is still" for index in range(3)]
         assert of_a_kind([*given, *given]) == {each: [] for each in given}

@@ -25,7 +25,8 @@ LOG = logging.getLogger("physgraph_usd")
 """Where warnings and progress go, for the whole package."""
 MOST_ALONE = 3
 """Prims that each get a warning of a kind; more of them get one together."""
-_OF_PRIM, _DIFFERS = re.compile(r"<([^>]+)>(?=[: ])"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
+_OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
+_DIFFERS = re.compile(r"<[^>]*>|; also (?:at|in) .*$|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
 _GARMENT: dict[str, Any] = dict.fromkeys(
     (
