@@ -26,7 +26,7 @@ LOG = logging.getLogger("physgraph_usd")
 MOST_ALONE = 3
 """Prims that each get a warning of a kind; more of them get one together."""
 _OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
-_DIFFERS = re.compile(r"<[^>]*>|; also (?:at|in) .*$|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
+_ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
 _GARMENT: dict[str, Any] = dict.fromkeys(
     (
@@ -179,7 +179,7 @@ def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
     kinds: dict[str, list[str]] = {}
     for warning in dict.fromkeys(warnings):
         about = _OF_PRIM.match(warning)
-        kinds.setdefault(_DIFFERS.sub("#", warning) if about else warning, []).append(warning)
+        kinds.setdefault(_DIFFERS.sub("#", _ALSO.sub("", warning)) if about else warning, []).append(warning)
     found: dict[str, list[str]] = {}
     for alike in kinds.values():
         paths = list(dict.fromkeys(match[1] for match in map(_OF_PRIM.match, alike) if match))
