@@ -4,7 +4,8 @@
 
 Refines some frames of a sample at level 2 and writes NAME.mp4, a loop, and NAME.jpg, one of its frames. Prints how
 many frames did not settle, the median time a frame, and the edges through faces of cloth and of bodies in all frames of
-both sides, counted by `benchmarks.crossing_count`. Takes the program ffmpeg with libx264.
+both sides, counted by `benchmarks.crossing_count`. Takes the program ffmpeg with libx264. The dancer is also written as
+an animated picture, for README.md.
 """
 
 from __future__ import annotations
@@ -68,6 +69,9 @@ SHOWN = {
 }
 """The films by sample."""
 
+README = "dancer"
+"""The film that README.md shows: pages of repositories play animated pictures, no films."""
+
 Side = list[DrawnMesh]
 
 
@@ -97,6 +101,10 @@ def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
     drawn = {time: Image.fromarray(pixels) for time, pixels in pictures(sides, shown)}
     drawn[shown.still].save(out.with_suffix(".jpg"), quality=85)
     encode(list(drawn.values()), out, rate=shown.rate)
+    if name == README:
+        first, *others = drawn.values()
+        moving = {"save_all": True, "append_images": others, "duration": 1000 // shown.rate, "loop": 0}
+        first.save(out.with_suffix(".webp"), quality=55, method=3, **moving)
 
 
 def smooth(name: str, fine: DrawnStage, times: Sequence[float]) -> Iterator[Side]:

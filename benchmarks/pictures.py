@@ -1,4 +1,4 @@
-"""The pictures of README and docs: each sample coarse and refined.
+"""The pictures of samples in docs: coarse and refined.
 
 python -m benchmarks.pictures docs/pictures
 """
@@ -15,7 +15,7 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.preview import preview
 from physgraph_usd.shot.refine import refine_shot
 
-SHOWN = {"sleeve": 24.0, "skirt": 24.0, "flag": 24.0, "tshirt": 36.0}
+SHOWN = {"tshirt": 36.0}
 """Time code to draw, by sample."""
 
 

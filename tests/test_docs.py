@@ -90,7 +90,7 @@ def test_code_runs_or_says_why_not(page: Path, folder: Path):
 
 
 def test_the_blocks_are_found():
-    assert len(blocks(ROOT / "README.md")) == 4
+    assert len(blocks(ROOT / "README.md")) == 5
     assert len(blocks(ROOT / "docs" / "farm.md")) == 3
 
 
