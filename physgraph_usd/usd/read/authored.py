@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from pxr import Usd, UsdGeom
@@ -20,17 +20,20 @@ _BLENDERS = {name.replace("physgraph:", "physgraph_") for name in _NAMES if name
 """Blender's exporter writes no colons in the names of primvars."""
 
 
-def unread(prims: Iterable[Usd.Prim]) -> list[Notice]:
-    """Notices of properties on garments or colliders, above them or on their materials, that are not read.
+def authored_faults(garments: Sequence[Usd.Prim], colliders: Sequence[Usd.Prim]) -> list[Notice]:
+    """Notices of properties on prims, above them or on their materials, that are not read or are beyond limits.
 
-    Each has the name that is spelt most like it.
+    Those that are not read have the name that is spelt most like theirs.
     """
     notices: dict[Notice, None] = {}
-    for prim in prims:
+    for prim in (*garments, *colliders):
         for each in with_ancestors(prim):
             notices |= dict.fromkeys(_unread_on(each, material=False))
         for each in bound_materials(prim):
             notices |= dict.fromkeys(_unread_on(each, material=True))
+    for schema, prims in ((GARMENT_API, garments), (COLLIDER_API, colliders)):
+        for attribute, fault, _ in (each for prim in prims for each in beyond_limits(prim, schema)):
+            notices[Notice(str(attribute.GetPrim().GetPath()), None, f"{attribute.GetName()} {fault}")] = None
     return list(notices)
 
 
@@ -79,14 +82,6 @@ def beyond_limits(prim: Usd.Prim, schema: str = GARMENT_API) -> Iterator[tuple[U
             yield attribute, _fault_of(row, hard, "hard", (row.minimum, row.maximum)), True
         elif attribute is not None and soft is not None:
             yield attribute, _fault_of(row, soft, "soft", row.soft), False
-
-
-def beyond_limits_of_all(garments: list[Usd.Prim], colliders: list[Usd.Prim]) -> Iterator[tuple[str, str]]:
-    """Paths and faults of values beyond limits, of garments and colliders."""
-    for schema, prims in ((GARMENT_API, garments), (COLLIDER_API, colliders)):
-        for prim in prims:
-            for attribute, message, _ in beyond_limits(prim, schema):
-                yield str(attribute.GetPrim().GetPath()), f"{attribute.GetName()} {message}"
 
 
 def _source(prim: Usd.Prim, row: Property) -> Usd.Attribute | None:

@@ -19,7 +19,7 @@ from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
 from ..times import garment_times, merge, transform_times, within
 from .cage import PointReader, read_cage
-from .materials import Values, find_values, rest_angle_notices
+from .materials import Values, find_values
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
 from .rest import AUTO, Rest, checked, read_rest, rests_bent
 from .skinning import Bake
@@ -108,13 +108,15 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     points = PointReader(prim, times[0] if times else None)
     cage = read_cage(prim, points.count, times)
     edges = cage.mesh.half_edges.edges
-    notices = [*cage.notices, *rest_angle_notices(prim), *check_placement(prim, request.units.metres, times)]
+    placement = check_placement(prim, request.units.metres, times)
     matrix = to_metres(prim, request.units.metres, first)
     start = place(points.read(first, edges)[0], matrix)
     if request.rest_frame is None:
         rest = _rest_on_stage(prim, matrix, request, edges=edges, start=start, first=first)
     else:
-        rest = checked(prim, edges, _rest_asked(prim, points, request, mesh=cage.mesh, every=every), first=start)
+        rest = _rest_asked(prim, points, request, mesh=cage.mesh, every=every)
+    rest, (bent, odd) = checked(prim, edges, rest, first=start), rests_bent(prim)
+    notices = [*cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     self_contact, layer, level = _constants(prim, request)
     order = layer.at(None)
@@ -124,7 +126,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         rest=rest.points,
         level=round(level.at(None) or 0.0),
         flipped=is_flipped(prim, matrix),
-        bent_rest=rests_bent(prim),
+        bent_rest=bent,
         self_contact=bool(self_contact.at(None)),
         layer=None if order is None else round(order),
         **_painted(prim, points.count, notices, values=values),

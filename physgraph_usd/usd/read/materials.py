@@ -36,7 +36,6 @@ from ..lookup import (
     bound_materials,
     check_limits,
     find_value,
-    nearest,
     read_number,
     source_name,
 )
@@ -234,12 +233,3 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     message = f"{THICKNESSES} goes from {low:.3g} to {high:.3g} mm: stiffnesses derived from {YOUNGS} follow it,"
     notice = Notice(str(prim.GetPath()), None, f"{message} contact and mass take the mean")
     return found, values / mean, (notice,)
-
-
-def rest_angle_notices(prim: Usd.Prim) -> list[Notice]:
-    """A notice of an older word in ``physics:restBendAnglesDefault``."""
-    attribute = nearest(prim, "physics:restBendAnglesDefault")
-    value = str(attribute.Get()) if attribute is not None else ""
-    new = {"restShapeDefault": "restShape", "flatDefault": "flat"}.get(value)
-    message = f"physics:restBendAnglesDefault is {value!r}, the proposal's older name; author {new!r}"
-    return [Notice(str(attribute.GetPrim().GetPath()), None, message)] if attribute is not None and new else []

@@ -39,7 +39,7 @@ from ..stage import (
 )
 from ..times import merge, snap, within
 from ..view import StageView
-from .authored import beyond_limits_of_all, unread
+from .authored import authored_faults
 from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots, read_apart
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
@@ -212,8 +212,7 @@ def open_shot(
         found = find_colliders(stage, prims, colliders)
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
-        notices += unread([*prims, *found])
-        notices += [Notice(path, None, message) for path, message in dict.fromkeys(beyond_limits_of_all(prims, found))]
+        notices += authored_faults(prims, found)
         units, odd = read_units(stage)
         assumed = root_metadata(stage, "metersPerUnit") is None
         bake = Bake(stage)

@@ -50,7 +50,7 @@ def read_rest(
     place: Callable[[np.ndarray], np.ndarray],
     baked: Sdf.Layer,
 ) -> Rest:
-    """Find the rest shape on the stage.
+    """Find the rest shape on the stage, still to be `checked`.
 
     Args:
         prim: Mesh prim.
@@ -60,24 +60,24 @@ def read_rest(
         baked: Layer of baked skinning, whose points are no rest shape.
 
     Raises:
-        GarmentError: When an authored rest shape does not fit the mesh, or all of its points are at one place.
+        GarmentError: When an authored rest shape does not fit the mesh.
     """
     path, count = str(prim.GetPath()), len(first)
     authored = _authored(prim, count)
     if authored is not None:
-        return checked(prim, edges, Rest(place(authored[0]), authored[1]), first=first)
+        return Rest(place(authored[0]), authored[1])
     default = _default_points(prim, baked)
     if default is None:
-        return checked(prim, edges, Rest(first, "first sample of points"), first=first)
+        return Rest(first, "first sample of points")
     if len(default) != count:
         message = f"the default points are {len(default)}, the mesh has {count}; the first sample is the rest shape"
-        return checked(prim, edges, Rest(first, "first sample of points", (Notice(path, None, message),)), first=first)
+        return Rest(first, "first sample of points", (Notice(path, None, message),))
     points = place(default)
     notices: tuple[Notice, ...] = ()
     if not np.isfinite(points).all():
         points = repair(points, edges, first)
         notices = (Notice(path, None, "the default points have NaN or infinite values, repaired for the rest shape"),)
-    return checked(prim, edges, Rest(points, "default points", notices), first=first)
+    return Rest(points, "default points", notices)
 
 
 def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray) -> Rest:
@@ -116,10 +116,15 @@ def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray)
     return Rest(rest.points, rest.source, (*notices, Notice(path, None, message)))
 
 
-def rests_bent(prim: Usd.Prim) -> bool:
-    """Whether hinges rest at the rest shape's angles: ``physics:restBendAnglesDefault`` is ``restShape``."""
+def rests_bent(prim: Usd.Prim) -> tuple[bool, list[Notice]]:
+    """Whether hinges rest at the rest shape's angles (``physics:restBendAnglesDefault``); a notice of an older word."""
     attribute = nearest(prim, "physics:restBendAnglesDefault")
-    return attribute is not None and attribute.Get() in _BENT
+    if attribute is None:
+        return False, []
+    value = str(attribute.Get())
+    new = {"restShapeDefault": "restShape", "flatDefault": "flat"}.get(value)
+    message = f"physics:restBendAnglesDefault is {value!r}, the proposal's older name; author {new!r}"
+    return value in _BENT, [Notice(str(attribute.GetPrim().GetPath()), None, message)] if new else []
 
 
 def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
