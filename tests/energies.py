@@ -1,6 +1,6 @@
 """The potential once more, written independently in plain torch, for autograd to differentiate; and finite differences.
 
-Formulas from DESIGN 4.1 on the authored triangles alone: nothing here reads a `Level`'s derived fields.
+The formulas of the forces on the authored triangles alone: nothing here reads a `Level`'s derived fields.
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ def test_maps_between_levels_compose(depths: tuple[int, int]):
 
 @pytest.mark.parametrize("name", ["stretch", "membrane"])
 def test_uniform_strain_costs_the_same_at_every_level(name: str):
-    """A value means the same at every level (DESIGN 4.1)."""
+    """A stiffness means the same at every level."""
     mesh, points = grid(3, 2, "triangles")
     garment = garment_of(mesh, points)
     strain = torch.tensor([[1.1, 0.05, 0.0], [0.0, 0.95, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
