@@ -131,11 +131,11 @@ def _call(code: str, function: Callable[..., Any], args: tuple[Any, ...]) -> tup
     """Call a function on a worker; what is wrong with the shot would be wrong on any other, and is not tried again."""
     worker = _distributed().get_worker()
     if worker.state.nthreads != 1:
-        said = f"the worker {worker.name} has {worker.state.nthreads} threads; start each with --nthreads 1"
-        return None, UsageError(said)
+        message = f"the worker {worker.name} has {worker.state.nthreads} threads; start each with --nthreads 1"
+        return None, UsageError(message)
     if code != _code():
-        said = f"the worker {worker.name} has physgraph-usd {_code()}, this machine {code}; install the same on both"
-        return None, UsageError(said)
+        message = f"the worker {worker.name} has physgraph-usd {_code()}, this machine {code}; install the same on both"
+        return None, UsageError(message)
     try:
         return function(*args), None
     except PhysGraphError as error:

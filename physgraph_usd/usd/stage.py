@@ -111,7 +111,7 @@ class GarmentSource:
     subsets: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
-    def left_out_said(self) -> str:
+    def left_out_words(self) -> str:
         """Number and place of its samples outside the range; "" when there are none."""
         before, after = ([f"{t:g}" for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
         spans = " and ".join(" to ".join(dict.fromkeys([span[0], span[-1]])) for span in (before, after) if span)

@@ -52,9 +52,9 @@ class Rays:
             origins: Shape (N, 3).
             directions: Shape (N, 3), not zero.
         """
-        met = wp.zeros(len(origins), dtype=wp.int32, device="cpu")
-        self._cast(_is_met, origins, directions, met)
-        return np.asarray(met.numpy() == 0)
+        hit = wp.zeros(len(origins), dtype=wp.int32, device="cpu")
+        self._cast(_is_hit, origins, directions, hit)
+        return np.asarray(hit.numpy() == 0)
 
     def first(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """What each ray meets first, whichever side the triangle shows.
@@ -78,16 +78,16 @@ def _vectors(values: np.ndarray) -> wp.array:
 
 
 @wp.kernel
-def _is_met(
+def _is_hit(
     first: int,
     mesh: wp.uint64,
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
-    met: wp.array(dtype=wp.int32),
+    hit: wp.array(dtype=wp.int32),
 ):
     i = first + wp.tid()
     if wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], FAR):
-        met[i] = 1
+        hit[i] = 1
 
 
 @wp.kernel

@@ -48,7 +48,7 @@ def read_series(report: RefineReport, index: int) -> Series:
     found = Series(report.garments[index]["path"])
     for place, frame in enumerate(report.frames):
         entry = frame["garments"][index] if "garments" in frame else {}
-        for name, values in _said(entry, frame).items():
+        for name, values in _series_of(entry, frame).items():
             lines: dict[str, Line] = getattr(found, name)
             for label, value in values.items():
                 line = lines.setdefault(label, [None] * len(report.frames))
@@ -56,7 +56,7 @@ def read_series(report: RefineReport, index: int) -> Series:
     return found
 
 
-def _said(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, dict[str, float]]:
+def _series_of(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, dict[str, float]]:
     """What one frame says of a garment, by field and line."""
     lines_of: dict[str, dict[str, float]] = {"time": _milliseconds(entry, frame)}
     if "energy_joules" in entry:

@@ -114,9 +114,9 @@ class Group:
         potential = self.settings.potential
         key = (potential, *((frame.fabric, frame.guide) for frame in frames))
         if key not in self._forces:
-            given = {"frames": frames, "gravity": self.gravity, "potential": potential}
+            weights = {"frames": frames, "gravity": self.gravity, "potential": potential}
             pairs = zip(self.levels, self.guide_maps, strict=True)
-            made = [build_forces(level, guide_map, self.garments, **given) for level, guide_map in pairs]
+            made = [build_forces(level, guide_map, self.garments, **weights) for level, guide_map in pairs]
             self._forces.clear()
             self._forces[key] = made
         return self._forces[key]
@@ -130,7 +130,7 @@ class Group:
 
     def contact(
         self,
-        given: FrameInput,
+        frame: FrameInput,
         cage: Cage,
         *,
         settings: ContactSettings | None = None,
@@ -139,20 +139,20 @@ class Group:
         """What a frame's cloth may touch, or None when there is nothing.
 
         Args:
-            given: The frame.
+            frame: The frame.
             cage: Where the cages are.
             settings: How contact is solved; the group's own when None.
             target: Where a warm frame's cloth is to go [m], or None.
         """
         settings = settings or self.settings.contact
-        touching = given.touching if settings.form != "off" else ()
+        touching = frame.touching if settings.form != "off" else ()
         cloth = self.cloth if settings.cloth != "off" and self.cloth.meets.any() else None
         if not len(self.levels[0].triangles):
             return None
         seams = Seams.find(self.levels[0], cage.points)
         if cloth is None and not touching and seams is None:
             return None
-        fabrics = [frame.fabric for frame in given.garments]
+        fabrics = [each.fabric for each in frame.garments]
         settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics))
         bodies = None
         if touching:
@@ -191,9 +191,9 @@ class Group:
         _, contact, origin = self.potential(frames, touching)
         if contact is None:
             return list(wanted), {}
-        begun, given = (self.tensor(np.concatenate(each) - origin) for each in (start, wanted))
-        moved, _ = contact.finish(contact.at(self.levels[-1]).moved(Placed(begun), given))
-        apart = (moved - given).double().cpu().numpy()
+        begun, target = (self.tensor(np.concatenate(each) - origin) for each in (start, wanted))
+        moved, _ = contact.finish(contact.at(self.levels[-1]).moved(Placed(begun), target))
+        apart = (moved - target).double().cpu().numpy()
         pairs = zip(wanted, self.levels[-1].spans, strict=True)
         return [each + apart[span] for each, span in pairs], contact.measure(moved)[0]
 

@@ -15,7 +15,7 @@ from ..colliders.pose import Pose
 from ..scene import Frame, GarmentFrame
 from .values import State, join
 
-BACK = 0.25
+RETURNED = 0.25
 """Part of the way that the input took into a broken frame by which it may miss its place before, to have come back.
 What moves on evenly misses it by twice that way, and what turns round by less only if it moves by less than an edge."""
 
@@ -90,7 +90,7 @@ class Origin:
             farthest = max(farthest, bodies_moved(last, frame.colliders, near))
         return farthest
 
-    def told(self, walked_from: float | None) -> dict[str, object]:
+    def telemetry(self, walked_from: float | None) -> dict[str, object]:
         """What the report says of it, given the time code from which a cold frame's cage walked here, or None."""
         found: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
         if walked_from is not None:
@@ -202,7 +202,7 @@ def came_back(
     """
     near = sorted({*near, *before.near})
     away = max(cage_moved(last, now), bodies_moved(last, colliders, near))
-    return away > edge and max(cage_moved(before, now), bodies_moved(before, colliders, near)) < BACK * away
+    return away > edge and max(cage_moved(before, now), bodies_moved(before, colliders, near)) < RETURNED * away
 
 
 def jumped_in(
@@ -226,4 +226,4 @@ def jumped_in(
     """
     near = sorted({*near, *first.near, *second.near})
     away = max(cage_moved(first, second.frame), bodies_moved(first, second.colliders, near))
-    return away > edge and max(cage_moved(second, now), bodies_moved(second, colliders, near)) < BACK * away
+    return away > edge and max(cage_moved(second, now), bodies_moved(second, colliders, near)) < RETURNED * away

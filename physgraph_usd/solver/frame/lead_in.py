@@ -88,8 +88,8 @@ def _crosses(cages: Refiner, frame: Frame) -> bool:
 def _is_clean(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> bool:
     """Whether nothing crosses in the cage that is solved at a time code by itself."""
     cages.forget()
-    told = _solve(cages, frame_at, time)
-    return bool(told) and all(not entry["contact"]["cloth"]["after"]["crossings"] for entry in told)
+    entries = _solve(cages, frame_at, time)
+    return bool(entries) and all(not entry["contact"]["cloth"]["after"]["crossings"] for entry in entries)
 
 
 def _solve(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> list[dict[str, Any]]:

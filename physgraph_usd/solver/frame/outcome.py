@@ -27,12 +27,12 @@ def refuse_swallowed(problem: Problem) -> None:
     Raises:
         SolveError: There is such cloth.
     """
-    given, depths = problem.given, [] if problem.contact is None else problem.contact.depths
-    for garment, frame, (deep, body) in zip(problem.group.garments, given.garments, depths, strict=False):
-        size = float(np.linalg.norm(np.ptp(frame.points, axis=0))) if len(frame.points) else 0.0
+    depths = [] if problem.contact is None else problem.contact.depths
+    for garment, each, (deep, body) in zip(problem.group.garments, problem.frame.garments, depths, strict=False):
+        size = float(np.linalg.norm(np.ptp(each.points, axis=0))) if len(each.points) else 0.0
         if deep > size:
             what = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
-            raise SolveError(f"{named([garment], given.at)}: {what}; mend the one or the other there")
+            raise SolveError(f"{named([garment], problem.frame.at)}: {what}; mend the one or the other there")
 
 
 def scaled(problem: Problem, x: Placed) -> Placed:
@@ -41,13 +41,13 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     Raises:
         SolveError: It is not finite or out of bounds.
     """
-    group, given, view = problem.group, problem.given, problem.view(problem.finest)
-    pairs = zip(given.garments, group.garments, strict=True)
-    gain = np.concatenate([frame.detail * garment.detail_scale for frame, garment in pairs])
+    group, view = problem.group, problem.view(problem.finest)
+    pairs = zip(problem.frame.garments, group.garments, strict=True)
+    gain = np.concatenate([each.detail * garment.detail_scale for each, garment in pairs])
     result = group.moving_frames.scaled(problem.aim, x, gain)
     if not bool((result.abs() <= FARTHEST).all()):
         what = f"the refined cloth is not finite or beyond {FARTHEST:g} m; lower physgraph:refine:detail"
-        raise SolveError(f"{named(group.garments, given.at)}: {what} or detailScale")
+        raise SolveError(f"{named(group.garments, problem.frame.at)}: {what} or detailScale")
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
@@ -94,7 +94,7 @@ def measured(problem: Problem, x: Tensor) -> tuple[dict[str, object], np.ndarray
         Plain values, and which vertices belong to cloth that crosses, shape (V,), bool.
     """
     group, settings = problem.group, problem.group.settings.contact.to_measure()
-    judge = problem.contact if settings is None else group.contact(problem.given, problem.cage, settings=settings)
+    judge = problem.contact if settings is None else group.contact(problem.frame, problem.cage, settings=settings)
     if judge is None:
         return {}, np.zeros(len(x), bool)
     values, crossing = judge.measure(x)

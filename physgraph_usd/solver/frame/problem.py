@@ -84,7 +84,7 @@ class Problem:
     Attributes:
         began: When the frame began [s].
         group: The garments.
-        given: The frame.
+        frame: The frame.
         cage: Where the cages are.
         aim: The cage that the fine cloth follows [m].
         forces: The lasting terms of each level, coarsest first.
@@ -97,7 +97,7 @@ class Problem:
 
     began: float
     group: Group
-    given: FrameInput
+    frame: FrameInput
     cage: Cage
     aim: Float[Tensor, "coarse 3"]
     forces: Sequence[LevelForces]
@@ -190,34 +190,34 @@ class Problem:
         return x, smoothing
 
 
-def begin(group: Group, given: FrameInput, last: State | None) -> Problem:
+def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     """Make a frame ready to be solved.
 
     Args:
         group: The garments.
-        given: The frame.
+        frame: The frame.
         last: What the last frame left, or None for a cold start.
     """
     began = time.perf_counter()
-    forces, cage, settings = group.forces_for(given.garments), group.cage(given.garments), group.settings
-    moved = given.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
+    forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
+    moved = frame.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
     known = None if settings.temporal == "off" else last
     reset = {"frames": group.moving_frames, "finest": group.levels[-1], "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved)
-    contact = group.contact(given, cage, target=start.detailed)
+    contact = group.contact(frame, cage, target=start.detailed)
     before = None if last is None else last.about(cage.origin)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
     return Problem(
         began,
         group,
-        given,
+        frame,
         cage,
         aim=cage.points if contact is None else contact.aim,
         forces=forces,
         contact=contact,
         start=start,
-        walked=None if given.walked is None else group.tensor(given.walked - cage.origin),
+        walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
         before=before,
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
     )

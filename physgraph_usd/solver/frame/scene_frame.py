@@ -226,7 +226,7 @@ class SceneFrame:
             near = tuple(sorted({*near, *more}))
         self._refuse_strayed(part, solved.points)
         entry = solved.telemetry | self._surroundings(part, near)
-        entry |= origin.told(None if cage is None else cage[1]) | (
+        entry |= origin.telemetry(None if cage is None else cage[1]) | (
             {"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}
         )
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)

@@ -42,18 +42,18 @@ HALVINGS = 4
 """How often a step is halved on which cloth that is blocked raises the energy, before all of it stays."""
 
 
-def solve_frame(group: Group, given: FrameInput, last: State | None) -> Solved:
+def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
     """Solve one frame.
 
     Args:
         group: Garments that are solved together.
-        given: The frame.
+        frame: The frame.
         last: What the last frame left, or None for a cold start.
 
     Raises:
         SolveError: A term of the potential is not finite, or cloth lies wholly in a body.
     """
-    problem = begin(group, given, last)
+    problem = begin(group, frame, last)
     refuse_swallowed(problem)
     prepared = time.perf_counter()
     try:
@@ -66,7 +66,7 @@ def solve_frame(group: Group, given: FrameInput, last: State | None) -> Solved:
                 made[-1].energies = module.energies(x)
             reports += made
     except SolveError as error:
-        broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=given.at)
+        broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
         raise SolveError(broken) from error
     assert x is not None
     shown, left, finish = scaled(problem, x), state_left(problem, x), dict[str, object]()

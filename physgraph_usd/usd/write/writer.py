@@ -297,7 +297,7 @@ def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[st
     return {
         "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
         "garments": [str(path) for path in targets],
-        "left_out": {str(path): source.left_out_said for path, source in pairs if source.left_out} or None,
+        "left_out": {str(path): source.left_out_words for path, source in pairs if source.left_out} or None,
         "variants": shot.selections or None,
     }
 
