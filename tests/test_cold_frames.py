@@ -48,7 +48,8 @@ def of_others(refiner: Refiner, frames: list) -> np.ndarray:
     return points
 
 
-@pytest.mark.parametrize("name", ["torus", "block", pytest.param("tshirt", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["torus", "tshirt"])
 def test_a_frame_by_itself_is_the_same_after_any_other(sample: Callable[[str], Path], name: str):
     shot = open_shot(str(sample(name)), level=1)
     frames = [shot.frame(time) for time in shot.scene.times[4::6]][:3]
