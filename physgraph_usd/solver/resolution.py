@@ -34,7 +34,7 @@ FEWEST_EDGES = 2.0
 """No mesh carries a wave of fewer edges: what would fold so folds at the mesh's own size."""
 SHARP_FOLD = math.radians(45.0)
 SHARP_FRACTION = 0.01
-"""Share of sharp folds above which the mesh shows: 0.1% on the T-shirt at level 3, 1.1% at level 2, where it does."""
+"""Fraction of sharp folds from which the mesh shows: 0.1% on the T-shirt at level 3, 1.1% at level 2, where it does."""
 LEAST_TENSION = 1e-9
 """[N/m]; cloth without stiffness does not buckle."""
 SHORTEST_WAVE = 1e-3
@@ -157,7 +157,7 @@ def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame])
 
 
 def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
-    """Share of the hinges that fold by more than 45 degrees; every fourth hinge is measured."""
+    """Fraction of the hinges that fold by more than 45 degrees; every fourth hinge is measured."""
     hinges = level.hinges[::4].cpu().numpy()
     if not len(hinges):
         return 0.0

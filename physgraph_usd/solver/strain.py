@@ -21,7 +21,7 @@ SHRUNK = 0.25
 LEAST_FRACTION = 0.01
 """Of the garment's rest area; smaller parts, such as single faces in a fold, are passed over."""
 COVERED = 0.9
-"""Share of a part's faces inside a subset that gives it its name."""
+"""Fraction of a part's faces inside a subset that gives it its name."""
 THIRD = 1.0 / 6.0
 """How far from the middle of a box its middle third ends, in its sizes."""
 LARGEST = 4.0

@@ -5,7 +5,7 @@
 | symbol | here | meaning |
 |---|---|---|
 | k_g | ``stiffness`` | guide stiffness [N/m^3] |
-| A_c | coarse vertex area, the sum of its share of fine areas [m^2] |
+| A_c | coarse vertex area, the sum of its part of fine areas [m^2] |
 | R | ``average`` | row-normalised transpose of the prolongation P, weighted by fine area |
 | s_c | painted ``guideScale`` |
 | p_v | 10 pin / (1 - pin) | soft pins: 0 where the pin weight is 0, grows without bound towards 1 |

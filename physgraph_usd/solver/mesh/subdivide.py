@@ -211,8 +211,8 @@ def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
 
     Among triangles these are Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and among polygons
     those of Catmull and Clark, both as OpenSubdiv has them. An edge between a triangle and a polygon takes half of
-    either rule. A vertex between both takes each rule by the share of the full turn that a regular corner has, a sixth
-    or a fourth: with s the sum of shares the rules are evaluated at valence 6 s and 4 s, and each corner adds its part.
+    either rule. A vertex between both takes each rule by the fraction of a full turn that a regular corner has, a sixth
+    or a fourth: with s the sum of them the rules are evaluated at valence 6 s and 4 s, and each corner adds its part.
     That is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) where s = 1, and the pure rule among one kind.
 
     Boundaries are cubic B-splines. Fixed are: vertices with one face, with three or more boundary edges, on

@@ -279,7 +279,7 @@ def quad_edges(split: TriangleSplit, counts: np.ndarray, edges: np.ndarray) -> t
         edges: Edges of the triangles, lexicographic, shape (E, 2).
 
     Returns:
-        The share of each edge's triangles that come from a quad, shape (E,), float64, and whether the edge is a quad's
+        The fraction of an edge's triangles that come from quads, shape (E,), float64, and whether the edge is a quad's
         diagonal, shape (E,), bool.
     """
     sides = split.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
