@@ -94,11 +94,11 @@ def made_from(opened: Shot | _Opened, out: Path | None, options: RefineOptions) 
 
 
 def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
-    """Refuse options that no shot could be refined with, and to write over what is read or written by any of the jobs.
+    """Refuse options that no shot could be refined with, and to write over a file that any of the jobs reads or writes.
 
     Args:
         jobs: Shot, layer to write and options of each.
-        also: What else is to be written.
+        also: Further files to be written.
 
     Raises:
         UsageError: With the value, and the file.

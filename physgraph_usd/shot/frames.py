@@ -1,7 +1,7 @@
 """Finished frames of a run in a folder beside its layer: they outlive the run when it is interrupted.
 
-One file a frame, whole or not there, and one that says what decides the frames. The folder goes when the layer stands
-whole under its name and for no other reason; until then one run holds it.
+One file a frame, whole or not there, and `RUN`, a record of everything that decides the frames. The folder goes when
+the layer is whole under its name and for no other reason; until then one run locks it.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ..usd.write.atomic import make_file, temporary_path, write_text
 from .lock import LOCK, FolderLock
 
 RUN = "run.json"
-"""The file that says what decides the frames."""
+"""A record of everything that decides the frames."""
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
 _BEFORE = ".before"
 _OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
-"""Names of finished frames, of what says what decides them, and of both while they are written."""
+"""Names of finished frames and of the record, also while they are written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +122,11 @@ class FrameFolder:
     def __init__(
         self, folder: Path, run: Mapping[str, Any], *, resume: bool = False, drop: bool = False, keep: bool = True
     ) -> None:
-        """Take a folder for a run, with what an interrupted run left in it or empty.
+        """Take a folder for a run, empty or with the frames of one that was interrupted.
 
         Args:
             folder: Where; made where it is not there.
-            run: What decides the frames, ready for JSON.
+            run: Everything that decides the frames, ready for JSON.
             resume: Use finished frames that are there.
             drop: Remove finished frames that are there, whatever run they are of.
             keep: Leave finished frames there when the run is interrupted.
@@ -164,7 +164,7 @@ class FrameFolder:
         write_text(self.folder / RUN, self._run)
 
     def _check_ours(self) -> None:
-        """Refuse a folder with anything in it that we did not write: what is ours in it goes once the layer stands."""
+        """Refuse a folder with files that are not ours: it is emptied once the layer is whole."""
         names = {file.name for file in self.folder.glob("*")}
         others = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
         if others or (names and not names & {RUN, LOCK}):
@@ -172,7 +172,7 @@ class FrameFolder:
             raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
 
     def _differences(self, wanted: dict[str, Any]) -> list[str]:
-        """Names of what decides the frames there, and is another here."""
+        """Names of the entries in which the record there differs."""
         try:
             there = json.loads((self.folder / RUN).read_text(encoding="utf-8"))
         except ValueError:
@@ -238,7 +238,7 @@ class FrameFolder:
         return Outcome(time, points, reused, record, heat)
 
     def _clear(self) -> None:
-        """Remove our files but the one that is held."""
+        """Remove our files but the locked one."""
         for file in self.folder.glob("*"):
             if file.name == RUN or _OURS.fullmatch(file.name):
                 file.unlink(missing_ok=True)

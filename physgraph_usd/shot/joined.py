@@ -1,4 +1,4 @@
-"""The rule for seams: what two processes solved of the same frames becomes one motion.
+"""The rule for seams: two solutions of the same frames, by two processes, become one motion.
 
 Cloth that can lie in several ways lies in another one after each history. Over the L frames that both processes solved
 the positions go from one solution to the other in equal parts,
@@ -49,7 +49,7 @@ def join(both: Sequence[tuple[Outcome, Lead]], move: Mover) -> Joint:
     """Join the frames of one seam.
 
     Args:
-        both: The frames before the seam with what the process behind it made of them.
+        both: The frames before the seam, each with its solution by the process behind it.
         move: Moves cloth safely.
     """
     frames, why = [], ""
@@ -147,6 +147,6 @@ def _worse(contact: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> s
 
 
 def _counts(contact: Mapping[str, Any]) -> dict[str, int]:
-    """Numbers of what crosses and of what is in bodies, of telemetry of contact."""
+    """Numbers of crossing edges and of vertices in bodies, of telemetry of contact."""
     bodies = {f"vertices inside <{path}>": each["after"]["inside"] for path, each in contact.get("bodies", {}).items()}
     return {"edges through cloth": contact.get("cloth", {}).get("after", {}).get("crossings", 0)} | bodies

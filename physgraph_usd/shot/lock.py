@@ -10,14 +10,14 @@ from ..errors import LayerError
 from ..usd.write.atomic import HOST, NO_LINK, check_no_link
 
 LOCK = "run.lock"
-"""The file that is held; it says by whom."""
+"""The locked file; it names the process that holds it."""
 try:
     import fcntl
 except ImportError:  # Windows has another module.
     import msvcrt
 
     def _hold(handle: int) -> None:
-        os.lseek(handle, 1 << 20, os.SEEK_SET)  # what is held there cannot be read
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # locked bytes cannot be read
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
 else:
 
@@ -29,15 +29,15 @@ class FolderLock:
     """A process's hold on a folder."""
 
     def __init__(self, folder: Path, *, layer: Path) -> None:
-        """Take hold of a folder, which is made where it is not there.
+        """Lock a folder, which is made where it is not there.
 
         Args:
             folder: The folder.
-            layer: What is made with it, for the message.
+            layer: The layer that is made with it, for the message.
 
         Raises:
             LayerError: Another run holds it.
-            UsageError: The file that is held is a link.
+            UsageError: The locked file is a link.
             OSError: The folder cannot be made or written.
         """
         self._file = folder / LOCK
@@ -51,7 +51,7 @@ class FolderLock:
                 raise LayerError(f"{layer} is being made by {who}; wait for it, end it, or name another layer")
             if _is_at(self._file, self._handle):
                 break
-            os.close(self._handle)  # who held it has removed it since
+            os.close(self._handle)  # its holder has removed it since
         os.ftruncate(self._handle, 0)
         os.write(self._handle, f"process {os.getpid()} on {HOST}".encode())
 

@@ -1,4 +1,4 @@
-"""Calls in processes of their own: one that dies is an error that says how, one that is not wanted any more ends."""
+"""Calls in processes of their own: a process that dies is an error that names the cause."""
 
 from __future__ import annotations
 
@@ -48,25 +48,23 @@ class Call:
         return self._answer is not None or self._here.poll()
 
     def result(self) -> Any:
-        """What the function returned; waits for it.
+        """The function's result; waits for it.
 
         Raises:
-            PhysGraphError: What it raised; what was not foreseen is named, and its traceback is on stderr.
+            PhysGraphError: The function's; an unforeseen one is named, and its traceback is on stderr.
             SolveError: The process died.
         """
         if self._answer is None:
-            self._answer = self._received()
+            try:
+                answer: tuple[Any, PhysGraphError | None] = self._here.recv()
+            except EOFError:
+                self._process.join()
+                answer = None, SolveError(_obituary(self._process.exitcode or 0))
+            self._answer = answer
         value, error = self._answer
         if error is not None:
             raise error
         return value
-
-    def _received(self) -> tuple[Any, PhysGraphError | None]:
-        try:
-            return self._here.recv()
-        except EOFError:
-            self._process.join()
-            return None, SolveError(_obituary(self._process.exitcode or 0))
 
     def ask_to_end(self) -> None:
         """Ask it to clear up and end, and do not wait."""
@@ -86,7 +84,7 @@ def call_each(
     """Call a function once a job, each call in a process of its own, and yield results in order.
 
     Args:
-        function: What to call.
+        function: The function; picklable.
         jobs: Arguments of each call.
         workers: Most calls at a time.
 
@@ -114,7 +112,7 @@ def call_each(
 
 @contextlib.contextmanager
 def memory_is_named() -> Iterator[None]:
-    """Turn what libraries raise when memory runs out into an error of ours.
+    """Turn errors that libraries raise when memory runs out into one of ours.
 
     Raises:
         SolveError: Memory ran out.
@@ -130,7 +128,7 @@ def memory_is_named() -> Iterator[None]:
 
 
 def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    """Call the function and send what came of it; Ctrl-C is the business of the process that started this one."""
+    """Call the function and send its result; Ctrl-C is the business of the process that started this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_outlast_parent, daemon=True).start()
     with signals_raise(), _Sent(there), memory_is_named():
@@ -138,7 +136,7 @@ def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ..
 
 
 class _Sent:
-    """Sends what is raised inside, and what nobody foresaw as an error of ours with its traceback on stderr."""
+    """Sends errors that are raised inside, unforeseen ones as one of ours with the traceback on stderr."""
 
     def __init__(self, there: Connection) -> None:
         self._there = there
@@ -169,7 +167,6 @@ def _outlast_parent() -> None:
 
 def _obituary(code: int) -> str:
     """How a process died, by its exit code."""
-    name = signal.Signals(-code).name if code < 0 else ""
-    how = name or f"exit code {code}"
-    why = ", perhaps for lack of memory; use fewer --workers or a lower --level" if name == "SIGKILL" else ""
+    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    why = ", perhaps for lack of memory; use fewer --workers or a lower --level" if how == "SIGKILL" else ""
     return f"a worker process died ({how}){why}"

@@ -176,7 +176,7 @@ def _opened(chunks: Sequence[str | Path], *, strict: bool = True) -> list[ChunkL
 
 
 def _layers_in(place: Path) -> list[Path]:
-    """The layers in a folder but those that are being written; a file is its own only one."""
+    """The layers in a folder but those that are being written; a file alone."""
     if not place.is_dir():
         return [place]
     return [file for file in sorted(place.iterdir()) if file.suffix in LAYER_SUFFIXES and ".tmp." not in file.name]
@@ -356,7 +356,7 @@ def _windows(parts: Sequence[ChunkLayer], made: Mapping[float, Points]) -> tuple
 
 
 def _mover(stack: ExitStack, shot: Path, parts: Sequence[ChunkLayer]) -> tuple[list[str], Mover]:
-    """Paths of the fine meshes, and what moves them, in local positions; anywhere where the shot is not there any more.
+    """Paths of the fine meshes, and their mover, in local positions; without the shot, cloth goes where it is wanted.
 
     Args:
         stack: Closes the shot at its end.

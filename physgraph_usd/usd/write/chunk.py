@@ -55,7 +55,7 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What a layer holds of one time code.
+    """Samples of one time code.
 
     Attributes:
         time: The time code.

@@ -122,7 +122,7 @@ def write_layer(
 
 
 def _still(parts: Sequence[ChunkLayer], out: Path) -> Sdf.Layer:
-    """All that the chunks hold but what moves, in memory."""
+    """A layer in memory with everything in the chunks that the solver does not move."""
     still = Sdf.Layer.CreateAnonymous(".usdc")
     temporary = temporary_path(out.with_suffix(".topology"))  # USD stitches no clips in memory.
     try:
@@ -167,7 +167,7 @@ def _union(ours: Any, value: Any) -> Any:
 
 
 def _write_frames(stream: LayerStream, parts: Sequence[ChunkLayer], frames: Iterable[Frame]) -> None:
-    """Write what moves, as `LayerWriter` does; a garment without samples has its default alone."""
+    """Write samples by the tracks of `LayerWriter`; a garment without samples has its default alone."""
     tracks: dict[str, tuple[PointTrack, HeatTrack]] = {}
     for frame in frames:
         for path, points in frame.points.items():
@@ -182,7 +182,7 @@ def _write_frames(stream: LayerStream, parts: Sequence[ChunkLayer], frames: Iter
 
 
 def _tracks(stream: LayerStream, parts: Sequence[ChunkLayer], path: str) -> tuple[PointTrack, HeatTrack]:
-    """What writes a fine mesh, with defaults, velocities and normals as the chunks have them."""
+    """Tracks of a fine mesh, with defaults, velocities and normals as the chunks have them."""
     layers = [part.layer for part in parts if part.layer.ListTimeSamplesForPath(f"{path}.points")]
     normals = _normals(layers[0], path)
     rate = (
@@ -195,7 +195,7 @@ def _tracks(stream: LayerStream, parts: Sequence[ChunkLayer], path: str) -> tupl
 
 
 def _normals(layer: Sdf.Layer, path: str) -> VertexNormals:
-    """What computes a fine mesh's normals, on the side on which the layer has them."""
+    """Normals of a fine mesh, on the side on which the layer has them."""
     time = layer.ListTimeSamplesForPath(f"{path}.normals")[0]
     points, there = (np.asarray(layer.QueryTimeSample(f"{path}.{name}", time)) for name in ("points", "normals"))
     mesh = PolygonMesh(*topology_of(layer, path), len(points))
@@ -213,7 +213,7 @@ def write_clips(
     shot: Path,
     overwrite: bool,
 ) -> None:
-    """Write a layer that plays the chunks, the manifest, and one with what does not move and the joined frames.
+    """Write a layer that plays the chunks, the manifest, and a layer with the topology and the joined frames.
 
     Args:
         parts: The chunks, in order; they stay where they are.
@@ -252,13 +252,13 @@ def write_clips(
 
 def _shown(clips: Sequence[_Clip], path: str) -> list[tuple[_Clip, list[float]]]:
     """The clips that show a garment, with the time codes of their samples that are shown: up to the next clip's."""
-    held = []
+    sampled = []
     for clip in clips:
         times = [time for time in clip.layer.ListTimeSamplesForPath(f"{path}.points") if time >= clip.begin]
         if times:
-            held.append((clip, times))
+            sampled.append((clip, times))
     found, end = [], inf
-    for clip, times in reversed(held):
+    for clip, times in reversed(sampled):
         shown = [time for time in times if time < end]
         if shown:
             found.append((clip, shown))
@@ -296,7 +296,7 @@ def _clip_root(
 
 
 def _check_clips(clips: Sequence[_Clip], garments: Sequence[str], shot: Path, out: Path) -> None:
-    """Refuse clips that do not show what the layers hold, in the first and last frame of each: USD fails silently."""
+    """Refuse clips of which USD does not show the first and last frame as their layers hold them: it fails silently."""
     root = Sdf.Layer.CreateAnonymous(".usda")
     root.timeCodesPerSecond = clips[0].layer.timeCodesPerSecond
     for identifier in (str(out.resolve()), *([str(shot)] if is_there(shot) else [])):
