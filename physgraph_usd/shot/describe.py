@@ -305,7 +305,7 @@ def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
         "friction": "out of scope: shapes at rest under pressure alone; the guide and the tether hold cloth in place",
     }
-    held = [f"{source.path}: {source.left_out_said}" for source in opened.sources if source.left_out]
+    held = [f"{source.path}: {source.left_out_words}" for source in opened.sources if source.left_out]
     if held:
         left_out["samples"] = f"outside the frame range, where the layer holds the cloth still: {'; '.join(held)}"
     if "self contact" not in report.modelled:
