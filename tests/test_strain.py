@@ -15,8 +15,8 @@ from stages import GARMENT_API, new_stage, save, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.solver.mesh.fit import median_shape
 from physgraph_usd.solver.strain import strained_parts, strayed
+from physgraph_usd.usd.read.garment import median_shape
 from physgraph_usd.usd.read.reader import open_shot
 
 SLEEVE = "/World/sleeve"
