@@ -221,6 +221,7 @@ class TestKeptFrames:
         with pytest.raises(KeyboardInterrupt):
             interrupt(tmp_path / "f", Failing(), range(8))
         assert FrameFolder(tmp_path / "f", {"level": 2}, resume=True).kept == {0, 1, 2, 3, 4, 6, 7}
+        assert not list((tmp_path / "f").glob("*.failed.npz")), "they are tried again"
 
 
 def layer_with(shot: Path, folder: Path, **options: object) -> Path:
