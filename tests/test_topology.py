@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import any_mesh, cube, faces_of, grid, mesh_of, planar_mesh, tetrahedron
 
-from physgraph_usd.solver.mesh.incidence import incidence
+from physgraph_usd.solver.mesh.stencil import incidence
 from physgraph_usd.solver.mesh.subdivide import subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh, edges_of, find_edges, hinges_of
 

@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.incidence import incidence
-from ..mesh.stencil import SCALAR, VECTOR, overloads, vectors
+from ..mesh.stencil import SCALAR, VECTOR, incidence, overloads, vectors
 from ..mesh.threads import Launch
 
 wp.set_module_options({"enable_backward": False})

@@ -9,8 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, Integrator, System, followed, resumed
-from .quasi_newton import backtrack
-from .truncation import truncated
+from .quasi_newton import backtrack, truncated
 
 PATIENCE = 4
 """Corrections in a row after which an integrator is replaced by its spare."""
@@ -21,7 +20,7 @@ class Guard:
 
     The start is the upsampled cage in a cold frame, and the last frame's detail in a warm one.
 
-    A step that raises the energy is truncated where it turns triangles (`truncation`), then halved, quartered, and
+    A step that raises the energy is truncated where it turns triangles (`truncated`), then halved, quartered, and
     replaced by a step along H0^-1 F with a line search.
     From a shortened step the integrator continues with its memory, if it can take over another's step. From one that
     was replaced it starts anew: its memory misled it. After `PATIENCE` corrections in a row the spare

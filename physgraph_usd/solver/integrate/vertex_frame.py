@@ -22,8 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.incidence import incidence
-from ..mesh.stencil import VECTOR, Stencil, overloads, vectors
+from ..mesh.stencil import VECTOR, Stencil, incidence, overloads, vectors
 from ..mesh.threads import Launch
 
 wp.set_module_options({"enable_backward": False})
