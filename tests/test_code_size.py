@@ -134,6 +134,17 @@ def test_names_speak_the_fields_language() -> None:
     assert not found
 
 
+def test_docstrings_begin_with_what_the_thing_is() -> None:
+    texts = {
+        f"{file.name}: {text[:60]}"
+        for file in (ROOT / PACKAGE).rglob("*.py")
+        if not {"contact", "collide", "colliders"} & set(file.parts)
+        for text in re.findall(r'"""(.*)', file.read_text(encoding="utf-8"))
+    }
+    assert len(texts) > 1000
+    assert not {text for text in texts if re.search(r": (The same|As|What)\b", text)}
+
+
 def test_no_paths_of_one_machine() -> None:
     assert MACHINE_PATH.search("see " + "/".join(["", "home", "someone"]))
     assert not MACHINE_PATH.search("#!/usr/bin/env bash, </World/work/Coat>, ../tmp/x, https://example.org/opt/x")

@@ -31,7 +31,7 @@ def _words(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) 
 
 
 def _type_of(name: str) -> click.ParamType | type:
-    """What turns text into the value of a field."""
+    """Function that turns text into the value of a field."""
     option, kind = OPTIONS[name], str(_FIELDS[name].type).removesuffix(" | None")
     if name in _TYPES:
         return _TYPES[name]

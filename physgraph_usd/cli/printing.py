@@ -1,4 +1,4 @@
-"""What commands print: warnings and progress on stderr, reports in words, a log in a file."""
+"""Output of commands: warnings and progress on stderr, reports in words, a log in a file."""
 
 from __future__ import annotations
 

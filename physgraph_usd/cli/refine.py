@@ -141,7 +141,7 @@ def _print_failed(rows: Sequence[Row]) -> None:
 
 
 def _results(jobs: Sequence[Job], output: Output) -> Iterator[RefineReport | PhysGraphError]:
-    """What became of each job: one in this process, several in processes of their own.
+    """Result of each job: one in this process, several in processes of their own.
 
     What was finished before is passed over without the solver, whose import takes seconds.
     """
@@ -153,7 +153,7 @@ def _results(jobs: Sequence[Job], output: Output) -> Iterator[RefineReport | Phy
 
 
 def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | PhysGraphError, None, None]:
-    """What becomes of the jobs that are not finished."""
+    """Fate of the jobs that are not finished."""
     if not jobs:
         return
     with imports_uncollected():

@@ -33,7 +33,7 @@ def find_show_file(shot: str, config: Path | None) -> Path | None:
 
 
 def values_for(ctx: click.Context, shot: str, known: click.Command) -> tuple[dict[str, Any], dict[str, str]]:
-    """What a command was told of a shot: on the command line, else by the show's file, else by default.
+    """Values that a command was given for a shot: on the command line, else by the show's file, else by default.
 
     Args:
         ctx: The command's context.

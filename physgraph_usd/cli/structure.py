@@ -1,4 +1,4 @@
-"""What all commands share: exit codes, errors as one line on stderr, help in groups."""
+"""Common parts of commands: exit codes, errors as one line on stderr, help in groups."""
 
 from __future__ import annotations
 

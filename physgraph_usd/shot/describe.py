@@ -1,4 +1,4 @@
-"""What is known of a shot before its first frame: garments, values and sources, terms on and off; and what was."""
+"""Facts of a shot before its first frame: garments, values and sources, terms on and off; and what was."""
 
 from __future__ import annotations
 
@@ -95,14 +95,14 @@ def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> Gar
 
 
 def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
-    """What decides the size of a run beside its garments."""
+    """Sizes of a run beside its garments'."""
     levels = [garment["level"] for garment in report.garments]
     times = opened.scene.times if options.preroll is None else within(opened.scene.times, options.frames)
     return {"levels": levels, "frames": max(len(times), 1), "workers": options.workers}
 
 
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
-    """What would be refined, with what, from where, and every defect found, as plain values."""
+    """Plan of a refinement: garments, values and their sources, and every defect found, as plain values."""
     report = RefineReport(opened.path, None, options.plain())
     warnings = begin_report(report, opened, options, before_a_run=True)
     large = too_large(opened, report, options)

@@ -1,4 +1,4 @@
-"""What a shot will cost, from its cages alone: fine vertices, memory, the layer's size and time.
+"""A shot's cost, from its cages alone: fine vertices, memory, the layer's size and time.
 
 ``python -m benchmarks.estimate`` measures the constants. Memory and size are within a factor of 2; times, which how
 crowded a cage is decides, within 2.8 for a few frames of real shots, and 4 for single ones where cloth jumps.
@@ -20,7 +20,7 @@ PROCESS = 5.2e8
 PER_VERTEX = 6.5e3
 """Memory for each fine vertex, coarser levels, forces, metric and hierarchies included [bytes]."""
 LAYER_ONCE, LAYER_FRAME = 60.0, 24.0
-"""What a layer holds of each fine vertex: faces, UVs and the default once; points and normals per sample [bytes]."""
+"""Data of each fine vertex in a layer: faces, UVs and the default once; points and normals per sample [bytes]."""
 COLD, WARM = (6e-5, 6e-5, 4e-4, 0.0, 5e-4, 1e-3), (1.2e-5, 1e-5, 1.5e-4, 1.2e-4, 2e-4, 7e-4)
 """Time of one core for each fine vertex [s], in the first frame and in each warm one: of free cloth, and what is added
 where it touches a body, with the root of `Crowding.crossings`, with `crossings`, with `near`, and with the root of
@@ -29,7 +29,7 @@ where it touches a body, with the root of `Crowding.crossings`, with `crossings`
 
 @dataclass(frozen=True)
 class Estimate:
-    """What refining costs.
+    """Cost of refining.
 
     Attributes:
         vertices: Fine vertices of all garments.

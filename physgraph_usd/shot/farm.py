@@ -45,7 +45,7 @@ class FarmCall:
         return self._future.done()
 
     def result(self) -> Any:
-        """What the function returned; waits for it.
+        """The function's result; waits for it.
 
         Raises:
             PhysGraphError: What it raised.

@@ -32,7 +32,7 @@ LIST = "; repeatable"
 
 @dataclass(frozen=True)
 class Option:
-    """What is known of one of the options beside its name, type and default.
+    """One option, beside its name, type and default.
 
     Attributes:
         heading: Under which the command line's help shows it; "" for one that Python alone has.
@@ -230,7 +230,7 @@ class RefineOptions:
 
 
 OPTIONS: dict[str, Option] = {each.name: each.metadata["option"] for each in dataclasses.fields(RefineOptions)}
-"""What is known of each option, by its field."""
+"""Each option by its field."""
 RefineOptions.__doc__ = f"{RefineOptions.__doc__}\n\nAttributes:\n" + "\n".join(
     f"    {name}: {option.help}" for name, option in OPTIONS.items()
 )

@@ -1,4 +1,4 @@
-"""What a user calls: a shot is opened, described, solved frame by frame, written, and reported."""
+"""Functions that a user calls: a shot is opened, described, solved frame by frame, written, and reported."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
 
 
 def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any) -> dict[str, Any]:
-    """What would be refined, with what, from where, and every defect found.
+    """Plan of a refinement: garments, values and their sources, and every defect found.
 
     Args:
         shot: The stage to read, a file or open.

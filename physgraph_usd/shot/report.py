@@ -49,7 +49,7 @@ def is_of_failure(path: Path) -> bool:
 
 @dataclass(eq=False)
 class RefineReport:
-    """What `refine_shot` did.
+    """Report of a run of `refine_shot`.
 
     Attributes:
         shot: Input file.

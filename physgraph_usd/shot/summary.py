@@ -1,4 +1,4 @@
-"""What became of several shots: one row each, as JSON and as a table."""
+"""Summary of several shots: one row each, as JSON and as a table."""
 
 from __future__ import annotations
 

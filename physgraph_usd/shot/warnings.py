@@ -301,7 +301,7 @@ def of_energy(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
 
 
 def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any], str]]:
-    """What contact is measured by: the kind of warning, where, the measurements, and the count's name in them."""
+    """Measures of contact: the kind of warning, where, the measurements, and the count's name in them."""
     yield "crossings", "of cloth", contact.get("cloth") or {}, "crossings"
     for body, measured in contact.get("bodies", {}).items():
         yield "crossings", f"with <{body}>", measured, "crossings"

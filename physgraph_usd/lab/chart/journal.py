@@ -11,7 +11,7 @@ from ...errors import UsageError
 
 NAME = "chart.rows.jsonl"
 KINDS = ("problem", "plan", "reference", "point", "failed", "term")
-"""What a row can be."""
+"""Kinds of rows."""
 REMEDY = "take that line out, or measure anew with --overwrite"
 
 

@@ -124,14 +124,14 @@ class ChartOptions:
         )
 
     def plain(self) -> dict[str, Any]:
-        """What decides the problem that is measured, ready for JSON."""
+        """Settings of the problem that is measured, ready for JSON."""
         names = ("garments", "colliders", "overrides", "level", "rest_frame", "device", "clock")
         return {name: list(v) if isinstance(v := getattr(self, name), list | tuple) else v for name in names}
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is measured.
+    """Settings of a measurement.
 
     Attributes:
         frames: Number of frames.

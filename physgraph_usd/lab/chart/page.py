@@ -109,7 +109,7 @@ def _lead(chart: Chart) -> str:
 
 
 def _terms(chart: Chart) -> str:
-    """What each part of the model costs and buys, as a table."""
+    """Cost and gain of each part of the model, as a table."""
     found = changes(chart)
     if not found:
         return ""

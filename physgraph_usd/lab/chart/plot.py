@@ -110,7 +110,7 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, style: dict[str
 
 
 def _terms(panels: Any, steps: list[Change]) -> None:
-    """What each part of the model costs and buys."""
+    """Cost and gain of each part of the model."""
     places = list(range(len(steps)))[::-1]
     cost, buys, words = panels
     for axes, values, colour, digits in (

@@ -72,7 +72,7 @@ class Reference:
 
     @staticmethod
     def of(plain: dict[str, Any]) -> Reference:
-        """What `plain` gave."""
+        """The values that `plain` gave."""
         return Reference(**{each.name: plain[each.name] for each in fields(Reference) if each.name in plain})
 
     def plain(self) -> dict[str, Any]:

@@ -89,7 +89,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Chart:
-    """What was measured on a shot.
+    """Measurements on a shot.
 
     Attributes:
         about: The shot, the machine, the plan and refine's default.

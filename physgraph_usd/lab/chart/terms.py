@@ -64,7 +64,7 @@ TERMS = (
 
 @dataclass(frozen=True, eq=False)
 class TermBench:
-    """What the terms are measured on.
+    """Bench on which the terms are measured.
 
     Attributes:
         timed: The problem in float32.

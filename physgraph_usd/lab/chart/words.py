@@ -20,7 +20,7 @@ BASELINE = "#6e6e6e"
 
 @dataclass(frozen=True)
 class Change:
-    """What a part of the model costs and buys.
+    """Cost and gain of a part of the model.
 
     Attributes:
         name: The part.

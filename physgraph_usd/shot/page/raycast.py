@@ -59,7 +59,7 @@ class View:
 
 
 class _Light(NamedTuple):
-    """What reaches each vertex: ambient 0..1 and key 0..1."""
+    """Light that reaches each vertex: ambient 0..1 and key 0..1."""
 
     ambient: np.ndarray
     key: np.ndarray

@@ -19,7 +19,7 @@ FAR = wp.constant(wp.float32(1e30))
 
 
 class Hits(NamedTuple):
-    """What each ray meets first.
+    """The first hit of each ray.
 
     Attributes:
         face: The triangle, -1 for none, shape (N,) int32.
@@ -57,7 +57,7 @@ class Rays:
         return np.asarray(hit.numpy() == 0)
 
     def first(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
-        """What each ray meets first, whichever side the triangle shows.
+        """The first hit of each ray, whichever side the triangle shows.
 
         Args:
             origins: Shape (N, 3).

@@ -120,7 +120,7 @@ def _picture(report: RefineReport, time: float | None) -> str:
 
 
 def _model(report: RefineReport) -> str:
-    """What was modelled and left out, and why."""
+    """Terms that were modelled and left out, and why."""
     return (
         "<h2>What was modelled</h2>"
         + table("modelled", ("term", "how"), list(report.modelled.items()))

@@ -1,4 +1,4 @@
-"""What a run's frames say over time, garment by garment."""
+"""Figures of a run's frames over time, garment by garment."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def read_series(report: RefineReport, index: int) -> Series:
 
 
 def _series_of(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """What one frame says of a garment, by field and line."""
+    """One frame's figures of a garment, by field and line."""
     lines_of: dict[str, dict[str, float]] = {"time": _milliseconds(entry, frame)}
     if "energy_joules" in entry:
         output, given = entry["energy_joules"]["output"], entry["energy_joules"]["input"]

@@ -66,7 +66,7 @@ class ShapeSurface:
 
 
 def _ball(x: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to a ball about zero and its gradient; up at the centre (STABILITY.md S23)."""
+    """Signed distance to a ball about zero and its gradient; up at the centre."""
     length = x.norm(dim=1)
     up = torch.zeros_like(x)
     up[:, 2] = 1.0

@@ -1,4 +1,4 @@
-"""What the cage gives to the fine cloth: the last frame's detail, and the places of what no solve moves.
+"""Values that the cage gives to the fine cloth: the last frame's detail, and the places of what no solve moves.
 
 Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame made of its normal
 and of a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface. What

@@ -136,7 +136,7 @@ class Group:
         settings: ContactSettings | None = None,
         target: Tensor | None = None,
     ) -> FrameContact | None:
-        """What a frame's cloth may touch, or None when there is nothing.
+        """Contact of a frame's cloth, or None when nothing may touch.
 
         Args:
             frame: The frame.

@@ -1,4 +1,4 @@
-"""What is kept of a garment's last frames, and from which of them the next one starts: values, replaced frame by frame.
+"""Memory of a garment's last frames, and from which of them the next one starts: values, replaced frame by frame.
 
 A frame starts from the last one, unless that one was broken: where the input leaves its place for one frame and comes
 back, what was solved there is no start for what follows. Then the frame before it is.
@@ -49,7 +49,7 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What is kept of one garment.
+    """Memory of one garment.
 
     Attributes:
         last: The last frame that was solved.
@@ -64,7 +64,7 @@ class Kept:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """What a frame of garments that are solved together starts from.
+    """Start of a frame of garments that are solved together.
 
     Attributes:
         frames: The frame of each garment that it starts from; None where there is none.
@@ -91,7 +91,7 @@ class Origin:
         return farthest
 
     def telemetry(self, walked_from: float | None) -> dict[str, object]:
-        """What the report says of it, given the time code from which a cold frame's cage walked here, or None."""
+        """Telemetry of the start, given the time code from which a cold frame's cage walked here, or None."""
         found: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
         if walked_from is not None:
             found["start"] = f"cold: the cage walked here from time code {walked_from:g}"

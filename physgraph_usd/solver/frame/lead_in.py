@@ -93,7 +93,7 @@ def _is_clean(cages: Refiner, frame_at: Callable[[float | None], Frame], time: f
 
 
 def _solve(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> list[dict[str, Any]]:
-    """What is told of each garment whose cloth may touch cloth; nothing of a frame that cannot be solved."""
+    """Telemetry of each garment whose cloth may touch cloth; nothing of a frame that cannot be solved."""
     try:
         state: Any = cages.solve(frame_at(time))
     except (SolveError, StageError):

@@ -26,7 +26,7 @@ from ..scene import Garment, GarmentFrame
 
 @dataclass(frozen=True, eq=False)
 class LevelForces:
-    """What one level's cloth feels, frame after frame.
+    """Terms that one level's cloth feels, frame after frame.
 
     Attributes:
         level: The level.
@@ -96,7 +96,7 @@ class LevelForces:
 
     @cached_property
     def _lasting(self) -> dict[bool, tuple[System, Guide, Tether | None]]:
-        """What `lasting_system` gave, by whether it is tied."""
+        """Systems that `lasting_system` gave, by whether they are tied."""
         return {}
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:

@@ -1,4 +1,4 @@
-"""What comes out of a frame's solve: the cloth shown, what it leaves to the next frame, and what the report says."""
+"""Outcome of a frame's solve: the cloth shown, what it leaves to the next frame, and what the report says."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def scaled(problem: Problem, x: Placed) -> Placed:
 
 
 def state_left(problem: Problem, x: Placed) -> State:
-    """What the next frame starts from."""
+    """State from which the next frame starts."""
     view, cage = problem.view(problem.finest), problem.cage
     stored = problem.group.moving_frames.store(cage.points, x)
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
@@ -84,7 +84,7 @@ def telemetry_of(
 
 
 def measured(problem: Problem, x: Tensor) -> tuple[dict[str, object], np.ndarray]:
-    """What is near and what crosses, of what the cloth may touch and of what is off but to be measured.
+    """Measures of contact: near parts and crossings, also of what is off but to be measured.
 
     Args:
         problem: The frame.

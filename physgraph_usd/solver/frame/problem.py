@@ -138,7 +138,7 @@ class Problem:
         return len(self.forces) - 1
 
     def view(self, index: int) -> LevelContact | None:
-        """What a level's cloth may touch."""
+        """Contact of a level's cloth."""
         return None if self.contact is None else self.contact.at(self.forces[index].level)
 
     def levels(self, *, nested: bool) -> range:
@@ -232,7 +232,7 @@ DEEP = 2
 RESTING = 0.05
 """Remaining move of the cage, in its edge lengths, under which it is nearly at rest."""
 FAR = 0.4
-"""The same from which it is far from rest: under it a cold frame on CUDA is solved at the finest level alone."""
+"""Remaining move of the cage from which it is far from rest; under it CUDA solves cold frames at the finest level."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from .values import FrameInput, split
 
 
 class SceneCloth:
-    """What the frames of a scene are solved with; one frame's bodies are posed at a time.
+    """Levels, groups and bodies that the frames of a scene are solved with; one frame's bodies are posed at a time.
 
     Attributes:
         scene: The scene.
@@ -240,7 +240,7 @@ class SceneFrame:
         return found
 
     def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
-        """What garments were solved with: bodies, where they feel any, and one another."""
+        """Telemetry of what garments were solved with: bodies, where they feel any, and one another."""
         found: dict[str, object] = {}
         if any(self.cloth.scene.garments[index].colliders for index in part):
             found["near"] = [self.cloth.scene.colliders[each].path for each in near]

@@ -1,4 +1,4 @@
-"""What a frame's solve is given, what it leaves to the next, and what it gives: values that nothing writes to."""
+"""Input, state and result of a frame's solve: values that nothing writes to."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..scene import GarmentFrame
 
 @dataclass(frozen=True, eq=False)
 class FrameInput:
-    """What a group is given for one frame.
+    """Input of a group for one frame.
 
     Attributes:
         garments: Its garments at this time code.
@@ -53,7 +53,7 @@ class Cage:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What one frame leaves to the next.
+    """State that one frame leaves to the next.
 
     Attributes:
         coarse: Cage positions [m], world space.
