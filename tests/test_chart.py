@@ -97,6 +97,7 @@ def chart_of(*points: Point) -> Chart:
     return Chart({"waited": 0.0}, points, (), (), ())
 
 
+@pytest.mark.slow
 def test_gaps_lie_between_the_reference_and_plain_upsampling(made: tuple[Path, Path, Chart]):
     chart = made[2]
     assert chart.curve(UPSAMPLED)[0].gap == pytest.approx(1.0)
@@ -105,6 +106,7 @@ def test_gaps_lie_between_the_reference_and_plain_upsampling(made: tuple[Path, P
     assert set(chart.methods) >= {DEFAULT, UPSAMPLED, SMOOTH, "quasi-newton", "gd", "gd, nested"}
 
 
+@pytest.mark.slow
 def test_page_and_summary_name_who_found_the_least_and_how_far_the_next_one_is(made: tuple[Path, Path, Chart]):
     _, folder, chart = made
     [known] = chart.references
@@ -113,6 +115,7 @@ def test_page_and_summary_name_who_found_the_least_and_how_far_the_next_one_is(m
     assert f"{known['apart']:.2%}" in (folder / "chart.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Chart], tmp_path: Path):
     shot, _, chart = made
     report = refine(
@@ -128,6 +131,7 @@ def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Char
     assert chart.curve(UPSAMPLED)[0].inside > 0
 
 
+@pytest.mark.slow
 def test_shapes_come_nearer_to_the_reference(made: tuple[Path, Path, Chart], tmp_path: Path):
     chart = made[2]
     far, near = chart.curve(UPSAMPLED)[0].apart_mm, chart.curve(DEFAULT)[0].apart_mm
@@ -146,6 +150,7 @@ def test_positions_of_a_reference_are_found_again_and_not_of_another_chart(tmp_p
     assert Solutions(tmp_path, fresh=True).apart_mm(frame, moved) is None
 
 
+@pytest.mark.slow
 def test_terms_tell_what_is_worse_without_them(made: tuple[Path, Path, Chart]):
     rows = {row["term"]: row for row in made[2].terms}
     assert rows["contact"]["without"]["inside"] > rows["contact"]["with"]["inside"]
@@ -155,6 +160,7 @@ def test_terms_tell_what_is_worse_without_them(made: tuple[Path, Path, Chart]):
     assert {"gravity", "bending", "guide", "warm"} <= set(rows)
 
 
+@pytest.mark.slow
 def test_the_files(made: tuple[Path, Path, Chart]):
     _, folder, chart = made
     with (folder / "chart.csv").open(encoding="utf-8", newline="") as file:
@@ -169,6 +175,7 @@ def test_the_files(made: tuple[Path, Path, Chart]):
     assert (folder / "chart.svg").read_text(encoding="utf-8").count("<text") > 20
 
 
+@pytest.mark.slow
 def test_a_second_run_measures_nothing_again(made: tuple[Path, Path, Chart]):
     shot, folder, _ = made
     before = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
@@ -180,6 +187,7 @@ def test_a_second_run_measures_nothing_again(made: tuple[Path, Path, Chart]):
     assert len(set(keys)) == len(keys)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on(made: tuple[Path, Path, Chart], tmp_path: Path):
     shot, folder, chart = made
     whole = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
@@ -193,6 +201,7 @@ def test_an_interrupted_run_goes_on(made: tuple[Path, Path, Chart], tmp_path: Pa
     assert {key: energies[key] for key in both} == {key: known[key] for key in both}
 
 
+@pytest.mark.slow
 def test_another_shot_in_the_same_folder_is_refused(made: tuple[Path, Path, Chart]):
     shot, folder, _ = made
     with pytest.raises(UsageError, match="another shot or of other options"):
@@ -200,6 +209,7 @@ def test_another_shot_in_the_same_folder_is_refused(made: tuple[Path, Path, Char
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
     _, folder, chart = made
     with opened(folder / "chart.html") as page:
@@ -312,6 +322,8 @@ def test_a_damaged_row_is_named(tmp_path: Path, line: bytes):
     assert Journal(tmp_path, {"shot": "a"}, overwrite=True).rows("point") == []
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_a_solver_outside_is_measured_by_the_same_ruler(
     made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any
 ):
@@ -332,6 +344,7 @@ def test_a_solver_outside_is_measured_by_the_same_ruler(
     assert "was given" in (tmp_path / "out" / "chart.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_solver_outside_that_fails_is_told(made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any):
     adapter = tmp_path / "broken.py"
     adapter.write_text("raise SystemExit('out of luck')", encoding="utf-8")
@@ -347,6 +360,7 @@ def test_wrong_peers_are_refused(given: str):
         parse_peers([given])
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_summary_and_tells_progress(made: tuple[Path, Path, Chart], tmp_path: Path):
     shot, folder, _ = made
     shutil.copytree(folder, tmp_path / "out")

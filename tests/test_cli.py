@@ -235,7 +235,7 @@ class TestSeveralShots:
         result = run("refine", "a.usda", "b.usda", "-o", tmp_path / "out.usdc")
         assert (result.exit_code, jobs) == (2, [])
 
-    @pytest.mark.parametrize("workers", ["1", "2"])
+    @pytest.mark.parametrize("workers", [pytest.param("1", marks=pytest.mark.slow), "2"])
     def test_those_that_fail_leave_the_others(self, tmp_path: Path, workers: str) -> None:
         """A garment that is broken, an output that exists, a report that cannot be written."""
         shots = [cloth_shot(tmp_path / f"{name}.usda") for name in ("good", "torn", "done", "told")]

@@ -25,7 +25,8 @@ CAUGHT = {
     ],
 }
 """Where cloth may not newly cross, and so cannot leave the body."""
-SLOW = {name: [pytest.mark.slow] for name in ("02_makehuman_usdskel_dm.usdc", "06_torus_pull.usda")}
+FAST = ("01_newton_shirt_dab_cm.usdc", "08_sphere_spin_xformcollider.usdc")
+SLOW = {name: [pytest.mark.slow] for name in SHOTS if name not in FAST}
 
 
 def bodies_of(report: Any) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""A hundred and fifty mutants in this process, and the fuzzer's machinery: `python -m tests.fuzz` runs thousands."""
+"""Mutants in this process, half of them slow, and the fuzzer's machinery: `python -m tests.fuzz` runs thousands."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ def test_the_shots_that_mutants_are_made_from_are_sound(bases: Path, tmp_path: P
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize(
+    "part", [*range(PARTS // 2), *(pytest.param(part, marks=pytest.mark.slow) for part in range(PARTS // 2, PARTS))]
+)
 def test_mutants_end_in_a_layer_or_a_named_error(bases: Path, tmp_path: Path, part: int):
     outcomes = [attempt(number, KINDS, bases, tmp_path / str(number)) for number in SAFE[part::PARTS]]
     bad = [f"{each.number} {each.kind}: {each.result}\n{each.detail}" for each in outcomes if each.result not in GOOD]

@@ -73,7 +73,7 @@ def finishes(shot: Path, out: Path, whole: bytes, *more: str) -> None:
     assert [file.name for file in out.parent.iterdir()] == [out.name]
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_killed_run_leaves_nothing_under_the_name_and_a_rerun_finishes(
     shot: Path, whole: bytes, tmp_path: Path, seed: int
 ):
@@ -120,8 +120,15 @@ def says_interrupted(out: Path, report: Path, summary: Path, *, code: int, of: i
     return count
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    ("number", "workers"),
+    [
+        (signal.SIGTERM, "2"),
+        (signal.SIGINT, "1"),
+        pytest.param(signal.SIGTERM, "1", marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, "2", marks=pytest.mark.slow),
+    ],
+)
 def test_a_polite_signal_keeps_finished_frames_and_says_so(
     shot: Path, whole: bytes, tmp_path: Path, number: signal.Signals, workers: str
 ):
@@ -248,7 +255,10 @@ def _alive(group: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize(("megabytes", "workers"), [(0.005, "1"), (0.005, "2"), (0.5, "1"), (2.0, "1")])
+@pytest.mark.parametrize(
+    ("megabytes", "workers"),
+    [(0.005, "2"), (0.5, "1"), *(pytest.param(each, "1", marks=pytest.mark.slow) for each in (0.005, 2.0))],
+)
 def test_a_full_disk_is_a_clear_error_and_costs_no_finished_frame(
     shot: Path, whole: bytes, tmp_path: Path, megabytes: float, workers: str
 ):

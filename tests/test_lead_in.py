@@ -60,7 +60,9 @@ class TestWhereNothingIsToBeWalked:
         assert lead_in(cages, shot.frame, shot.times_until(36.0)) is None
 
 
-@pytest.mark.parametrize(("broken", "begun"), [(None, 32.0), (32.0, 28.0), (34.0, 32.0)])
+@pytest.mark.parametrize(
+    ("broken", "begun"), [(32.0, 28.0), *(pytest.param(each, 32.0, marks=pytest.mark.slow) for each in (None, 34.0))]
+)
 def test_a_frame_that_cannot_be_read_is_passed_over(skirt: Path, broken: float | None, begun: float):
     shot = open_shot(str(skirt), frames=(36.0, 40.0))
     cages = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[0])

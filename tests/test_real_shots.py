@@ -46,7 +46,9 @@ def check(data: Path, name: str, refined: tuple[Result, Path, dict]) -> None:
                 assert level["energy_after"] <= level["energy_before"]
 
 
-@pytest.mark.parametrize("name", VALID)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name.startswith("02") else name for name in VALID]
+)
 def test_a_few_frames_of_a_valid_shot(real_data: Path, tmp_path: Path, name: str):
     refined = refine(real_data, name, tmp_path, "--level", "1", "--frames", FIRST.get(name, "1:3"))
     check(real_data, name, refined)

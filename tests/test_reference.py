@@ -39,7 +39,13 @@ def bounded() -> Reference:
     return find_reference(*squeezed(), settings=ALONE, short=True)
 
 
-@pytest.mark.parametrize("method", ["quasi-newton", "quasi-newton-flat", "physgraph", "lbfgs"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "quasi-newton",
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ("quasi-newton-flat", "physgraph", "lbfgs")),
+    ],
+)
 def test_no_method_with_any_budget_ends_below_it(found: Reference, method: str):
     problem, frame = squeezed()
     for steps in (12, 24, 48, 96):

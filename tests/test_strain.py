@@ -158,7 +158,7 @@ def test_the_command_tells_before_the_first_frame_and_once(tmp_path: Path):
     assert "--rest" not in done.stderr
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_command_tells_once_of_each_of_several_shots(tmp_path: Path, workers: int):
     shots = [puffed_shot(tmp_path / name) for name in ("a.usda", "b.usda")]
     done = command("refine", *shots, "-o", tmp_path / "out", "--level", "0", "--workers", str(workers))

@@ -116,6 +116,7 @@ def test_collapsed_triangles_of_stiff_cloth_do_not_hold_up_the_rest(dtype: torch
 
 
 @pytest.mark.real_data
+@pytest.mark.slow
 def test_more_steps_do_not_end_higher(real_data: Path):
     """In denim 12 steps ended at 10.5 mJ and 200 at 23: long rounds passed through cloth and were taken back."""
     fabric = PRESETS["denim"]
