@@ -132,11 +132,11 @@ class Refiner:
     def solve(self, frame: Frame, wanted: Sequence[bool] | None = None) -> State:
         """Solve one frame, starting from the last one solved where that helps.
 
+        Garments that could not be solved follow their cages, where others could.
+
         Args:
             frame: The frame.
             wanted: For each garment, whether it is asked for; all when None.
-
-        Garments that could not be solved follow their cages, where others could.
 
         Raises:
             GarmentError: A position is out of bounds.
