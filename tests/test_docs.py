@@ -16,6 +16,7 @@ from stages import GARMENT_API, add_sheet, new_stage, save
 
 from benchmarks import trouble
 from physgraph_usd.cli import main
+from physgraph_usd.shot.options import OPTIONS
 
 ROOT = Path(__file__).resolve().parents[1]
 FOR_USERS = (
@@ -150,3 +151,5 @@ def test_the_site_builds_without_a_warning(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     assert "not included in the" not in done.stderr
     assert (tmp_path / "site" / "index.html").is_file()
+    python = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+    assert not [name for name in OPTIONS if f">{name}</span></code></td>" not in python]

@@ -1,4 +1,4 @@
-"""Which frames the solver left unsettled, unsolved, crossed or in bodies: for warnings, `--strict` and reports."""
+"""Frames that did not settle or were not solved: for warnings, `--strict` and reports."""
 
 from __future__ import annotations
 

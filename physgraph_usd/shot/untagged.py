@@ -11,14 +11,16 @@ from shlex import join
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..errors import StageError
 from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import MeshPose
-from ..solver.contact.broad_phase import NEAR, bounds_of, share_at, smallest_body
+from ..solver.colliders.sign import signed_distances
+from ..solver.contact.broad_phase import bounds_of, mean_edge
 from ..solver.mesh.threads import start_warp
 from ..solver.resolution import sample_frames
-from ..solver.scene import Frame
+from ..solver.scene import Frame, Garment
 from ..usd.read.reader import Shot, open_shot
 from ..usd.read.untagged import meshes_beside
 from ..usd.view import Stage
@@ -27,6 +29,10 @@ AUTO = "auto"
 """In place of a collider: all that the shot names, and closed meshes that garments touch."""
 MOST_ASKED = 32
 """Most open meshes that are tried as garments."""
+NEAR = 0.025
+"""How near a body is taken for one that cloth lies on [m]: solvers keep up to 2 cm, and rounding adds."""
+TRIM = 4.0
+"""Bodies without a side of so many of the cage's edges are buttons and buckles: no cloth drapes over them."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +70,15 @@ def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
     sampled = list(dict.fromkeys(frames[k] for k in (0, len(frames) // 2, -1) if frames))
     boxes = [bounds_of(np.concatenate([garment.points for garment in frame.garments])) for frame in sampled]
     boxes = [box + np.array([[-NEAR], [NEAR]]) for box in boxes]
-    least, found = smallest_body(shot.scene.garments), []
+    least, found = _smallest_body(shot.scene.garments), []
     for path, poses in meshes_beside(shot, [frame.time for frame in sampled], boxes, least=least):
         start_warp()
         body = MeshBody(device="cpu", threads=1)
         for index, pose in poses:
             cages = zip(shot.scene.garments, sampled[index].garments, strict=True)
-            shares = {g.path: share_at(body, pose, g, cage.points) for g, cage in cages if isinstance(pose, MeshPose)}
+            shares = {
+                g.path: _fraction_at(body, pose, g, cage.points) for g, cage in cages if isinstance(pose, MeshPose)
+            }
             touched = {path: share for path, share in shares.items() if share}
             if touched:
                 found.append(Beside(path, touched))
@@ -129,3 +137,30 @@ def command_of(shot: str, garments: Iterable[str], colliders: Iterable[str]) -> 
 def options_of(name: str, values: Iterable[str]) -> list[str]:
     """An option for each of some values, as words of a command."""
     return [word for value in values for word in (name, value)]
+
+
+def _smallest_body(garments: Sequence[Garment]) -> float:
+    """Longest side of the smallest body that some garment could drape over [m]."""
+    return TRIM * min(map(mean_edge, garments), default=0.0)
+
+
+def _fraction_at(body: MeshBody, pose: MeshPose, garment: Garment, cage: np.ndarray) -> float:
+    """Fraction of a cage's vertices that is in a body's closed part or near it.
+
+    Args:
+        body: The body.
+        pose: Where it is.
+        garment: The garment.
+        cage: Positions of its cage [m], shape (V, 3).
+
+    Returns:
+        The fraction; 0 where it does not touch it. A room or a sky that holds all of it, with nothing near its walls,
+        is not touched.
+    """
+    fraction, edges = 0.0, torch.as_tensor(garment.mesh.half_edges.edges)
+    for surface in body.pose(pose):
+        if surface.closed:
+            signed = signed_distances(surface, torch.as_tensor(cage - surface.origin), edges, reach=2.0 * NEAR)
+            touches = (signed.abs() <= NEAR).any() or ((signed < 0).any() and (signed > 0).any())
+            fraction = max(fraction, float((signed <= NEAR).double().mean())) if bool(touches) else fraction
+    return fraction

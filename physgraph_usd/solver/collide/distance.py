@@ -1,7 +1,7 @@
 """Closest points of a vertex and a triangle and of two edges, in double precision."""
 
 # Warp's functions are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
 import warp as wp

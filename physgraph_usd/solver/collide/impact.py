@@ -6,7 +6,7 @@ up; each sum is safe, however rounded the rest.
 """
 
 # Warp's functions are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportCallIssue=false
 from __future__ import annotations
 
 import warp as wp

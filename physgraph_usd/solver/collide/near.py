@@ -1,7 +1,7 @@
 """Every pair of parts nearer than a distance, and the shortest way between the two."""
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """A level's vertices, edges and faces in clusters, as kernels read them: what can meet what, and which are one."""
 
 # Warp's structs are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 from __future__ import annotations
 
 import numpy as np

@@ -1,7 +1,7 @@
 """Closest points on a moving triangle mesh, by Warp's bounding volume hierarchy, refitted for each pose."""
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 from dataclasses import replace

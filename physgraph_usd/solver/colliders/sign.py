@@ -6,7 +6,7 @@ that such edges join.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
 import numpy as np

@@ -6,7 +6,7 @@ f(s) = ((b - a) x (c - a)) . (p - a) vanishes, a cubic in time s; each root with
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportArgumentType=false
 # pyright: reportIndexIssue=false, reportCallIssue=false
 from __future__ import annotations
 

@@ -24,9 +24,12 @@ from ..mesh.stencil import Stencil, add_at
 from ..mesh.topology import PolygonMesh
 from .values import State
 
+NEAREST = 1e-6
+"""Distance under which points count as at one place, in edge lengths."""
+
 
 class MovingFrames:
-    """The frames of a cage and the way from them to the fine vertices.
+    """The frames of a cage and their map to the fine vertices.
 
     Attributes:
         edge: Mean edge of the cage [m].
@@ -51,7 +54,7 @@ class MovingFrames:
         return State(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
 
     def predict(
-        self, kept: State, coarse: Float[Tensor, "coarse 3"]
+        self, last: State, coarse: Float[Tensor, "coarse 3"]
     ) -> tuple[Float[Tensor, "vertices 3"], float, float]:
         """Carry detail to new cage positions.
 
@@ -59,9 +62,9 @@ class MovingFrames:
             Predicted fine positions [m], the RMS motion of the cage in mean cage edges, and its RMS turn [rad].
         """
         frames = self.frames(coarse)
-        moved = torch.einsum("vij,vj->vi", self._turned(kept.frames, frames), kept.detail)
-        motion = float((coarse - kept.coarse).square().sum(dim=1).mean().sqrt()) / self.edge
-        cosine = (torch.einsum("cij,cij->c", frames, kept.frames) - 1.0) / 2.0
+        moved = torch.einsum("vij,vj->vi", self._turned(last.frames, frames), last.detail)
+        motion = float((coarse - last.coarse).square().sum(dim=1).mean().sqrt()) / self.edge
+        cosine = (torch.einsum("cij,cij->c", frames, last.frames) - 1.0) / 2.0
         turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
         return self._level.smooth_base.apply(coarse) + moved, motion, turn
 
@@ -84,10 +87,6 @@ class MovingFrames:
         turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
         first, last = (self._level.base.apply(turned[:, :, column].contiguous()) for column in (0, 2))
         return orthonormal(last, first)
-
-
-NEAREST = 1e-6
-"""Distance under which points count as at one place, in edge lengths."""
 
 
 class Followers:

@@ -16,12 +16,12 @@ from ..scene import Frame, GarmentFrame
 from .values import State, join
 
 RETURNED = 0.25
-"""Part of the way that the input took into a broken frame by which it may miss its place before, to have come back.
-What moves on evenly misses it by twice that way, and what turns round by less only if it moves by less than an edge."""
+"""Fraction of its move into a broken frame by which the input may miss its place before it, to have come back. What
+moves on evenly misses it by twice that move, and what turns round by less only if it moves by less than an edge."""
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class SolvedFrame:
     """One garment's solved frame.
 
     Attributes:
@@ -48,7 +48,7 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class Memory:
     """Memory of one garment.
 
     Attributes:
@@ -57,8 +57,8 @@ class Kept:
         solved: Whether the last result is a solution.
     """
 
-    last: Known | None = None
-    before: Known | None = None
+    last: SolvedFrame | None = None
+    before: SolvedFrame | None = None
     solved: bool = True
 
 
@@ -74,7 +74,7 @@ class Origin:
         gap: Whether the time between samples is too long.
     """
 
-    frames: tuple[Known | None, ...]
+    frames: tuple[SolvedFrame | None, ...]
     state: State | None
     broken: float | None
     jumped: float | None
@@ -103,21 +103,21 @@ class Origin:
 
 
 def origin_of(
-    part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], *, near: Sequence[int], edge: float, gap: bool
+    part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float, gap: bool
 ) -> Origin:
     """From which frame garments start.
 
     Args:
         part: Numbers of the garments.
         frame: The frame that is to be solved.
-        kept: What is kept of each of them.
+        memories: What is remembered of each of them.
         near: The bodies that they may touch.
         edge: Mean edge of their cages [m].
         gap: Whether the time between samples is too long.
     """
-    given = {"near": near, "edge": edge}
-    broken, jumped = _broken(part, frame, kept, **given), _jumped(part, frame, kept, **given)
-    frames = tuple(each.last if broken is None else each.before for each in kept)
+    near_by = {"near": near, "edge": edge}
+    broken, jumped = _broken(part, frame, memories, **near_by), _jumped(part, frame, memories, **near_by)
+    frames = tuple(each.last if broken is None else each.before for each in memories)
     frames = frames if jumped is None else (None,) * len(part)
     known = [each for each in frames if each is not None]
     state = None if gap or len(known) < len(part) else join([each.state for each in known])
@@ -127,10 +127,10 @@ def origin_of(
 
 
 def _broken(
-    part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], *, near: Sequence[int], edge: float
+    part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the last frame, if garments' input left its place in it alone."""
-    pairs = [(each.last, each.before) for each in kept if each.last is not None and each.before is not None]
+    pairs = [(each.last, each.before) for each in memories if each.last is not None and each.before is not None]
     if len(pairs) == len(part):
         for index, (last, before) in zip(part, pairs, strict=True):
             if came_back(last, before, frame.garments[index], frame.colliders, near=near, edge=edge):
@@ -139,10 +139,10 @@ def _broken(
 
 
 def _jumped(
-    part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], *, near: Sequence[int], edge: float
+    part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the first frame, if garments' input jumped from there to the second and stays there."""
-    for index, each in zip(part, kept, strict=True):
+    for index, each in zip(part, memories, strict=True):
         first, second = each.before, each.last
         if first is None or second is None or not first.first:
             return None
@@ -151,9 +151,9 @@ def _jumped(
     return None
 
 
-def is_same(part: tuple[int, ...], frame: Frame, kept: Sequence[Kept], near: Sequence[int]) -> bool:
+def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], near: Sequence[int]) -> bool:
     """Whether garments and the bodies that they may touch are what they were, and solved together."""
-    for index, each in zip(part, (each.last for each in kept), strict=True):
+    for index, each in zip(part, (each.last for each in memories), strict=True):
         if each is None or each.part != part or near != each.near:
             return False
         now, then = frame.garments[index], each.frame
@@ -170,7 +170,7 @@ def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
     return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 
-def cage_moved(known: Known, now: GarmentFrame) -> float:
+def cage_moved(known: SolvedFrame, now: GarmentFrame) -> float:
     """How far any point of a garment's cage has moved since a frame [m]; infinite where that is no length."""
     if now.points.shape != known.frame.points.shape:
         return np.inf
@@ -178,7 +178,7 @@ def cage_moved(known: Known, now: GarmentFrame) -> float:
     return far if np.isfinite(far) else np.inf
 
 
-def bodies_moved(known: Known, colliders: Sequence[Pose | None], near: Sequence[int]) -> float:
+def bodies_moved(known: SolvedFrame, colliders: Sequence[Pose | None], near: Sequence[int]) -> float:
     """How far any of some bodies has moved since a frame [m]; infinite where one cannot be compared."""
     farthest = 0.0
     for body in near:
@@ -188,7 +188,13 @@ def bodies_moved(known: Known, colliders: Sequence[Pose | None], near: Sequence[
 
 
 def came_back(
-    last: Known, before: Known, now: GarmentFrame, colliders: Sequence[Pose | None], *, near: Sequence[int], edge: float
+    last: SolvedFrame,
+    before: SolvedFrame,
+    now: GarmentFrame,
+    colliders: Sequence[Pose | None],
+    *,
+    near: Sequence[int],
+    edge: float,
 ) -> bool:
     """Whether the input left its place in the last frame alone.
 
@@ -206,8 +212,8 @@ def came_back(
 
 
 def jumped_in(
-    first: Known,
-    second: Known,
+    first: SolvedFrame,
+    second: SolvedFrame,
     now: GarmentFrame,
     colliders: Sequence[Pose | None],
     *,

@@ -23,6 +23,17 @@ from .level_forces import LevelForces
 from .start import Start, start_of
 from .values import Cage, FrameInput, State
 
+LONGER, LONGER_CUDA = 4, 8
+"""Steps of the finest level alone over those that it takes after coarse ones, on the CPU and on CUDA."""
+CROWDED = 0.1
+"""Fraction of the vertices with cloth near them from which a cold frame goes through the levels."""
+DEEP = 2
+"""Subdivisions from which the network makes the steps of a cold frame that goes through the levels, on the CPU too."""
+RESTING = 0.05
+"""Remaining move of the cage, in its edge lengths, under which it is nearly at rest."""
+FAR = 0.4
+"""Remaining move of the cage from which it is far from rest; under it CUDA solves cold frames at the finest level."""
+
 
 @dataclass(frozen=True, eq=False)
 class LevelProblem:
@@ -221,18 +232,6 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         before=before,
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
     )
-
-
-LONGER, LONGER_CUDA = 4, 8
-"""Steps of the finest level alone over those that it takes after coarse ones, on the CPU and on CUDA."""
-CROWDED = 0.1
-"""Fraction of the vertices with cloth near them from which a cold frame goes through the levels."""
-DEEP = 2
-"""Subdivisions from which the network makes the steps of a cold frame that goes through the levels, on the CPU too."""
-RESTING = 0.05
-"""Remaining move of the cage, in its edge lengths, under which it is nearly at rest."""
-FAR = 0.4
-"""Remaining move of the cage from which it is far from rest; under it CUDA solves cold frames at the finest level."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..deadline import ends_after
 from ..mesh.subdivide import Refinement
 from ..scene import Frame, Scene, State, refuse_far
 from .group import Group
-from .history import Kept
+from .history import Memory
 from .scene_frame import SceneCloth, SceneFrame
 from .settings import SolveSettings
 
@@ -65,7 +65,7 @@ class Refiner:
         self._cloth = SceneCloth(scene, chosen, dtype=dtype, device=device, threads=threads)
         self._passed = Passed(scene.garments, scene.colliders, device=device, threads=threads)
         self.scene, self._settings, self._heat_map = scene, settings, heat_map
-        self._kept = (Kept(),) * len(scene.garments)
+        self._memories = (Memory(),) * len(scene.garments)
         self._time: float | None = None
         self._walked: tuple[Sequence[np.ndarray | None], float] | None = None
         self._seconds: list[float] = []  # What frames took that came to their end.
@@ -88,7 +88,7 @@ class Refiner:
         """Start the next frame cold, as if it were the first."""
         self._passed.forget()
         self._cloth.bodies.forget()
-        self._kept, self._time, self._walked = (Kept(),) * len(self._kept), None, None
+        self._memories, self._time, self._walked = (Memory(),) * len(self._memories), None, None
 
     def begin_at(self, cages: Refiner, *, since: float) -> None:
         """Start the first frame, where it is cold, with the cage that another refiner walked to it.
@@ -97,7 +97,7 @@ class Refiner:
             cages: A refiner of the same scene that does not subdivide, and has solved that frame.
             since: The time code from which it walked, for the report.
         """
-        self._walked = [None if each.last is None else each.last.points for each in cages._kept], since
+        self._walked = [None if each.last is None else each.last.points for each in cages._memories], since
 
     def use(self, settings: SolveSettings) -> None:
         """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
@@ -168,8 +168,8 @@ class Refiner:
         count = len(frame.garments)
         asked = [True] * count if wanted is None else list(wanted)
         now = {"gap": gap, "walked": self._walked, "limit": self._limit}
-        answers, reused = SceneFrame(self._cloth, self._settings, frame, self._kept, **now).solve(asked)
-        self._kept = tuple(answers[index].kept if index in answers else self._kept[index] for index in range(count))
+        answers, reused = SceneFrame(self._cloth, self._settings, frame, self._memories, **now).solve(asked)
+        self._memories = tuple(answers[k].memory if k in answers else each for k, each in enumerate(self._memories))
         self._time, self._walked = frame.time, None
         points = [answers[index].points if index in answers and asked[index] else None for index in range(count)]
         absent: dict[str, object] = {"start": "left out: the garment has no sample here"}
@@ -216,8 +216,8 @@ class Refiner:
 
     def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
         """A garment's heat map, where it has positions [m]."""
-        kept = self._kept[index]
-        crossing = kept.last.crossing if kept.solved and kept.last is not None else None
+        memory = self._memories[index]
+        crossing = memory.last.crossing if memory.solved and memory.last is not None else None
         return None if points is None else self._cloth.heat(index, points, crossing)
 
     def _is_gap(self, time: float | None) -> bool:

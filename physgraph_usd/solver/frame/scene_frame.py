@@ -19,7 +19,7 @@ from ..mesh.topology import edges_of
 from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
-from .history import Kept, Known, is_same, origin_of
+from .history import Memory, SolvedFrame, is_same, origin_of
 from .settings import SolveSettings
 from .solve import solve_frame
 from .values import FrameInput, split
@@ -135,12 +135,12 @@ class Answer:
     Attributes:
         points: Fine positions [m], world space.
         telemetry: What the report says.
-        kept: What its next frame needs.
+        memory: What its next frame needs.
     """
 
     points: np.ndarray
     telemetry: dict[str, object]
-    kept: Kept
+    memory: Memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class SceneFrame:
         cloth: What the scene is solved with; its bodies are posed.
         settings: How to solve.
         frame: The frame.
-        kept: What is kept of each garment's last frames.
+        memories: What is remembered of each garment's last frames.
         gap: Whether the time since the last frame is too long to start from it.
         walked: World positions of each cage [m] that another refiner walked here, and from which time code; or None.
         limit: Seconds after which the frame stops where it stands.
@@ -160,7 +160,7 @@ class SceneFrame:
     cloth: SceneCloth
     settings: SolveSettings
     frame: Frame
-    kept: Sequence[Kept]
+    memories: Sequence[Memory]
     gap: bool
     walked: tuple[Sequence[np.ndarray | None], float] | None
     limit: float
@@ -175,9 +175,9 @@ class SceneFrame:
         unsolved = dict[tuple[int, ...], SolveError]()
         for part in self.cloth.parts_of(self.frame, self.settings):
             near = self.cloth.near(part, [self.frame.garments[index] for index in part], self.settings)
-            same = is_same(part, self.frame, [self.kept[index] for index in part], near)
+            same = is_same(part, self.frame, [self.memories[index] for index in part], near)
             for index in part:
-                reused[index] = same and self.kept[index].solved
+                reused[index] = same and self.memories[index].solved
             if not any(asked[index] for index in part):
                 continue
             try:
@@ -195,26 +195,28 @@ class SceneFrame:
         first, points = self.cloth.scene.garments[part[0]], self.frame.garments[part[0]].points
         if has_collapsed(first, points):  # It is alone, and the next frame starts from the last one solved.
             entry = {"start": "not solved: the cage has collapsed", "collapsed": size_left(first, points)}
-            return [Answer(self.cloth.upsampled(part[0], points), entry, replace(self.kept[part[0]], solved=False))]
+            return [Answer(self.cloth.upsampled(part[0], points), entry, replace(self.memories[part[0]], solved=False))]
         if not same:
             return self._solve_part(part, near)
-        found = [(self.kept[index], self.kept[index].last) for index in part]
+        memories = [self.memories[index] for index in part]
         entry: dict[str, object] = {"start": "reused: the input equals the last frame's"}
-        return [Answer(last.points, entry, replace(kept, solved=True)) for kept, last in found if last is not None]
+        return [
+            Answer(each.last.points, entry, replace(each, solved=True)) for each in memories if each.last is not None
+        ]
 
     def _on_cages(self, part: tuple[int, ...], error: SolveError) -> list[Answer]:
         """Garments that could not be solved, on their cages' smooth surface; the next frame starts from one before."""
         entry: dict[str, object] = {"start": "not solved: it follows its cage", "not_solved": str(error)}
         points = self.cloth.group(part, self.settings).upsampled([self.frame.garments[index] for index in part])
-        kept = [replace(self.kept[index], solved=False) for index in part]
-        return [Answer(x, entry, each) for x, each in zip(points, kept, strict=True)]
+        memories = [replace(self.memories[index], solved=False) for index in part]
+        return [Answer(x, entry, each) for x, each in zip(points, memories, strict=True)]
 
     def _solve_part(self, part: tuple[int, ...], near: tuple[int, ...]) -> list[Answer]:
         """Solve garments together; bodies that the cloth reaches only as it is solved are taken up."""
-        frames, kept = [self.frame.garments[index] for index in part], [self.kept[index] for index in part]
+        frames, memories = [self.frame.garments[index] for index in part], [self.memories[index] for index in part]
         group = self.cloth.group(part, self.settings)
         edge = float(group.levels[0].spacing.mean())
-        origin = origin_of(part, self.frame, kept, near=near, edge=edge, gap=self.gap)
+        origin = origin_of(part, self.frame, memories, near=near, edge=edge, gap=self.gap)
         cage = None if origin.state is not None else self._cage_walked(part)
         while True:
             touching, moved = self.cloth.touching(part, frames, near), origin.moved(part, self.frame, near)
@@ -231,12 +233,12 @@ class SceneFrame:
         )
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         found = list[Answer]()
-        for place, (index, own) in enumerate(zip(part, kept, strict=True)):
+        for place, (index, memory) in enumerate(zip(part, memories, strict=True)):
             at = self.frame.time, self.frame.garments[index], self.frame.colliders, near, part
             points, crossing = solved.points[place], solved.crossing[place]
-            now = Known(*at, points, states[place], crossing, first=own.last is None)
-            before = own.last if origin.broken is None else origin.frames[place]
-            found.append(Answer(points, entry, Kept(now, before)))
+            now = SolvedFrame(*at, points, states[place], crossing, first=memory.last is None)
+            before = memory.last if origin.broken is None else origin.frames[place]
+            found.append(Answer(points, entry, Memory(now, before)))
         return found
 
     def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
@@ -258,7 +260,7 @@ class SceneFrame:
     def _refuse_strayed(self, part: tuple[int, ...], points: Sequence[np.ndarray]) -> None:
         """Refuse cloth that is no more where its cage is."""
         for index, fine in zip(part, points, strict=True):
-            last = self.kept[index].last
+            last = self.memories[index].last
             before = None if last is None else last.frame.points
             if wrong := strayed(self.frame.garments[index].points, fine, before=before):
                 when = "" if self.frame.time is None else f" at time code {self.frame.time:g}"

@@ -20,6 +20,10 @@ from torch import Tensor
 from .base import Carry, Solver, System
 from .secants import Secant, dot, secant_direction
 
+ARMIJO = 1e-4
+MAX_BACKTRACKS = 12
+SHORTENED = 0.01
+"""Fraction of its length to which a step is shortened from which on secants are dropped and the metric is stiffened."""
 TURN = math.cos(math.radians(45.0))
 """Cosine of the angle by which a triangle may turn in a step that failed: the angle between two neighbours then
 changes by a quarter turn at most, so that none is turned over."""
@@ -51,12 +55,6 @@ def truncated(
             break
         part[torch.unique(corners[turned])] *= 0.5
     return part * move if bool((part < 1.0).any()) else None
-
-
-ARMIJO = 1e-4
-MAX_BACKTRACKS = 12
-SHORTENED = 0.01
-"""Part of its length to which a step is shortened from which on the secants are dropped and the metric is stiffened."""
 
 
 class QuasiNewton:
