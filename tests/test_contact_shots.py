@@ -19,12 +19,6 @@ SHOTS: dict[str, tuple[list[str], list[str], tuple[float, float]]] = {
     "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], ["Cesium_Man_2"], (36, 37)),
     "12_variants/b_winding_flipped_unflagged.usdc": (["/shot/shirt"], ["/shot/body"], (6, 7)),
 }
-CAUGHT = {
-    "01_newton_shirt_dab_cm.usdc": [
-        pytest.mark.xfail(reason="two of 22,312 vertices stay 8 mm inside the body, where cloth holds cloth")
-    ],
-}
-"""Where cloth may not newly cross, and so cannot leave the body."""
 FAST = ("01_newton_shirt_dab_cm.usdc", "08_sphere_spin_xformcollider.usdc")
 SLOW = {name: [pytest.mark.slow] for name in SHOTS if name not in FAST}
 
@@ -58,9 +52,7 @@ def test_samples(sample: Callable[[str], Path], tmp_path: Path, name: str, frame
 
 
 @pytest.mark.real_data
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[*CAUGHT.get(name, ()), *SLOW.get(name, ())]) for name in SHOTS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in SHOTS])
 def test_real_shots(real_data: Path, tmp_path: Path, name: str):
     garments, colliders, frames = SHOTS[name]
     shot = real_data / "shots" / name

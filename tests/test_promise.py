@@ -7,8 +7,8 @@ import torch
 from brute import Soup, crossings
 from folds import EDGE, levels_of, named, promise_of, square
 
+from physgraph_usd.solver.collide.narrow_phase import Pairs
 from physgraph_usd.solver.collide.near import weights
-from physgraph_usd.solver.collide.sweep import Pairs
 from physgraph_usd.solver.contact.along import COMES, along
 from physgraph_usd.solver.level import Placed
 

@@ -10,9 +10,9 @@ import torch
 from brute import Soup, between_edges, crossings, on_segments, on_triangles
 from folds import SHAPES, folded, frame_with, levels_of, named, placed, refiner_with, square, strip
 
+from physgraph_usd.solver.collide.narrow_phase import Reach
 from physgraph_usd.solver.collide.near import near_pairs
 from physgraph_usd.solver.collide.parts import Parts
-from physgraph_usd.solver.collide.sweep import Reach
 from physgraph_usd.solver.level import Level
 
 ONE = np.ones((1, 1), bool)
@@ -21,7 +21,7 @@ ONE = np.ones((1, 1), bool)
 def reach_of(level: Level, within: float) -> Reach:
     """What is near within a distance [m], however near it is at rest."""
     radius = torch.full((level.vertex_count,), 0.5 * within, dtype=torch.float64)
-    return Reach(radius, torch.full_like(radius, 1e3), 0.0)
+    return Reach(radius, torch.zeros_like(radius), 1e9)
 
 
 class TestCagesThatPassThroughOneAnother:

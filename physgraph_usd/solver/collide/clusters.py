@@ -36,7 +36,7 @@ class Clusters:
         """
         start_warp()  # Views of tensors do not start Warp by themselves.
         self._device = level.device
-        cluster = _in_space(_gathered(beside), level)
+        cluster = _in_space(gathered(beside), level)
         self.count = int(cluster.max(initial=-1)) + 1
         edges, triangles = (each.cpu().numpy() for each in (level.edges, level.triangles))
         owner, of_face = np.zeros(len(edges), np.int64), cluster[triangles[:, 0]]
@@ -73,7 +73,7 @@ def _in_space(cluster: np.ndarray, level: Level) -> np.ndarray:
     return rank[cluster]
 
 
-def _gathered(beside: sp.csr_matrix) -> np.ndarray:
+def gathered(beside: sp.csr_matrix) -> np.ndarray:
     """The cluster of each vertex: roots no two of which are neighbours, and their neighbours (Luby 1986).
 
     Clusters have the order of their roots.

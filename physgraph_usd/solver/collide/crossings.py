@@ -12,8 +12,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..mesh.piercing import volume
-from .parts import Parts, Topology
-from .sweep import IMPACTS, ROUNDING, Found, Motion, Pairs, Sweep, Swept, has, is_one, overlap, write
+from .boxes import ROUNDING, Boxes, Motion, outside, overlap
+from .detector import Detector
+from .narrow_phase import Found, has, is_one, write
+from .parts import Parts
+from .topology import Topology
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,43 +71,6 @@ def is_through(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, t: wp.vec3i):
     return turns_left(x, e, t[1], t[2]) == first and turns_left(x, e, t[2], t[0]) == first
 
 
-@wp.kernel
-def edges_through(
-    first: wp.int32,
-    parts: Topology,
-    motion: Motion,
-    sweep: Sweep,
-    tree: wp.uint64,
-    low: wp.array(dtype=wp.vec3f),
-    high: wp.array(dtype=wp.vec3f),
-    found: Found,
-):
-    """Count the faces that edges of a cluster pass through, and write them from where the cluster's begin."""
-    i = first + wp.tid()
-    if low[i][0] > high[i][0] or found.begin[i + 1] == found.begin[i]:
-        return
-    count, j = wp.int32(0), wp.int32(0)
-    query = wp.bvh_query_aabb(tree, low[i], high[i])
-    while wp.bvh_query_next(query, j):
-        if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
-            continue
-        for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
-            e = parts.edges[k]
-            if not overlap(sweep.edge_low[k], sweep.edge_high[k], low[j], high[j]):
-                continue
-            for m in range(parts.first_face[j], parts.first_face[j + 1]):
-                if not overlap(sweep.edge_low[k], sweep.edge_high[k], sweep.face_low[m], sweep.face_high[m]):
-                    continue
-                t = parts.faces[m]
-                if has(t, e[0]) or has(t, e[1]) or touches(parts, e, t):
-                    continue
-                if is_through(motion.start, e, t):
-                    numbers = wp.vec4i(parts.edge_number[k], parts.face_number[m], 0, 0)
-                    write(found, i, count, numbers, wp.float64(0.0), False)
-                    count += 1
-    found.count[i] = count
-
-
 @wp.func
 def touches(parts: Topology, e: wp.vec2i, t: wp.vec3i):
     """Whether an edge is sewn to a face."""
@@ -115,15 +81,62 @@ def touches(parts: Topology, e: wp.vec2i, t: wp.vec3i):
     return False
 
 
-def crossings(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Crossings:
+@wp.func
+def edges_through(
+    parts: Topology,
+    motion: Motion,
+    boxes: Boxes,
+    found: Found,
+    owner: wp.int32,
+    i: wp.int32,
+    j: wp.int32,
+    count: wp.int32,
+):
+    """Write the edges of a cluster that pass through faces of another, with these; the number of pairs so far."""
+    for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
+        e = parts.edges[k]
+        near, far = motion.start[e[0]], motion.start[e[1]]
+        if outside(wp.min(near, far), wp.max(near, far), boxes.low[j], boxes.high[j], wp.float64(0.0)):
+            continue
+        for m in range(parts.first_face[j], parts.first_face[j + 1]):
+            if not overlap(boxes.edge_low[k], boxes.edge_high[k], boxes.face_low[m], boxes.face_high[m]):
+                continue
+            t = parts.faces[m]
+            if has(t, e[0]) or has(t, e[1]) or touches(parts, e, t):
+                continue
+            if is_through(motion.start, e, t):
+                numbers = wp.vec4i(parts.edge_number[k], parts.face_number[m], 0, 0)
+                write(found, owner, count, numbers, wp.float64(0.0), False)
+                count += 1
+    return count
+
+
+@wp.kernel
+def find_crossings(
+    first: wp.int32, parts: Topology, clusters: wp.array(dtype=wp.vec2i), motion: Motion, boxes: Boxes, found: Found
+):
+    """The edges of either of two clusters that pass through faces of the other, so far as there is room."""
+    n = first + wp.tid()
+    i, j = clusters[n][0], clusters[n][1]
+    if found.begin[n + 1] == found.begin[n]:
+        return
+    if outside(boxes.low[i], boxes.high[i], boxes.low[j], boxes.high[j], wp.float64(0.0)):
+        return
+    count = edges_through(parts, motion, boxes, found, n, i, j, 0)
+    if i != j:
+        count = edges_through(parts, motion, boxes, found, n, j, i, count)
+    found.count[n] = count
+
+
+def crossings(parts: Parts, x: Float[Tensor, "vertices 3"], *, detector: Detector | None = None) -> Crossings:
     """Every edge that passes through a face which it shares no vertex with, nor is sewn to.
 
     Args:
         parts: The parts.
         x: Positions [m].
+        detector: What has detected before with the same parts, or None.
     """
-    at = x.double()
-    numbers: Pairs = Swept(parts, at, torch.zeros_like(at)).found(edges_through, IMPACTS)
+    numbers = (detector or Detector.once(parts)).still(find_crossings, x)
     edge, face = numbers.corners.long()[:, 0], numbers.corners.long()[:, 1]
     order = torch.argsort(edge * max(len(parts.level.triangles), 1) + face)
     return Crossings(edge[order], face[order])

@@ -45,6 +45,12 @@ def kept_of(distance: wp.float64, share: wp.float64, floor: wp.float64):
 
 
 @wp.func
+def can_meet(distance: wp.float64, bound: wp.float64, share: wp.float64, floor: wp.float64):
+    """Whether parts at least a distance apart that come nearer by at most a bound may come nearer than they may."""
+    return distance - kept_of(distance, share, floor) < bound
+
+
+@wp.func
 def impact_of(
     face: wp.bool,
     a: wp.vec3d,

@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.threads import Launch
+from .detector import Detector
 from .distance import weights_of
+from .narrow_phase import Reach
 from .parts import Parts
-from .sweep import Listed, Reach, Swept
 
 wp.set_module_options({"enable_backward": False})
 
@@ -67,20 +68,19 @@ def weights(
     return out
 
 
-def near_pairs(parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, listed: Listed | None = None) -> NearPairs:
+def near_pairs(
+    parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, detector: Detector | None = None
+) -> NearPairs:
     """Every vertex and face, and every two edges, that share no vertex and are as near as is asked for.
 
     Args:
         parts: The parts.
         x: Positions [m].
         near: How near; what is near at rest may come too where it is not as near as the radii say.
-        listed: Pairs among which those are, by what they were found with, or None.
+        detector: What has detected before with the same parts and reach, or None.
     """
     at = x.double()
-    if listed is not None and listed.covers(x):
-        pairs = listed.pairs
-    else:
-        pairs = Swept(parts, at, torch.zeros_like(at), near=near).near()
+    pairs = (detector or Detector.once(parts, near)).near(x)
     weight, corners = weights(at, pairs.corners, pairs.face, threads=parts.level.threads), pairs.corners.long()
     way = (weight.unsqueeze(2) * at[corners]).sum(dim=1)
     radius = near.radius[corners]

@@ -1,4 +1,4 @@
-"""A level's vertices, edges and faces in clusters, as kernels read them: what can meet what, and which are one."""
+"""The parts of a level's cloth: which can meet which, and which are one."""
 
 # Warp's structs are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
@@ -7,33 +7,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Int
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from ..level import Level
 from ..mesh.topology import adjacency, owned_sides
 from .clusters import Clusters
-
-
-@wp.struct
-class Topology:
-    """What moves, by cluster; corners are all the vertices of a cluster's parts, each once."""
-
-    first_corner: wp.array(dtype=wp.int32)
-    corners: wp.array(dtype=wp.int32)
-    first_vertex: wp.array(dtype=wp.int32)
-    vertices: wp.array(dtype=wp.int32)
-    first_edge: wp.array(dtype=wp.int32)
-    edges: wp.array(dtype=wp.vec2i)
-    edge_number: wp.array(dtype=wp.int32)
-    first_face: wp.array(dtype=wp.int32)
-    faces: wp.array(dtype=wp.vec3i)
-    face_number: wp.array(dtype=wp.int32)
-    garment: wp.array(dtype=wp.int32)
-    meets: wp.array(dtype=wp.int32)
-    garments: wp.int32
-    label: wp.array(dtype=wp.int32)
-    owner: wp.array(dtype=wp.int32)
-    rest: wp.array(dtype=wp.vec3d)
+from .patches import MonotonePatches
+from .topology import Topology
 
 
 class Parts:
@@ -43,6 +24,7 @@ class Parts:
         level: The level.
         count: Number of clusters.
         topology: What kernels read.
+        patches: Its monotone patches.
         links: Vertices that hang together: the edges, and what is sewn, shape (N, 2), int64.
         lengths: Of these at rest, 0 where sewn [m], shape (N,), float64.
         spacing: Mean length of the edges at rest [m].
@@ -66,6 +48,9 @@ class Parts:
         table.first_edge, table.edges, table.edge_number = clusters.edges
         table.first_face, table.faces, table.face_number = clusters.faces
         table.first_corner, table.corners = (self._array(each) for each in _corners(clusters))
+        self._corner = wp.to_torch(table.corners).long()
+        counts = wp.to_torch(table.first_corner).diff().long()
+        self._cluster = torch.arange(self.count, device=level.device).repeat_interleave(counts)
         table.garment, table.garments = clusters.garment, len(meets)
         table.meets = self._array(np.asarray(meets).ravel())
         sewn = np.zeros((0, 2), np.int64) if label is None else _sewn(label)
@@ -78,7 +63,13 @@ class Parts:
         table.owner = self._array(level.vertex_garment.cpu().numpy())
         self._rest = level.rest.double().contiguous()
         table.rest = wp.from_torch(self._rest, dtype=wp.vec3d)
+        self.patches = MonotonePatches.of(level, table, self.count)
         table.label = self._array(np.arange(level.vertex_count) if label is None else label)
+
+    def least_of(self, values: Float[Tensor, " vertices"]) -> Float[Tensor, " clusters"]:
+        """The least of some values at the corners of each cluster."""
+        out = torch.full((self.count,), torch.inf, dtype=values.dtype, device=values.device)
+        return out.scatter_reduce(0, self._cluster, values[self._corner], "amin")
 
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=self.level.device)

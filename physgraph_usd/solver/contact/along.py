@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..collide.narrow_phase import Pairs
 from ..collide.near import weights
-from ..collide.sweep import Pairs
 from ..mesh.stencil import add_at
 
 COMES = 0.5

@@ -2,89 +2,106 @@
 
 Springs shorten a contour step by step and stop where the cloth between is stretched. Which piece is on the wrong side
 is known at once, the smaller one (Baraff, Witkin and Kass 2003): its vertices are laid as far above the other cloth as
-they were under it, but at most a gap, so a dent, a corner or half a sheet comes back whole, however deep it was.
+they were under it, but at most a gap, so a dent, a corner or half a sheet comes back whole, however deep it was. All
+pieces go at once.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import scipy.sparse as sp
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..collide.closest import ways_to
 from ..collide.crossings import Crossings, crossings
-from ..colliders.mesh import MeshSurface
-from ..colliders.pose import MeshPose
+from ..collide.detector import Detector
 from ..deadline import is_over
 from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
 
 PASSES = 6
-"""Most pieces' goes: a piece laid back may uncover another contour."""
+"""Most times that pieces go back: one may uncover another contour."""
 WIDER = (0.0, 0.25, 0.5)
 """Least gaps that are tried, in mean edges: faces of curved cloth come through ones that lie closer than they sag."""
 BESIDE = 2
-"""Rings round a piece that are its own cloth and no barrier to it."""
+"""Rings round a piece that are its own cloth, which it cannot have gone through."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Through:
+    """Vertices of pieces that went through other cloth.
+
+    Attributes:
+        vertices: Their numbers, shape (N,), int64.
+        way: From the closest point of that cloth to each [m], shape (N, 3).
+    """
+
+    vertices: Int[Tensor, " vertices"]
+    way: Float[Tensor, "vertices 3"]
+
+    def back(self, x: Tensor, gap: float) -> Tensor:
+        """Positions in which they lie on the other side, as far as they were through, but at most a gap [m]."""
+        out, length = x.clone(), self.way.norm(dim=1, keepdim=True)
+        beyond = length.clamp_max(gap) / length.clamp_min(1e-30)
+        out[self.vertices] = x[self.vertices] - ((1.0 + beyond) * self.way).to(x)
+        return out
 
 
 def drawn_apart(
-    mesh: ClothMesh, x: Float[Tensor, "vertices 3"], *, gap: float
-) -> tuple[Float[Tensor, "vertices 3"], int, int]:
+    mesh: ClothMesh, x: Float[Tensor, "vertices 3"], start: Crossings, *, gap: float, detector: Detector
+) -> tuple[Float[Tensor, "vertices 3"], int]:
     """Lay pieces that contours cut off back to their side, while fewer parts cross.
 
     Args:
         mesh: The cloth of one level.
         x: Positions [m].
+        start: What crosses there.
         gap: Distance that they end from what they were behind [m], or a part of an edge where that crosses less.
+        detector: What detects this cloth.
 
     Returns:
-        Positions [m], x itself where nothing gets better, and the number of crossings before and after.
+        Positions [m], x itself where nothing gets better, and the number of crossings there.
     """
-    start = _look(mesh, x)
-    best = (x, start)
+    best, first = (x, start), None
     for least in WIDER:
         if not best[1].count or is_over():
             break
-        found = _in_passes(mesh, x, start, gap=max(gap, least * float(mesh.level.spacing.mean())))
-        best = found if found[1].count < best[1].count else best
-    return best[0], start.count, best[1].count
+        first = _gone_through(mesh, start, x) if first is None else first
+        wide = max(gap, least * float(mesh.level.spacing.mean()))
+        at, found, through = x, start, first
+        for _ in range(PASSES):
+            moved = through.back(at, wide)
+            after = crossings(mesh.parts, moved, detector=detector)
+            if after.count >= found.count:
+                break
+            at, found = moved, after
+            if not found.count or is_over():
+                break
+            through = _gone_through(mesh, found, at)
+        best = (at, found) if found.count < best[1].count else best
+    return best[0], best[1].count
 
 
-def _in_passes(mesh: ClothMesh, x: Tensor, found: Crossings, *, gap: float) -> tuple[Tensor, Crossings]:
-    """Lay pieces back while fewer parts cross; the positions, and what crosses there."""
-    for _ in range(PASSES):
-        moved = _lay_back(mesh, found, x, gap=gap)
-        after = _look(mesh, moved)
-        if after.count >= found.count:
-            break
-        x, found = moved, after
-        if not found.count:
-            break
-    return x, found
-
-
-def _look(mesh: ClothMesh, x: Tensor) -> Crossings:
-    """What crosses at x [m]."""
-    return crossings(mesh.parts, x)
-
-
-def _lay_back(mesh: ClothMesh, found: Crossings, x: Tensor, *, gap: float) -> Tensor:
-    """Each chosen piece on the other side of the cloth that it went through."""
-    out = x.clone()
-    for piece, barrier in _chosen(mesh, found):
-        faces = mesh.level.triangles.cpu().numpy()[barrier[mesh.triangles].all(dim=1).cpu().numpy()]
-        which = torch.nonzero(piece & mesh.level.free[:, 0]).squeeze(1)
-        if not len(faces) or not len(which):
-            continue
-        never = np.zeros(faces.shape, bool)
-        pose = MeshPose(out.double().cpu().numpy(), faces)
-        surface = MeshSurface(pose, faces, (never, never), device=str(x.device), threads=mesh.level.threads)
-        asked = out[which] - torch.as_tensor(surface.origin).to(x)
-        near = surface.closest(asked, torch.full_like(asked[:, 0], float("inf")))
-        back = near.point - asked
-        beyond = near.distance.clamp_max(gap).unsqueeze(1) * torch.nn.functional.normalize(back, dim=1, eps=1e-30)
-        out[which] = out[which] + back + beyond
-    return out
+def _gone_through(mesh: ClothMesh, found: Crossings, x: Tensor) -> _Through:
+    """The vertices of the smallest pieces that every contour has one of, and how far they are through other cloth."""
+    piece, met = _chosen(mesh, found)
+    count = met.shape[0]
+    inside = torch.as_tensor(piece >= 0, device=x.device) & mesh.level.free[:, 0]
+    vertices = torch.nonzero(inside).squeeze(1)
+    which = torch.as_tensor(piece, device=x.device)[vertices]
+    own = sp.csr_matrix(
+        (np.ones(int((piece >= 0).sum()), np.float32), (piece[piece >= 0], np.flatnonzero(piece >= 0))), shape=met.shape
+    )
+    rings = np.ceil(np.sqrt(np.bincount(piece[piece >= 0], minlength=count))).astype(int) + BESIDE
+    barrier = _grown(mesh, met, rings) - _grown(mesh, own, np.full(count, BESIDE))
+    barrier = sp.csr_matrix(barrier > 0)
+    way = ways_to(mesh.level, x, vertices, which, _faces_of(mesh, barrier))
+    kept = torch.nonzero((way != 0).any(dim=1)).squeeze(1)
+    return _Through(vertices[kept], way[kept])
 
 
 def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -110,33 +127,50 @@ def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray
     return piece, area < largest[whole[first]], area
 
 
-def _chosen(mesh: ClothMesh, found: Crossings) -> list[tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]]:
-    """The smallest pieces that every contour has one of, and the cloth that each of them went through."""
+def _chosen(mesh: ClothMesh, found: Crossings) -> tuple[Int[np.ndarray, " vertices"], sp.csr_matrix]:
+    """The smallest pieces that every contour has one of.
+
+    Returns:
+        The row of the piece that each vertex is in, -1 where in none, and the vertices that each piece met, shape
+        (pieces, V).
+    """
     piece, off, area = pieces_of(mesh, found)
+    rank = np.empty(len(area), np.int64)
+    rank[np.argsort(area, kind="stable")] = np.arange(len(area))
     corners = mesh.corners_of(found).cpu().numpy()
     pieces = piece[corners]
-    left = np.ones(len(corners), bool)
-    candidates = np.unique(pieces[off[pieces]])
-    chosen = []
-    for number in candidates[np.argsort(area[candidates], kind="stable")]:
-        of_edge, of_face = (pieces == number)[:, :2].any(axis=1), (pieces == number)[:, 2:].any(axis=1)
-        own = left & (of_edge ^ of_face)
-        if not own.any():
-            continue
-        left &= ~own
-        met = np.zeros(mesh.level.vertex_count, bool)
-        met[corners[own & of_edge, 2:]] = True
-        met[corners[own & of_face, :2]] = True
-        chosen.append(_with_barrier(mesh, piece == number, met))
-    return chosen
+    of_edge = (pieces[:, :, None] == pieces[:, None, :2]).any(axis=2)
+    of_face = (pieces[:, :, None] == pieces[:, None, 2:]).any(axis=2)
+    order = np.where(off[pieces] & (of_edge ^ of_face), rank[pieces], len(area))
+    place = order.argmin(axis=1)
+    has = np.flatnonzero(order.min(axis=1) < len(area))
+    numbers, row = np.unique(pieces[has, place[has]], return_inverse=True)
+    # What a piece met is the face where the piece has the edge, and the edge where it has the face.
+    by_edge = of_edge[has, place[has]]
+    other = np.where(by_edge[:, None], corners[has][:, [2, 3, 4]], corners[has][:, [0, 1, 1]])
+    met = sp.csr_matrix(
+        (np.ones(other.size, np.float32), (np.repeat(row, 3), other.ravel())),
+        shape=(len(numbers), mesh.level.vertex_count),
+    )
+    rows = np.full(len(area), -1, np.int64)
+    rows[numbers] = np.arange(len(numbers))
+    return rows[piece], met
 
 
-def _with_barrier(
-    mesh: ClothMesh, piece: np.ndarray, met: np.ndarray
-) -> tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-    """A piece, and the cloth round what it met, as far as the piece is wide."""
-    device = mesh.level.rest.device
-    inside, around = (torch.as_tensor(each, device=device) for each in (piece, met))
-    own = mesh.grown(inside, BESIDE)
-    rings = int(np.ceil(np.sqrt(piece.sum()))) + BESIDE
-    return inside, mesh.grown(around, rings) & ~own
+def _grown(mesh: ClothMesh, some: sp.csr_matrix, rings: np.ndarray) -> sp.csr_matrix:
+    """Each row's vertices and those at most so many edges from them as the row has rings; ones, float32."""
+    grown = sp.csr_matrix(some > 0).astype(np.float32)
+    for ring in range(int(rings.max(initial=0))):
+        more = sp.diags((rings > ring).astype(np.float32)) @ grown @ mesh.beside
+        grown = sp.csr_matrix(grown + more > 0).astype(np.float32)
+    return grown
+
+
+def _faces_of(mesh: ClothMesh, vertices: sp.csr_matrix) -> sp.csr_matrix:
+    """The faces all of whose corners are among each row's vertices, shape (rows, T)."""
+    triangles = mesh.level.triangles.cpu().numpy()
+    columns = sp.csc_matrix(vertices.astype(np.float32))
+    a, b, c = (columns[:, triangles[:, corner]] for corner in range(3))
+    out = sp.csr_matrix(a.multiply(b).multiply(c))
+    out.eliminate_zeros()
+    return out

@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.crossings import Crossings, crossings
-from ..collide.near import near_pairs
+from ..collide.detector import Detector
+from ..collide.narrow_phase import Reach
+from ..collide.near import NearPairs, near_pairs
 from ..collide.parts import Parts
-from ..collide.sweep import Listed, Reach
 from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
@@ -129,6 +130,11 @@ class ClothView:
         return float(self._thickness.mean())
 
     @cached_property
+    def detector(self) -> Detector:
+        """What detects in this frame."""
+        return Detector(self.parts, self.near)
+
+    @cached_property
     def near(self) -> Reach:
         """How near parts are that may push one another before they are looked for again."""
         play = 0.5 * MARGIN * self._level.spacing.double()
@@ -142,7 +148,7 @@ class ClothView:
     def _look(self, x: Tensor) -> _Looked:
         """What is known of x, looked for where it is not known."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            found = crossings(self.parts, x)
+            found = crossings(self.parts, x, detector=self.detector)
             corners = self.mesh.corners_of(found)
             tangles = Tangles.find(self.mesh, corners, rings=TANGLED) if found.count else None
             self._looked = _Looked(x, x._version, found, tangles)
@@ -153,7 +159,7 @@ class ClothView:
         known = self._look(x)
         if not order or self._lasting.layers is None:
             return known.tangles
-        near = near_pairs(self.parts, x, self.near)
+        near = self._near_pairs(x)
         wrong = near.corners[self._lasting.layers.wrong(self._level, near, x)].long()
         corners = torch.cat([self.mesh.corners_of(known.crossings), wrong[:, [0, 1, 2, 3, 3]]])
         return Tangles.find(self.mesh, corners, rings=TANGLED) if len(corners) else None
@@ -162,27 +168,32 @@ class ClothView:
         """Take it that nothing crosses at x [m]: it was reached safely from where nothing did."""
         self._looked = _Looked(x, x._version, Crossings.none(x.device), None)
 
-    def term(
-        self, x: Float[Tensor, "vertices 3"], listed: Listed | None = None, *, order: bool = False
-    ) -> SelfContact | None:
+    def term(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> SelfContact | None:
         """The force between parts that are near one another, or None where no parts are; what crosses is drawn out.
 
         Args:
             x: Positions [m].
-            listed: Pairs among which those are that are near, or None.
             order: Whether garments are brought in their order, and even what is hopeless is drawn out.
         """
         found, tangles = self.crossings(x), self.tangles(x)
-        gaps = self._gaps(x, found, listed, order=order)
+        gaps = self._gaps(x, found, order=order)
         found = found if tangles is None or order else tangles.hopeful(found)
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
-    def _gaps(self, x: Tensor, found: Crossings, listed: Listed | None, *, order: bool) -> PairConstraints:
+    def is_near(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """Whether any parts are near one another at x [m]."""
+        return len(self._near_pairs(x).face) > 0
+
+    def _near_pairs(self, x: Tensor) -> NearPairs:
+        """Parts that are near one another at x [m]."""
+        return near_pairs(self.parts, x, self.near, detector=self.detector)
+
+    def _gaps(self, x: Tensor, found: Crossings, *, order: bool) -> PairConstraints:
         """The springs between all parts that are near and do not cross."""
-        near = near_pairs(self.parts, x, self.near, listed=listed)
+        near = self._near_pairs(x)
         corners = near.corners.long()
         garment = self._level.vertex_garment[corners[:, [0, 3]]].long()
         at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
@@ -208,19 +219,20 @@ class ClothView:
         return PairConstraints(near.corners[kept], near.weight[kept], normal, offset[kept].contiguous(), stiffness)
 
     def measure(
-        self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+        self, before: Float[Tensor, "vertices 3"] | None, x: Float[Tensor, "vertices 3"]
     ) -> tuple[dict[str, dict[str, int]], Bool[Tensor, " vertices"]]:
         """What crosses before and after, as plain values, and the vertices of what does after.
 
-        Both are looked for anew, whatever is remembered.
+        What safe moves reached from where nothing crossed is not looked for again: nothing crosses there.
 
         Args:
-            before: The upsampled cage [m].
+            before: The upsampled cage [m]; None where nothing crosses there.
             x: The result [m].
         """
-        said = {}
-        for name, at in (("before", before), ("after", x)):
-            found = crossings(self.parts, at)
-            apart = int(np.triu(self.mesh.between(found), 1).sum())
-            said[name] = {"crossings": found.count, "between_garments": apart}
+        found = self.crossings(x)
+        first = Crossings.none(x.device) if before is None else crossings(self.parts, before)
+        said = {
+            name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
+            for name, each in (("before", first), ("after", found))
+        }
         return said, self.mesh.crossed(found)

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.sweep import Listed
+from ..collide.crossings import crossings
+from ..collide.detector import Detector
 from ..deadline import is_over
 from ..forces.contact import Contact
 from ..forces.seam import Seam
@@ -93,7 +94,8 @@ class LevelContact:
         """Positions in which pieces that went through cloth lie on their side again [m], where less crosses then."""
         if self.promise is None or not self.crosses(x):
             return x
-        out = drawn_apart(self.promise.view.mesh, x, gap=self.promise.view.gap)[0]
+        view = self.promise.view
+        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap, detector=view.detector)[0]
         return x if out is x else Placed(self.closed(out))
 
     def without_hope(self, x: Placed, start: Placed) -> Placed:
@@ -114,29 +116,23 @@ class LevelContact:
         if self.promise is not None:
             self.promise.view.remember(x)
 
-    def terms(
-        self, x: Float[Tensor, "vertices 3"], *, listed: Listed | None = None, order: bool = False
-    ) -> tuple[LevelContact, tuple[Touch, ...]]:
+    def terms(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> tuple[LevelContact, tuple[Touch, ...]]:
         """The view from positions x [m], and the forces of what is near them; none where nothing is.
 
         The rest is as for `ClothView.term`.
         """
         seen, body = (None, None) if self.bodies is None else self._letting_through(self.bodies, x).seen(x)
-        cloth = None if self.cloth is None else self.cloth.term(x, listed, order=order)
+        cloth = None if self.cloth is None else self.cloth.term(x, order=order)
         return replace(self, bodies=seen), tuple(term for term in (body, cloth) if term is not None)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with their seams closed [m]."""
         return x if self.seam is None else self.seam.closed(x)
 
-    def listed(self, x: Float[Tensor, "vertices 3"], known: Listed | None) -> Listed | None:
-        """As `Promise.listed`; None without cloth."""
-        return None if self.promise is None else self.promise.listed(x, known)
-
-    def moved(self, x: Placed, wanted: Float[Tensor, "vertices 3"], listed: Listed | None = None) -> Placed:
+    def moved(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """Positions as near to wanted ones as is safe [m], seams closed."""
         wanted = self.closed(wanted)
-        return unhindered(wanted) if self.promise is None else self.promise.move(x, wanted, listed=listed)
+        return unhindered(wanted) if self.promise is None else self.promise.move(x, wanted)
 
     def drawn(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """The same where tangles may come to cross more for a while."""
@@ -195,39 +191,43 @@ class FrameContact:
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
         self._views: dict[int, LevelContact] = {}
 
-    @cached_property
+    @property
     def aim(self) -> Float[Tensor, "coarse 3"]:
         """The cage that the fine cloth follows [m]: the input, but for what is between overlapping parts of a body.
 
         And but for a cage that crosses and comes clean: the guide would draw cloth through itself.
         """
-        cage, out = self._levels[0], self._coarse
+        return self._aimed[0]
+
+    @cached_property
+    def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None]:
+        """The same, and whether the input crosses, where that was looked for."""
+        cage, out, crosses = self._levels[0], self._coarse, None
         if self._cloth is None:
-            return out
+            return out, crosses
         seam = self._seam_at(cage, out)
         mesh = self._cloth.mesh(cage, seam)
         if self._bodies is not None:
             out = repaired_cage(cage, out, bodies=self._bodies.at(cage, self._levels[-1]), mesh=mesh)
         if self._settings.cloth == "pairs":
-            apart, before, after = drawn_apart(mesh, out, gap=float(self._thickness.mean()))
-            out = apart if before and not after else out
-        return out if seam is None or out is self._coarse else seam.closed(out)
+            detector = Detector(mesh.parts)
+            found = crossings(mesh.parts, out, detector=detector)
+            gap = float(self._thickness.mean())
+            apart, left = drawn_apart(mesh, out, found, gap=gap, detector=detector)
+            crosses = found.count > 0 if out is self._coarse else None
+            out = apart if found.count and not left else out
+        return (out if seam is None or out is self._coarse else seam.closed(out)), crosses
 
     @property
     def depths(self) -> list[tuple[float, str]]:
         """As `FrameBodies.depths`; nothing without bodies."""
         return [] if self._bodies is None else self._bodies.depths(self._levels[-1])
 
-    @property
+    @cached_property
     def crossed(self) -> bool:
         """Whether the cage crosses itself."""
-        return self._crossed
-
-    @cached_property
-    def _crossed(self) -> bool:
-        """The same, found once."""
-        cage = self._levels[0]
-        return self.at(cage).crosses(cage.base.apply(self._coarse))
+        cage, known = self._levels[0], self._aimed[1]
+        return self.at(cage).crosses(cage.base.apply(self._coarse)) if known is None else known
 
     def at(self, level: Level) -> LevelContact:
         """The view of one level, the same at each call."""
@@ -288,7 +288,7 @@ class FrameContact:
         if self._bodies is not None:
             said |= self._bodies.measure(finest, base, x, view=view.bodies_around(x))
         if view.cloth is not None:
-            cloth, crossing = view.cloth.measure(view.closed(base), x)
-            near = view.cloth.term(x) is not None or any(each["crossings"] for each in cloth.values())
+            cloth, crossing = view.cloth.measure(view.closed(base) if self.crossed else None, x)
+            near = view.cloth.is_near(x) or any(each["crossings"] for each in cloth.values())
             said["cloth"] = {"near": near, **cloth}
         return said, crossing

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..collide.sweep import Listed, joined, none_of
+from ..collide.narrow_phase import Pairs
 from ..deadline import is_over
 from ..level import Placed
 from ..mesh.stencil import add_at
@@ -17,10 +17,10 @@ from .along import along
 from .cloth import ClothView
 from .safe_move import in_the_way, safe_move
 
-REACH = 0.15
-"""Part of its shortest edge that each vertex may go before near pairs are listed anew."""
 WIDTHS = (16.0, 8.0, 4.0, 2.0)
 """Cells in which cloth is carried together where something is in the way of its own ways, in edge lengths."""
+LONG = 1.0
+"""Mean edges beyond which a move is carried together: what a shorter one loses comes in the next round."""
 GOES = 3
 """How often what is then left of each way is gone: what was in the way may have gone too."""
 TRIES = 4
@@ -39,19 +39,7 @@ class Promise:
     view: ClothView
     floor: float
 
-    def listed(self, x: Float[Tensor, "vertices 3"], known: Listed | None) -> Listed:
-        """The pairs that short moves from x [m] ask; known ones while at least half of what they may is left."""
-        if known is not None and known.covers(x, 0.5):
-            return known
-        return Listed(self.view.parts, x, near=self.view.near, may=REACH * self.view.parts.shortest)
-
-    def move(
-        self,
-        start: Placed,
-        wanted: Float[Tensor, "vertices 3"],
-        *,
-        listed: Listed | None = None,
-    ) -> Placed:
+    def move(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """Positions as near to what is wanted as is safe [m], ``wanted`` itself where nothing is in the way.
 
         In a tangle, round what crosses at the start, cloth may pass through itself, so long as no more of it crosses
@@ -59,43 +47,45 @@ class Promise:
         """
         tangles = self.view.tangles(start)
         if tangles is None:
-            x = self._go(start, wanted, None, listed)
+            x = self._go(start, wanted, None)
             self.view.remember(x)
             return x
         free = tangles.label.clone()
-        x = self._go(start, wanted, free, listed)
+        x = self._go(start, wanted, free)
         for attempt in range(TRIES):
             worse = tangles.worse(self.view.crossings(x))
             if not bool(worse.any()):
                 break
             free[worse if attempt < TRIES - 1 else ~tangles.given_up] = -1
-            x = self._go(start, wanted, free, listed)
+            x = self._go(start, wanted, free)
         return x
 
     def draw(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """The same where tangles may come to cross more for a while, and garments are brought in their order."""
         tangles = self.view.tangles(start, order=True)
-        return self._go(start, wanted, None if tangles is None else tangles.label, None)
+        return self._go(start, wanted, None if tangles is None else tangles.label)
 
-    def _go(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None, listed: Listed | None) -> Placed:
+    def _go(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None) -> Placed:
         """The same, with nothing promised to what is in a tangle against what is in the same.
 
         First goes what cloth in a place has in common of its ways, in ever smaller places: layers that move together
         hold nothing up. Then each vertex goes what is left of its own way, along what was in it.
         """
-        given = {"floor": self.floor, "tangle": tangle, "listed": listed}
+        given = {"floor": self.floor, "tangle": tangle, "detector": self.view.detector}
         parts, moves = self.view.parts, (aim != start).any(dim=1, keepdim=True)
-        if not len(in_the_way(start, aim, parts, **given).value):
+        met = in_the_way(start, aim, parts, **given)
+        if not len(met.value):
             return Placed(aim)
-        x, met = start, none_of(start)
-        for width in (*WIDTHS, *(0.0,) * GOES):
+        is_long = float((aim - start).norm(dim=1).max()) > LONG * parts.spacing
+        x, met = start, Pairs.none(start.device) if is_long else met
+        for width in (*(WIDTHS if is_long else ()), *(0.0,) * GOES):
             at, rest = x.double(), aim.double() - x.double()
             if width:
                 way = moves * carried(at, rest, width=width * parts.spacing)
             else:
                 way = along(at, rest, met, free=moves & parts.level.free)
             moved = safe_move(x, self.view.closed((at + way).to(aim)), parts, **given)
-            x, met = moved.x, joined(met, moved.met)
+            x, met = moved.x, met.joined(moved.met)
             if is_over() or (not width and not bool(moved.short.any())):
                 break
         return Placed(aim) if torch.equal(x, aim) else x

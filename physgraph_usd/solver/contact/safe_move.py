@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..collide.detector import Detector
+from ..collide.narrow_phase import Pairs
 from ..collide.parts import Parts
-from ..collide.sweep import Listed, ListedAndSwept, Pairs, joined, none_of
 from ..deadline import is_over
 from ..level import Placed
 
@@ -61,7 +62,7 @@ def safe_move(
     *,
     floor: float,
     tangle: Int[Tensor, " vertices"] | None = None,
-    listed: Listed | None = None,
+    detector: Detector | None = None,
 ) -> Moved:
     """Move vertices as far towards wanted positions as no pair of parts comes too near.
 
@@ -76,7 +77,7 @@ def safe_move(
         floor: Distance under which a pair keeps nine tenths of what it has [m]: gaps end there.
         tangle: The tangle that each vertex is in, int32, -1 where in none: to what is in one nothing is promised
             against what is in the same; or None.
-        listed: Pairs that are asked alone of vertices that do not leave their reach, or None.
+        detector: What has detected before with the same parts, or None.
 
     Returns:
         Positions, ``wanted`` itself where nothing is in the way, and how far vertices have come.
@@ -85,13 +86,13 @@ def safe_move(
     way = wanted.double() - at
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
     x, asked = wanted, (way != 0).any(dim=1)
-    swept = ListedAndSwept(parts, at, way, listed)
-    met = none_of(way)
+    detector = detector or Detector.once(parts)
+    met = Pairs.none(way.device)
     for attempt in range(len(way) + SHORTENINGS):
-        more = swept.impacts(x.double() - at, share=KEPT, floor=floor, asked=asked, tangle=tangle)
+        more = detector.impacts(start, x, share=KEPT, floor=floor, asked=asked, tangle=tangle)
         if not len(more.value):
             break
-        met, least = joined(met, more), torch.ones_like(share)
+        met, least = met.joined(more), torch.ones_like(share)
         corner = more.corners.long().reshape(-1)
         least.scatter_reduce_(0, corner, BACK * more.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < SHORTENINGS else torch.where(least < 1.0, 0.0, share)
@@ -109,13 +110,12 @@ def in_the_way(
     *,
     floor: float,
     tangle: Int[Tensor, " vertices"] | None = None,
-    listed: Listed | None = None,
+    detector: Detector | None = None,
 ) -> Pairs:
     """The pairs that would come too near on the straight way to what is wanted, all as for `safe_move`."""
-    at = start.double()
-    way = wanted.double() - at
-    swept = ListedAndSwept(parts, at, way, listed)
-    return swept.impacts(way, share=KEPT, floor=floor, asked=(way != 0).any(dim=1), tangle=tangle)
+    detector = detector or Detector.once(parts)
+    asked = (wanted.double() != start.double()).any(dim=1)
+    return detector.impacts(start, wanted, share=KEPT, floor=floor, asked=asked, tangle=tangle)
 
 
 def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -106,10 +105,9 @@ def solve_one_level(
         x = view.moved(x, x + smoothing) if level.index else x
         view, terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
-    carry, last, terms, pairs, made, touched = None, None, (), None, 0, False
+    carry, last, terms, made, touched = None, None, (), 0, False
     while not made or made < _most_steps(budget, reports[-1], touched=touched):
-        pairs = view.listed(x, pairs)
-        view, terms = view.terms(x, listed=pairs)
+        view, terms = view.terms(x)
         touched |= bool(terms)
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
@@ -119,7 +117,7 @@ def solve_one_level(
         reports.append(report)
         made += report.steps
         wanted = carry.x
-        x, last = _safe_step(partial(view.moved, listed=pairs), system, x, wanted), system
+        x, last = _safe_step(view.moved, system, x, wanted), system
         blocked = x is not wanted
         if _is_last(report, blocked=blocked) or (smoothing is None and _is_near(report, budget, made)):
             break

@@ -1,0 +1,212 @@
+"""Boxes of clusters and of their parts while all vertices move along straight paths."""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from .domains import single
+from .parts import Parts
+from .topology import Topology
+
+wp.set_module_options({"enable_backward": False})
+
+FAR = wp.constant(wp.float64(1.0e30))
+"""Corner of a box that holds nothing."""
+ROUNDING = wp.constant(wp.float64(2.4e-7))
+"""What boxes in single precision are widened by, of their corners' distance from the origin."""
+
+
+@wp.struct
+class Motion:
+    """Where vertices are, where they go, which pairs are asked for, and what is near where nothing moves."""
+
+    start: wp.array(dtype=wp.vec3d)
+    path: wp.array(dtype=wp.vec3d)
+    asked: wp.array(dtype=wp.bool)
+    tangle: wp.array(dtype=wp.int32)
+    share: wp.float64
+    floor: wp.float64
+    is_still: wp.bool
+    radius: wp.array(dtype=wp.float64)
+    play: wp.array(dtype=wp.float64)
+    slack: wp.array(dtype=wp.float64)
+    half: wp.float64
+
+
+@wp.struct
+class Boxes:
+    """Of each cluster: the box it starts in, its mean path, how far its vertices leave that, and how near it looks; and
+    the boxes of its edges and faces."""
+
+    low: wp.array(dtype=wp.vec3d)
+    high: wp.array(dtype=wp.vec3d)
+    mean: wp.array(dtype=wp.vec3d)
+    spread: wp.array(dtype=wp.float64)
+    radius: wp.array(dtype=wp.float64)
+    asked: wp.array(dtype=wp.int32)
+    edge_low: wp.array(dtype=wp.vec3f)
+    edge_high: wp.array(dtype=wp.vec3f)
+    face_low: wp.array(dtype=wp.vec3f)
+    face_high: wp.array(dtype=wp.vec3f)
+
+
+@wp.func
+def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.vec3f):
+    """Whether two boxes meet; all six comparisons are made, for a wrong guess at a branch costs more."""
+    first = wp.where(low[0] <= other_high[0], 1, 0) & wp.where(low[1] <= other_high[1], 1, 0)
+    second = wp.where(low[2] <= other_high[2], 1, 0) & wp.where(other_low[0] <= high[0], 1, 0)
+    third = wp.where(other_low[1] <= high[1], 1, 0) & wp.where(other_low[2] <= high[2], 1, 0)
+    return (first & second & third) == 1
+
+
+@wp.func
+def outside(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.vec3d, reach: wp.float64):
+    """Whether two boxes are farther apart than a reach along an axis."""
+    for axis in range(3):
+        if low[axis] > other_high[axis] + reach or other_low[axis] > high[axis] + reach:
+            return True
+    return False
+
+
+@wp.func
+def lowest_of(v: wp.vec3d):
+    """A corner in single precision, no higher."""
+    return single(v - ROUNDING * wp.abs(v))
+
+
+@wp.func
+def highest_of(v: wp.vec3d):
+    """A corner in single precision, no lower."""
+    return single(v + ROUNDING * wp.abs(v))
+
+
+@wp.func
+def reach_of(boxes: Boxes, i: wp.int32, j: wp.int32):
+    """How much nearer parts of two clusters can come, or the distance asked for."""
+    move = wp.length(boxes.mean[i] - boxes.mean[j]) + boxes.spread[i] + boxes.spread[j]
+    return move + boxes.radius[i] + boxes.radius[j]
+
+
+@wp.kernel
+def sweep_boxes(
+    first: wp.int32,
+    parts: Topology,
+    motion: Motion,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    near: wp.array(dtype=wp.float64),
+):
+    """The box that each cluster sweeps, with how near it looks and how far it may leave its paths; and how near."""
+    i = first + wp.tid()
+    lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
+    reach, radius = wp.float64(0.0), wp.float64(0.0)
+    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
+        v = parts.corners[k]
+        at = motion.start[v]
+        end = at + motion.path[v]
+        lowest, highest = wp.min(lowest, wp.min(at, end)), wp.max(highest, wp.max(at, end))
+        reach = wp.max(reach, motion.radius[v] + motion.slack[v])
+        radius = wp.max(radius, motion.radius[v])
+    near[i] = radius
+    widened = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest)) + wp.vec3d(reach)
+    low[i] = single(lowest - widened)
+    high[i] = single(highest + widened)
+
+
+@wp.kernel
+def bound_parts(first: wp.int32, parts: Topology, motion: Motion, active: wp.array(dtype=wp.int32), boxes: Boxes):
+    """The box that each of some clusters starts in, and those of its edges and faces."""
+    i = active[first + wp.tid()]
+    lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
+    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
+        at = motion.start[parts.corners[k]]
+        lowest, highest = wp.min(lowest, at), wp.max(highest, at)
+    boxes.low[i] = lowest
+    boxes.high[i] = highest
+    for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
+        a, b = motion.start[parts.edges[k][0]], motion.start[parts.edges[k][1]]
+        boxes.edge_low[k] = lowest_of(wp.min(a, b))
+        boxes.edge_high[k] = highest_of(wp.max(a, b))
+    for k in range(parts.first_face[i], parts.first_face[i + 1]):
+        t = parts.faces[k]
+        p, q, r = motion.start[t[0]], motion.start[t[1]], motion.start[t[2]]
+        boxes.face_low[k] = lowest_of(wp.min(p, wp.min(q, r)))
+        boxes.face_high[k] = highest_of(wp.max(p, wp.max(q, r)))
+
+
+@wp.kernel
+def average_paths(first: wp.int32, parts: Topology, motion: Motion, active: wp.array(dtype=wp.int32), boxes: Boxes):
+    """Of each of some clusters its mean path, how far vertices leave that, how near it looks, and if it is asked."""
+    i = active[first + wp.tid()]
+    total, asked, radius = wp.vec3d(), wp.int32(0), wp.float64(0.0)
+    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
+    for k in range(begin, end):
+        v = parts.corners[k]
+        total += motion.path[v]
+        radius = wp.max(radius, motion.radius[v] + motion.slack[v])
+        if motion.asked[v]:
+            asked = 1
+    mean = total / wp.float64(wp.max(end - begin, 1))
+    spread = wp.float64(0.0)
+    for k in range(begin, end):
+        spread = wp.max(spread, wp.length(motion.path[parts.corners[k]] - mean))
+    boxes.mean[i] = mean
+    boxes.spread[i] = spread
+    boxes.radius[i] = radius
+    boxes.asked[i] = asked
+
+
+def room_for_boxes(parts: Parts) -> Any:
+    """Boxes to be filled."""
+    size, device = parts.count, parts.level.device
+    boxes = Boxes()
+    for name in ("low", "high", "mean"):
+        setattr(boxes, name, wp.empty(size, dtype=wp.vec3d, device=device))
+    boxes.spread, boxes.radius = (wp.empty(size, dtype=wp.float64, device=device) for _ in range(2))
+    boxes.asked = wp.empty(size, dtype=wp.int32, device=device)
+    for name, count in (("edge", len(parts.level.edges)), ("face", len(parts.level.triangles))):
+        for end in ("low", "high"):
+            setattr(boxes, f"{name}_{end}", wp.empty(count, dtype=wp.vec3f, device=device))
+    return boxes
+
+
+def motion_of(
+    start: Tensor,
+    path: Tensor,
+    *,
+    asked: Tensor | None = None,
+    tangle: Tensor | None = None,
+    radius: Tensor | None = None,
+    play: Tensor | None = None,
+    slack: Tensor | None = None,
+    half: float = 0.0,
+) -> Any:
+    """What kernels read of the vertices; pairs are near ones where a radius is given.
+
+    Args:
+        start: Positions [m], float64, shape (V, 3).
+        path: How far each vertex goes [m], float64, shape (V, 3).
+        asked: Only pairs with one of these vertices are asked for; all where None, shape (V,).
+        tangle: The tangle that each vertex is in, int32, -1 where in none; or None.
+        radius: How near is near, as for `Reach` [m], or None.
+        play: As for `Reach` [m], or None.
+        slack: How far each vertex may be elsewhere [m], or None.
+        half: As for `Reach`.
+    """
+    motion, nothing = Motion(), torch.zeros_like(start[:, 0])
+    motion.start, motion.path = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (start, path))
+    asked = torch.ones(len(start), dtype=torch.bool, device=start.device) if asked is None else asked
+    motion.asked = wp.from_torch(asked.contiguous())
+    tangle = torch.full_like(asked, -1, dtype=torch.int32) if tangle is None else tangle
+    motion.tangle = wp.from_torch(tangle.contiguous())
+    motion.is_still, motion.half = radius is not None, half
+    motion.radius, motion.play, motion.slack = (
+        wp.from_torch((nothing if each is None else each).contiguous()) for each in (radius, play, slack)
+    )
+    return motion

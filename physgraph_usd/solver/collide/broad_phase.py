@@ -1,0 +1,271 @@
+"""Broad phase: the pairs of clusters whose parts can come near one another, or touch, on straight paths.
+
+Nearly all that boxes find are neighbours on the cloth. Those in one monotone patch (`patches`) cannot touch; and where
+m of the patch times their distance in its plane is more than is asked for, or m times the least cosine between faces
+and plane more than the part of their distance at rest that is, they are not near either, and left out.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
+from .boxes import motion_of, sweep_boxes
+from .domains import Patches, flat, holds
+from .parts import Parts
+from .patches import MARGIN, NOTHING
+from .topology import Topology
+
+wp.set_module_options({"enable_backward": False})
+
+ROOM = 48
+"""Pairs of a cluster that there is room for before they are counted."""
+LEAST = wp.constant(wp.float32(0.01))
+"""What m is asked to be at least: single precision rounds it to some millionths."""
+APART, OUT = wp.constant(1), wp.constant(2)
+"""What patches prove of two clusters: that they do not touch on any path that is served, or that they are not near."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterPairs:
+    """Pairs of clusters, all that matter while vertices stay near the paths that they were found for.
+
+    Attributes:
+        parts: The parts.
+        start: Where the vertices were [m], float64.
+        path: Where they went from there [m], float64.
+        slack: How far they may be from these paths [m].
+        pairs: The clusters of each pair, the lower one first, shape (N, 2), int32.
+        active: Clusters that occur in pairs, int32.
+        apart: Which pairs are proved not to touch on the paths: they can only be near, shape (N,).
+        allowed: How much nearer those of each pair may come while parts that were listed serve [m], shape (N,).
+        relied: What is relied on of m of each patch, by what is proved with it; -1 where nothing is.
+    """
+
+    parts: Parts
+    start: Float[Tensor, "vertices 3"]
+    path: Float[Tensor, "vertices 3"]
+    slack: Float[Tensor, " vertices"]
+    pairs: Int[Tensor, "pairs 2"]
+    active: Int[Tensor, " clusters"]
+    apart: Bool[Tensor, " pairs"]
+    allowed: Float[Tensor, " pairs"]
+    relied: Float[Tensor, " patches"]
+
+    @staticmethod
+    def find(
+        parts: Parts,
+        start: Float[Tensor, "vertices 3"],
+        end: Float[Tensor, "vertices 3"] | None,
+        *,
+        radius: Float[Tensor, " vertices"],
+        slack: Float[Tensor, " vertices"],
+        allowed: Float[Tensor, " vertices"],
+        half: float,
+    ) -> ClusterPairs:
+        """Find the pairs.
+
+        Args:
+            parts: The parts.
+            start: Positions [m], float64.
+            end: Where the vertices go [m], float64; None where nothing moves.
+            radius: How near each vertex looks [m], float64.
+            slack: How far each may be from its path [m], float64.
+            allowed: How far each may go while parts that were listed serve [m], float64.
+            half: What lies in one garment is asked for only within this part of its distance at rest.
+        """
+        path = torch.zeros_like(start) if end is None else end - start
+        m = parts.patches.measured(start, end, least=float(LEAST + MARGIN), enough=half + float(MARGIN))
+        relied = torch.full_like(m, float(NOTHING))
+        found = _in_boxes(parts, motion_of(start, path, radius=radius, slack=slack, half=half), m, relied)
+        pairs = found[:, :2].contiguous()
+        occurs = torch.zeros(parts.count, dtype=torch.bool, device=start.device)
+        occurs[pairs.reshape(-1).long()] = True
+        active = torch.nonzero(occurs).squeeze(1).to(torch.int32)
+        least = parts.least_of(allowed)[pairs.long()].sum(dim=1)
+        return ClusterPairs(parts, start, path, slack, pairs, active, found[:, 2] == APART, least, relied)
+
+    def nearer(self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " pairs"]:
+        """How much nearer the clusters of each pair can have come between two positions [m], float64."""
+        size, device, out = self.parts.count, str(x.device), x.new_empty(len(self.pairs))
+        mean, spread = wp.empty(size, dtype=wp.vec3d, device=device), wp.empty(size, dtype=wp.float64, device=device)
+        path, pairs = wp.from_torch(x - before, dtype=wp.vec3d), wp.from_torch(self.pairs, dtype=wp.vec2i)
+        launch(self.parts, average, len(self.active), path, wp.from_torch(self.active), mean, spread)
+        launch(self.parts, approach, len(out), pairs, mean, spread, wp.from_torch(out))
+        return out
+
+    def covers(self, start: Float[Tensor, "vertices 3"], end: Float[Tensor, "vertices 3"] | None) -> bool:
+        """Whether it serves for a move between positions [m], or for positions: m of its patches must do there."""
+        if not self._is_near(start) or (end is not None and not self._is_near(end)):
+            return False
+        return self.parts.patches.still(self.relied, (self.start, self.start + self.path), start, end)
+
+    def _is_near(self, x: Tensor) -> bool:
+        """Whether all vertices at x [m] are near their paths."""
+        way = x - self.start
+        length = self.path.square().sum(dim=1)
+        part = ((way * self.path).sum(dim=1) / length.clamp_min(1e-300)).clamp(0.0, 1.0)
+        return bool(((way - part.unsqueeze(1) * self.path).square().sum(dim=1) <= self.slack.square()).all())
+
+
+def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
+    """Run a kernel over clusters or pairs of clusters; another thread is worth it from so many items."""
+    given = {"device": parts.level.device, "threads": parts.level.threads, "least": least}
+    Launch(kernel, size, [parts.topology, *inputs], **given)({})
+
+
+def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor) -> Int[Tensor, "pairs 3"]:
+    """Pairs of clusters whose boxes meet on their way, and what is proved of them; what that relies on is noted."""
+    size, device = parts.count, str(m.device)
+    low, high = (wp.empty(size, dtype=wp.vec3f, device=device) for _ in range(2))
+    reach = wp.empty(size, dtype=wp.float64, device=device)
+    launch(parts, sweep_boxes, size, motion, low, high, reach)
+    tree, room = wp.Bvh(low, high), ROOM
+    while True:
+        slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
+        count = torch.zeros(size, dtype=torch.int32, device=device)
+        given = [parts.patches.table, wp.from_torch(m), wp.from_torch(relied), reach, motion.half, tree.id, low, high]
+        given += [room, wp.from_torch(slots.view(-1, 3), dtype=wp.vec3i), wp.from_torch(count)]
+        launch(parts, find_clusters, size, *given, least=LEAST_QUERIES)
+        most = int(count.max()) if size else 0
+        if most <= room:
+            return slots[torch.arange(room, device=device) < count.unsqueeze(1)]
+        room = most
+
+
+@wp.func
+def gap_in(patches: Patches, p: wp.int32, i: wp.int32, j: wp.int32):
+    """Least distance of two clusters at rest in a patch's plane."""
+    between = wp.length(flat(patches, p, patches.centre[i]) - flat(patches, p, patches.centre[j]))
+    return wp.max(between - patches.size[i] - patches.size[j], wp.float64(0.0))
+
+
+@wp.func
+def proved_by(
+    patches: Patches,
+    m: wp.array(dtype=wp.float32),
+    relied: wp.array(dtype=wp.float32),
+    reach: wp.float64,
+    half: wp.float32,
+    p: wp.int32,
+    i: wp.int32,
+    j: wp.int32,
+):
+    """What a patch proves of two clusters, and how much of m that needs is noted."""
+    if m[p] <= LEAST + MARGIN:
+        return 0
+    begin, end = patches.first_inside[p], patches.first_inside[p + 1]
+    if not holds(patches.inside, begin, end, i):
+        return 0
+    if not holds(patches.inside, begin, end, j):
+        return 0
+    needed = half / patches.flattest[p]
+    gap = wp.float32(gap_in(patches, p, i, j))
+    if gap > wp.float32(0.0):
+        needed = wp.min(needed, wp.float32(reach) / gap)
+    needed = wp.max(needed, LEAST)
+    if m[p] > needed + MARGIN:
+        wp.atomic_max(relied, p, needed)
+        return OUT
+    wp.atomic_max(relied, p, LEAST)
+    return APART
+
+
+@wp.func
+def proved(
+    patches: Patches,
+    m: wp.array(dtype=wp.float32),
+    relied: wp.array(dtype=wp.float32),
+    reach: wp.float64,
+    half: wp.float32,
+    i: wp.int32,
+    j: wp.int32,
+):
+    """What the patches round two clusters prove of them."""
+    most = proved_by(patches, m, relied, reach, half, patches.wide[i], i, j)
+    if most < OUT:
+        most = wp.max(most, proved_by(patches, m, relied, reach, half, patches.small[i], i, j))
+    if most < OUT and patches.wide[j] != patches.wide[i]:
+        most = wp.max(most, proved_by(patches, m, relied, reach, half, patches.wide[j], i, j))
+    if most < OUT and patches.small[j] != patches.small[i]:
+        most = wp.max(most, proved_by(patches, m, relied, reach, half, patches.small[j], i, j))
+    return most
+
+
+@wp.kernel
+def find_clusters(
+    first: wp.int32,
+    parts: Topology,
+    patches: Patches,
+    m: wp.array(dtype=wp.float32),
+    relied: wp.array(dtype=wp.float32),
+    reach: wp.array(dtype=wp.float64),
+    half: wp.float32,
+    tree: wp.uint64,
+    low: wp.array(dtype=wp.vec3f),
+    high: wp.array(dtype=wp.vec3f),
+    room: wp.int32,
+    out: wp.array(dtype=wp.vec3i),
+    found: wp.array(dtype=wp.int32),
+):
+    """Clusters, no lower ones, that each cluster can come near; counted also where there is no room."""
+    i = first + wp.tid()
+    if low[i][0] > high[i][0]:
+        return
+    count, j = wp.int32(0), wp.int32(0)
+    query = wp.bvh_query_aabb(tree, low[i], high[i])
+    while wp.bvh_query_next(query, j):
+        if j < i or parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
+            continue
+        known = proved(patches, m, relied, reach[i] + reach[j], half, i, j)
+        if known == OUT:
+            continue
+        if count < room:
+            out[i * room + count] = wp.vec3i(i, j, known)
+        count += 1
+    found[i] = count
+
+
+@wp.kernel
+def average(
+    first: wp.int32,
+    parts: Topology,
+    path: wp.array(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    mean: wp.array(dtype=wp.vec3d),
+    spread: wp.array(dtype=wp.float64),
+):
+    """How far the vertices of each of some clusters went on the mean, and how far from that at most."""
+    i = active[first + wp.tid()]
+    total, most = wp.vec3d(), wp.float64(0.0)
+    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
+    for k in range(begin, end):
+        total += path[parts.corners[k]]
+    total /= wp.float64(end - begin)
+    for k in range(begin, end):
+        most = wp.max(most, wp.length(path[parts.corners[k]] - total))
+    mean[i] = total
+    spread[i] = most
+
+
+@wp.kernel
+def approach(
+    first: wp.int32,
+    parts: Topology,
+    clusters: wp.array(dtype=wp.vec2i),
+    mean: wp.array(dtype=wp.vec3d),
+    spread: wp.array(dtype=wp.float64),
+    out: wp.array(dtype=wp.float64),
+):
+    """How much nearer the clusters of each pair can have come."""
+    n = first + wp.tid()
+    i, j = clusters[n][0], clusters[n][1]
+    out[n] = wp.length(mean[i] - mean[j]) + spread[i] + spread[j]

@@ -1,0 +1,195 @@
+"""Collision detection of one level's cloth: what is near, what would touch on straight paths, and what crosses.
+
+A broad phase serves until cloth leaves the paths that it was found for, or a patch on which it relies is monotone no
+more; within it a list of near pairs serves while vertices hardly move.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportArgumentType=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from .boxes import average_paths, bound_parts, motion_of, room_for_boxes
+from .broad_phase import ClusterPairs, launch
+from .narrow_phase import Pairs, Reach, find, find_pairs, of_list
+from .parts import Parts
+
+SLACK = 0.25
+"""How far vertices may leave the paths of a broad phase, in mean edges."""
+LIST_RADIUS = 0.1
+"""How much nearer two clusters may come while a list of near pairs serves for moves, of each in its shortest edge; for
+forces half as much."""
+KNOWN = 4
+"""Positions of which it is known what they are in double precision."""
+SPARE = 1.05
+"""What is listed reaches so much farther than it need: distances are rounded."""
+IMPACTS, NEAR = 4, 16
+"""Pairs of parts of two clusters that there is room for before they are counted: few meet on their way, many are
+near."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Listed:
+    """Near pairs, while no two clusters come nearer by more than they may.
+
+    Attributes:
+        found: The broad phase that they were found in.
+        x: Where vertices were when it was looked last [m], float64.
+        drift: How much nearer each pair of clusters may have come until then, since it was listed [m].
+        pairs: The pairs of parts.
+        owner: The pair of clusters of each.
+    """
+
+    found: ClusterPairs
+    x: Tensor
+    drift: Tensor
+    pairs: Pairs
+    owner: Tensor
+
+
+class _Places:
+    """Positions in double precision, and which of them a broad phase serves for; tensors are known until written to."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[Tensor, int, Tensor]] = []
+
+    def of(self, x: Tensor) -> Tensor:
+        """Positions x in double precision, the same tensor at each call for the same x."""
+        for known, version, double in self._known:
+            if known is x and version == x._version:
+                return double
+        self._known = [*self._known[-KNOWN + 1 :], (x, x._version, x.double())]
+        return self._known[-1][2]
+
+
+class Detector:
+    """Detects for one level's cloth; what it remembers changes how long an answer takes, not which pairs it has."""
+
+    def __init__(
+        self, parts: Parts, near: Reach | None = None, *, slack: float = SLACK, farther: float = LIST_RADIUS
+    ) -> None:
+        """Begin with nothing found.
+
+        Args:
+            parts: What may touch what.
+            near: How near is near, where that will be asked for.
+            slack: How far vertices may leave the paths of a broad phase before there is another, in mean edges.
+            farther: How much farther than what is near what is listed may be, of each vertex in its shortest edge.
+        """
+        self.parts, self.reach = parts, near
+        nothing = torch.zeros_like(parts.shortest)
+        self._radius = nothing if near is None else near.radius.double()
+        self._half = 0.0 if near is None else near.half
+        self._may = torch.where(parts.shortest.isfinite(), farther * parts.shortest, nothing)
+        self._slack = torch.full_like(nothing, slack * parts.spacing)
+        self._places = _Places()
+        self._found: ClusterPairs | None = None
+        self._served: Tensor | None = None
+        self._listed: _Listed | None = None
+        self._boxes: tuple[ClusterPairs, Tensor, Any] | None = None
+
+    @staticmethod
+    def once(parts: Parts, near: Reach | None = None) -> Detector:
+        """One that is asked once: it looks no farther than it need."""
+        return Detector(parts, near, slack=0.0, farther=0.0)
+
+    def near(self, x: Float[Tensor, "vertices 3"]) -> Pairs:
+        """All near pairs at x [m], and some that are a little farther."""
+        assert self.reach is not None
+        at = self._places.of(x)
+        found, last, reach = self._broad(at, None), self._listed, self.reach
+        given = {"radius": self._radius, "play": reach.play, "slack": SPARE * self._may, "half": reach.half}
+        motion = motion_of(at, torch.zeros_like(at), **given)
+        if last is None or last.found is not found:
+            pairs, owner = self._narrow(found, found.pairs, motion, at, room=NEAR)
+            self._listed = _Listed(found, at, torch.zeros_like(found.allowed), pairs, owner)
+            return pairs
+        drift = last.drift + found.nearer(last.x, at)
+        stale = drift > 0.5 * found.allowed
+        pairs, owner = last.pairs, last.owner
+        if bool(stale.any()):
+            which, kept = torch.nonzero(stale).squeeze(1), torch.nonzero(~stale[owner]).squeeze(1)
+            more, of = self._narrow(found, found.pairs[which], motion, at, room=NEAR)
+            pairs, owner = pairs.where(kept).joined(more), torch.cat([owner[kept], which[of]])
+            drift = torch.where(stale, 0.0, drift)
+        self._listed = _Listed(found, at, drift, pairs, owner)
+        return pairs
+
+    def impacts(
+        self,
+        start: Float[Tensor, "vertices 3"],
+        end: Float[Tensor, "vertices 3"],
+        *,
+        share: float,
+        floor: float,
+        asked: Bool[Tensor, " vertices"],
+        tangle: Int[Tensor, " vertices"] | None = None,
+    ) -> Pairs:
+        """Every pair of parts that would come too near on straight paths.
+
+        Args:
+            start: Positions [m].
+            end: Where the vertices go [m].
+            share: Fraction of their distance that pairs keep at least.
+            floor: Distance under which they keep nine tenths of it [m].
+            asked: Only pairs with one of these vertices are asked.
+            tangle: The tangle that each vertex is in, int32, -1 where in none: pairs of one alone are not asked; or
+                None.
+        """
+        if not bool(asked.any()):
+            return Pairs.none(asked.device)
+        at, to = self._places.of(start), self._places.of(end)
+        path = to - at
+        found, last = self._broad(at, to), self._listed
+        near, asks = Pairs.none(at.device), ~found.apart
+        motion = motion_of(at, path, asked=asked, tangle=tangle)
+        motion.share, motion.floor = share, floor
+        if last is not None and last.found is found:
+            near = of_list(self.parts, last.pairs.where(asks[last.owner]), motion)
+            drift = last.drift + torch.maximum(found.nearer(last.x, at), found.nearer(last.x, to))
+            asks = asks & (drift > found.allowed)
+        clusters = found.pairs[asks]
+        return near.joined(self._narrow(found, clusters, motion, at, room=IMPACTS)[0]) if len(clusters) else near
+
+    def still(self, kernel: wp.Kernel, x: Float[Tensor, "vertices 3"]) -> Pairs:
+        """Pairs of parts that a kernel with the parameters of `find_pairs` finds at x [m]."""
+        at = self._places.of(x)
+        found = self._broad(at, None)
+        motion = motion_of(at, torch.zeros_like(at))
+        return self._narrow(found, found.pairs[~found.apart], motion, at, room=IMPACTS, kernel=kernel)[0]
+
+    def _broad(self, at: Tensor, to: Tensor | None) -> ClusterPairs:
+        """Pairs of clusters that serve for a move from some positions to others, or for positions."""
+        last = to if to is not None else at
+        known = self._found is not None and ((to is None and last is self._served) or self._found.covers(at, to))
+        if self._found is None or not known:
+            radius = self._radius if self.reach is None else self._radius + SPARE * self._may
+            given = {"radius": radius, "slack": self._slack, "allowed": self._may, "half": self._half}
+            self._found = ClusterPairs.find(self.parts, at, to, **given)
+        self._served = last
+        return self._found
+
+    def _narrow(
+        self,
+        found: ClusterPairs,
+        clusters: Int[Tensor, "clusters 2"],
+        motion: Any,
+        at: Tensor,
+        *,
+        room: int,
+        kernel: wp.Kernel = find_pairs,
+    ) -> tuple[Pairs, Int[Tensor, " pairs"]]:
+        """The pairs of parts in some of a broad phase's pairs of clusters, and of which they are."""
+        active = wp.from_torch(found.active)
+        if self._boxes is None or self._boxes[0] is not found or self._boxes[1] is not at:
+            self._boxes = found, at, room_for_boxes(self.parts) if self._boxes is None else self._boxes[2]
+            launch(self.parts, bound_parts, len(found.active), motion, active, self._boxes[2])
+        launch(self.parts, average_paths, len(found.active), motion, active, self._boxes[2])
+        return find(self.parts, clusters, kernel, motion, self._boxes[2], room=room)

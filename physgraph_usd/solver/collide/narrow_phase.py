@@ -1,0 +1,348 @@
+"""Narrow phase: the pairs of parts of near clusters that are near, or that would touch on straight paths."""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..mesh.threads import LEAST_QUERIES, Launch
+from .boxes import Boxes, Motion, highest_of, lowest_of, outside, overlap, reach_of
+from .broad_phase import launch
+from .impact import can_meet, distance_of, impact_of, motion_of
+from .parts import Parts
+from .topology import Topology
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Found:
+    """Where each pair of clusters writes its pairs of parts, how many it has, and what `Pairs` holds."""
+
+    begin: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    corners: wp.array(dtype=wp.vec4i)
+    value: wp.array(dtype=wp.float64)
+    face: wp.array(dtype=wp.bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """How near what is near is.
+
+    Attributes:
+        radius: Two parts are near within the sum of their radii, the greatest of their corners' [m], shape (V,),
+            float64.
+        play: Those of one garment only within a part of their distance at rest and twice the least of these [m], shape
+            (V,).
+        half: That part. What lies in a patch whose m says that its parts keep more of it is left out whatever the play;
+            a great number leaves nothing out.
+    """
+
+    radius: Float[Tensor, " vertices"]
+    play: Float[Tensor, " vertices"]
+    half: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of parts.
+
+    Attributes:
+        corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4).
+        value: Of impacts the fraction of their paths that they may go, in (0, 1); of near pairs their distance over the
+            one asked for; shape (N,).
+        face: Whether it is a vertex and a face, shape (N,).
+    """
+
+    corners: Int[Tensor, "pairs 4"]
+    value: Float[Tensor, " pairs"]
+    face: Bool[Tensor, " pairs"]
+
+    @staticmethod
+    def none(device: torch.device | str) -> Pairs:
+        """No pairs."""
+        return _room(0, device)
+
+    def joined(self, other: Pairs) -> Pairs:
+        """These pairs and others."""
+        parts = ((getattr(self, name), getattr(other, name)) for name in ("corners", "value", "face"))
+        return Pairs(*(torch.cat(each) for each in parts))
+
+    def where(self, kept: Bool[Tensor, " pairs"] | Int[Tensor, " kept"]) -> Pairs:
+        """Some of these pairs."""
+        return Pairs(self.corners[kept], self.value[kept], self.face[kept])
+
+
+@wp.func
+def has(t: wp.vec3i, v: wp.int32):
+    """Whether a triangle has a vertex."""
+    return t[0] == v or t[1] == v or t[2] == v
+
+
+@wp.func
+def write(found: Found, i: wp.int32, count: wp.int32, corners: wp.vec4i, value: wp.float64, face: wp.bool):
+    """Write a cluster's next pair, if there is room."""
+    place = found.begin[i] + count
+    if place < found.begin[i + 1]:
+        found.corners[place] = corners
+        found.value[place] = value
+        found.face[place] = face
+
+
+@wp.func
+def is_one(parts: Topology, a: wp.int32, b: wp.int32):
+    """Whether two vertices are one, or sewn together."""
+    return parts.label[a] == parts.label[b]
+
+
+@wp.func
+def sum_of(face: wp.bool, a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64):
+    """The greatest value of a pair's first part and that of its second."""
+    if face:
+        return a + wp.max(b, wp.max(c, d))
+    return wp.max(a, b) + wp.max(c, d)
+
+
+@wp.func
+def box_gap(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Greatest distance along an axis between the boxes of two parts."""
+    low, high, other_low, other_high = a, a, wp.min(c, d), wp.max(c, d)
+    if face:
+        other_low, other_high = wp.min(b, other_low), wp.max(b, other_high)
+    else:
+        low, high = wp.min(a, b), wp.max(a, b)
+    apart = wp.max(low - other_high, other_low - high)
+    return wp.max(apart[0], wp.max(apart[1], apart[2]))
+
+
+@wp.func
+def nearness(face: wp.bool, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32, parts: Topology, motion: Motion):
+    """Distance of a pair over that within which it is near, which is less where it is near at rest; 1 beyond it."""
+    one = wp.float64(1.0)
+    r, p, m = motion.radius, motion.play, motion.slack
+    within, may = sum_of(face, r[a], r[b], r[c], r[d]), sum_of(face, m[a], m[b], m[c], m[d])
+    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
+    if box_gap(face, x, y, z, w) >= within + may:
+        return one
+    distance = distance_of(face, x, y, z, w)
+    if distance < within + may and parts.owner[a] == parts.owner[d]:
+        at_rest = distance_of(face, parts.rest[a], parts.rest[b], parts.rest[c], parts.rest[d])
+        play = wp.float64(2.0) * wp.min(wp.min(p[a], p[b]), wp.min(p[c], p[d]))
+        within = wp.min(within, motion.half * at_rest + play)
+    return wp.min(distance / (within + may), one)
+
+
+@wp.func
+def is_asked(motion: Motion, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32):
+    """Whether any vertex of a pair is asked for, and they are not all in one tangle."""
+    if not (motion.asked[a] or motion.asked[b] or motion.asked[c] or motion.asked[d]):
+        return False
+    tangle = motion.tangle[a]
+    in_one = motion.tangle[b] == tangle and motion.tangle[c] == tangle and motion.tangle[d] == tangle
+    return tangle < 0 or not in_one
+
+
+@wp.func
+def value_of(
+    face: wp.bool,
+    a: wp.int32,
+    b: wp.int32,
+    c: wp.int32,
+    d: wp.int32,
+    parts: Topology,
+    motion: Motion,
+):
+    """Part of their ways that a vertex and a face, or two edges, may go, or their distance over the one asked for.
+
+    It is 1 where they are not to be asked.
+    """
+    none = wp.float64(1.0)
+    if is_one(parts, a, c) or is_one(parts, a, d) or is_one(parts, b, wp.where(face, a, c)):
+        return none
+    if not face and is_one(parts, b, d):
+        return none
+    if not is_asked(motion, a, b, c, d):
+        return none
+    x, y, z, w = motion.start[a], motion.start[b], motion.start[c], motion.start[d]
+    if motion.is_still:
+        return nearness(face, a, b, c, d, parts, motion)
+    u, v, p, q = motion.path[a], motion.path[b], motion.path[c], motion.path[d]
+    if not can_meet(box_gap(face, x, y, z, w), motion_of(face, u, v, p, q), motion.share, motion.floor):
+        return none
+    return impact_of(face, x, y, z, w, u, v, p, q, motion.share, motion.floor)
+
+
+@wp.func
+def faces_met(
+    parts: Topology,
+    motion: Motion,
+    boxes: Boxes,
+    found: Found,
+    owner: wp.int32,
+    i: wp.int32,
+    j: wp.int32,
+    count: wp.int32,
+):
+    """Write the pairs of a cluster's vertices and another's faces; the number of pairs so far."""
+    reach = reach_of(boxes, i, j)
+    for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
+        v = parts.vertices[k]
+        at = motion.start[v]
+        if outside(at, at, boxes.low[j], boxes.high[j], reach):
+            continue
+        low, high = lowest_of(at - wp.vec3d(reach)), highest_of(at + wp.vec3d(reach))
+        for m in range(parts.first_face[j], parts.first_face[j + 1]):
+            if not overlap(low, high, boxes.face_low[m], boxes.face_high[m]):
+                continue
+            t = parts.faces[m]
+            if has(t, v):
+                continue
+            value = value_of(True, v, t[0], t[1], t[2], parts, motion)
+            if value < wp.float64(1.0):
+                write(found, owner, count, wp.vec4i(v, t[0], t[1], t[2]), value, True)
+                count += 1
+    return count
+
+
+@wp.func
+def edges_met(
+    parts: Topology,
+    motion: Motion,
+    boxes: Boxes,
+    found: Found,
+    owner: wp.int32,
+    i: wp.int32,
+    j: wp.int32,
+    count: wp.int32,
+):
+    """Write the pairs of the edges of two clusters, each once; the number of pairs so far."""
+    reach = reach_of(boxes, i, j)
+    for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
+        e = parts.edges[k]
+        near, far = motion.start[e[0]], motion.start[e[1]]
+        if outside(wp.min(near, far), wp.max(near, far), boxes.low[j], boxes.high[j], reach):
+            continue
+        low = lowest_of(wp.min(near, far) - wp.vec3d(reach))
+        high = highest_of(wp.max(near, far) + wp.vec3d(reach))
+        for m in range(wp.where(i == j, k + 1, parts.first_edge[j]), parts.first_edge[j + 1]):
+            if not overlap(low, high, boxes.edge_low[m], boxes.edge_high[m]):
+                continue
+            f = parts.edges[m]
+            if e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
+                continue
+            value = value_of(False, e[0], e[1], f[0], f[1], parts, motion)
+            if value < wp.float64(1.0):
+                write(found, owner, count, wp.vec4i(e[0], e[1], f[0], f[1]), value, False)
+                count += 1
+    return count
+
+
+@wp.kernel
+def find_pairs(
+    first: wp.int32, parts: Topology, clusters: wp.array(dtype=wp.vec2i), motion: Motion, boxes: Boxes, found: Found
+):
+    """The pairs of each two clusters' vertices with faces and of edges with edges, so far as there is room."""
+    n = first + wp.tid()
+    i, j = clusters[n][0], clusters[n][1]
+    if found.begin[n + 1] == found.begin[n] or (boxes.asked[i] == 0 and boxes.asked[j] == 0):
+        return
+    if outside(boxes.low[i], boxes.high[i], boxes.low[j], boxes.high[j], reach_of(boxes, i, j)):
+        return
+    count = faces_met(parts, motion, boxes, found, n, i, j, 0)
+    if i != j:
+        count = faces_met(parts, motion, boxes, found, n, j, i, count)
+    found.count[n] = edges_met(parts, motion, boxes, found, n, i, j, count)
+
+
+@wp.kernel
+def values_of(
+    first: wp.int32,
+    parts: Topology,
+    motion: Motion,
+    corners: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.bool),
+    value: wp.array(dtype=wp.float64),
+):
+    """The value of each pair of a list."""
+    i = first + wp.tid()
+    c = corners[i]
+    value[i] = value_of(face[i], c[0], c[1], c[2], c[3], parts, motion)
+
+
+def find(
+    parts: Parts, clusters: Int[Tensor, "clusters 2"], kernel: wp.Kernel, motion: Any, boxes: Any, *, room: int
+) -> tuple[Pairs, Int[Tensor, " pairs"]]:
+    """The pairs of parts that a kernel with the parameters of `find_pairs` finds in pairs of clusters.
+
+    Args:
+        parts: The parts.
+        clusters: The pairs of clusters, int32.
+        kernel: The kernel.
+        motion: What moves.
+        boxes: Boxes of the clusters that occur.
+        room: Pairs of parts of two clusters that there is room for before they are counted.
+
+    Returns:
+        The pairs, and which pair of clusters each is of.
+    """
+    size, device = len(clusters), clusters.device
+    given = (parts, clusters, kernel, motion, boxes)
+    begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
+    slots, count = _room(room * size, device), torch.zeros_like(begin[:size])
+    _write(*given, begin=begin, count=count, out=slots)
+    over = count > room
+    kept = torch.nonzero((torch.arange(room, device=device) < count.unsqueeze(1)) & ~over.unsqueeze(1))
+    first, owner = slots.where(kept[:, 0] * room + kept[:, 1]), kept[:, 0]
+    if not bool(over.any()):
+        return first, owner
+    begin[0] = 0  # Those without room are written again, now that they are counted.
+    begin[1:] = (count * over).cumsum(dim=0)
+    rest = _room(int(begin[-1]), device)
+    _write(*given, begin=begin, count=count, out=rest)
+    more = torch.arange(size, device=device).repeat_interleave(count * over)
+    return first.joined(rest), torch.cat([owner, more])
+
+
+def _write(
+    parts: Parts,
+    clusters: Tensor,
+    kernel: wp.Kernel,
+    motion: Any,
+    boxes: Any,
+    *,
+    begin: Tensor,
+    count: Tensor,
+    out: Pairs,
+) -> None:
+    """Count the pairs of each two clusters, and write those that there is room for."""
+    found = Found()
+    found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
+    found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
+    found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
+    pairs = wp.from_torch(clusters, dtype=wp.vec2i)
+    launch(parts, kernel, len(clusters), pairs, motion, boxes, found, least=LEAST_QUERIES)
+
+
+def of_list(parts: Parts, pairs: Pairs, motion: Any) -> Pairs:
+    """Those of some pairs that would come too near on the paths of a motion."""
+    value = torch.ones_like(pairs.value)
+    inputs = [parts.topology, motion, wp.from_torch(pairs.corners, dtype=wp.vec4i)]
+    inputs += [wp.from_torch(pairs.face), wp.from_torch(value)]
+    Launch(values_of, len(value), inputs, device=str(value.device), threads=parts.level.threads)({})
+    met = torch.nonzero(value < 1.0).squeeze(1)
+    return Pairs(pairs.corners[met], value[met], pairs.face[met])
+
+
+def _room(count: int, device: torch.device | str) -> Pairs:
+    """Room for some pairs."""
+    corners = torch.empty((count, 4), dtype=torch.int32, device=device)
+    value = torch.empty(count, dtype=torch.float64, device=device)
+    return Pairs(corners, value, torch.empty(count, dtype=torch.bool, device=device))

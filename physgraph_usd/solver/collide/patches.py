@@ -1,0 +1,290 @@
+"""Monotone patches: pieces of cloth that are proved not to touch themselves over a whole move.
+
+Theorem. Let a patch of cloth, projected at rest onto a plane, cover a convex domain D of the plane one to one, and let
+f: D -> R^3 be the piecewise linear map from there to where the cloth is. If there is an isometry Q: R^2 -> R^3 with
+
+    sym(Q^T Df) >= m > 0   in every triangle that meets D,
+
+then |f(x) - f(y)| >= m |x - y| for all x, y in D, so no two points of the patch touch.
+
+Proof. <f(x) - f(y), Q (x - y)> is the integral of <Df (x - y), Q (x - y)> along the segment from y to x, which lies in
+D. The condition is linear in f: where it holds with one Q at both ends of straight paths, it holds all along them.
+
+That a map whose gradient has a positive definite symmetric part is one to one on a convex domain is a classical fact of
+monotone maps. Relatives in collision detection are normal cones (Volino and Magnenat-Thalmann 1994; Provot 1997), with
+the test of the contour that they need (Tang et al. 2009; Wang et al. 2018), and certificates of deformation (Barbic and
+James 2010). Here one 2x2 matrix a triangle replaces both the cone and the contour.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from ..level import Level
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
+from .domains import Patches, area_of, domains_of, single
+from .topology import Topology
+
+wp.set_module_options({"enable_backward": False})
+
+SAMPLED = wp.constant(4)
+"""Of so many triangles one is counted where Q is fitted: any Q is right, the best proves most."""
+MARGIN = wp.constant(wp.float32(0.1))
+"""By how much m must be greater than what is relied on when it is found: by so much may each triangle's gradient
+change, by its Frobenius norm, before the patch is looked at again."""
+NOTHING = wp.constant(wp.float32(-1.0))
+"""m of a patch of which nothing is known, and what is relied on of one that leaves nothing out."""
+
+
+@wp.func
+def moved(start: wp.array(dtype=wp.vec3d), path: wp.array(dtype=wp.vec3d), v: wp.int32, time: wp.float64):
+    """Where a vertex is at a time of a move; where nothing moves the time is 0 and no path is read."""
+    if time == wp.float64(0.0):
+        return start[v]
+    return start[v] + time * path[v]
+
+
+@wp.func
+def sides_of(t: wp.vec3i, start: wp.array(dtype=wp.vec3d), path: wp.array(dtype=wp.vec3d), time: wp.float64):
+    """Two sides of a triangle at a time of a move, in single precision."""
+    p = moved(start, path, t[0], time)
+    u, v = moved(start, path, t[1], time) - p, moved(start, path, t[2], time) - p
+    return single(u), single(v)
+
+
+@wp.func
+def fitted(
+    patches: Patches, p: wp.int32, start: wp.array(dtype=wp.vec3d), path: wp.array(dtype=wp.vec3d), time: wp.float64
+):
+    """The isometry nearest to a patch's mean gradient at a time of a move; zero where that has none."""
+    g1, g2 = wp.vec3f(), wp.vec3f()
+    for k in range(patches.first_face[p], patches.first_face[p + 1], SAMPLED):
+        m = patches.inverse[k]
+        u, v = sides_of(patches.faces[k], start, path, time)
+        g1 += m[0] * u + m[2] * v
+        g2 += m[1] * u + m[3] * v
+    a, b, c = wp.dot(g1, g1), wp.dot(g1, g2), wp.dot(g2, g2)
+    root = wp.sqrt(wp.max(a * c - b * b, wp.float32(0.0)))
+    q1 = wp.normalize((c + root) * g1 - b * g2)
+    q2 = (a + root) * g2 - b * g1
+    q2 = wp.normalize(q2 - wp.dot(q1, q2) * q1)
+    if root <= wp.float32(1.0e-6) * (a + c):
+        q1, q2 = wp.vec3f(), wp.vec3f()
+    return q1, q2
+
+
+@wp.func
+def has_changed(patches: Patches, p: wp.int32, change: wp.array(dtype=wp.float32)):
+    """Whether a gradient in a patch has changed by more than the margin."""
+    for n in range(patches.first_member[p], patches.first_member[p + 1]):
+        if change[patches.members[n]] > MARGIN:
+            return True
+    return False
+
+
+@wp.func
+def least_of(
+    patches: Patches,
+    p: wp.int32,
+    start: wp.array(dtype=wp.vec3d),
+    path: wp.array(dtype=wp.vec3d),
+    moves: wp.bool,
+    wanted: wp.float32,
+):
+    """m of a patch over a move, by Q fitted half way; `NOTHING` where it is less than what is wanted."""
+    q1, q2 = fitted(patches, p, start, path, wp.where(moves, wp.float64(0.5), wp.float64(0.0)))
+    least = wp.float32(1.0)
+    for k in range(patches.first_face[p], patches.first_face[p + 1]):
+        inverse = patches.inverse[k]
+        for at in range(wp.where(moves, 2, 1)):
+            u, v = sides_of(patches.faces[k], start, path, wp.float64(at))
+            f1, f2 = inverse[0] * u + inverse[2] * v, inverse[1] * u + inverse[3] * v
+            h11, h22 = wp.dot(q1, f1), wp.dot(q2, f2)
+            other = wp.float32(0.5) * (h11 - h22)
+            h12 = wp.float32(0.5) * (wp.dot(q1, f2) + wp.dot(q2, f1))
+            least = wp.min(least, wp.float32(0.5) * (h11 + h22) - wp.sqrt(other * other + h12 * h12))
+            if not least > wanted:
+                return NOTHING
+    return least
+
+
+@wp.kernel
+def measure_patches(
+    first: wp.int32,
+    begin_at: wp.int32,
+    patches: Patches,
+    start: wp.array(dtype=wp.vec3d),
+    path: wp.array(dtype=wp.vec3d),
+    moves: wp.bool,
+    least: wp.float32,
+    enough: wp.float32,
+    found: wp.array(dtype=wp.float32),
+):
+    """m of some patches over a move along straight paths; of small ones only where that of the wide one round them is
+    not enough in every case."""
+    p = begin_at + first + wp.tid()
+    if patches.first_face[p] == patches.first_face[p + 1]:
+        return
+    around = patches.within[p]
+    if around >= 0:
+        if found[around] * patches.flattest[around] > enough:
+            return
+    found[p] = least_of(patches, p, start, path, moves, least)
+
+
+@wp.kernel
+def find_lost(
+    first: wp.int32,
+    patches: Patches,
+    start: wp.array(dtype=wp.vec3d),
+    path: wp.array(dtype=wp.vec3d),
+    moves: wp.bool,
+    relied: wp.array(dtype=wp.float32),
+    change: wp.array(dtype=wp.float32),
+    lost: wp.array(dtype=wp.int32),
+):
+    """Whether m of any patch is less than is relied on over a move; known where its gradients have changed little."""
+    p = first + wp.tid()
+    if lost[0] > 0 or relied[p] == NOTHING:
+        return
+    if has_changed(patches, p, change):
+        if least_of(patches, p, start, path, moves, relied[p]) == NOTHING:
+            lost[0] = 1
+
+
+@wp.kernel
+def find_changes(
+    first: wp.int32,
+    parts: Topology,
+    rest: wp.array(dtype=wp.vec3f),
+    start: wp.array(dtype=wp.vec3d),
+    end: wp.array(dtype=wp.vec3d),
+    x: wp.array(dtype=wp.vec3d),
+    change: wp.array(dtype=wp.float32),
+):
+    """The greatest change of a gradient in each cluster from one of two positions to a third, if it is greater."""
+    i = first + wp.tid()
+    most = wp.float32(0.0) + change[i]
+    for k in range(parts.first_face[i], parts.first_face[i + 1]):
+        t, r = parts.faces[k], rest[k]
+        most = wp.max(most, wp.min(change_of(t, r, start, x), change_of(t, r, end, x)))
+    change[i] = most
+
+
+@wp.func
+def change_of(t: wp.vec3i, r: wp.vec3f, before: wp.array(dtype=wp.vec3d), x: wp.array(dtype=wp.vec3d)):
+    """Frobenius norm of the change of a triangle's gradient between two positions."""
+    p = x[t[0]] - before[t[0]]
+    u, v = single(x[t[1]] - before[t[1]] - p), single(x[t[2]] - before[t[2]] - p)
+    along = r[0] * u
+    return wp.sqrt(wp.length_sq(along) + wp.length_sq(r[2] * v - r[1] * along))
+
+
+@wp.kernel
+def measure_rest(first: wp.int32, parts: Topology, rest: wp.array(dtype=wp.vec3f)):
+    """Of each face at rest what turns sides into a gradient: one over its first side, and of its second side what lies
+    along that over its height, and one over the height."""
+    i = first + wp.tid()
+    for k in range(parts.first_face[i], parts.first_face[i + 1]):
+        t = parts.faces[k]
+        e, f = parts.rest[t[1]] - parts.rest[t[0]], parts.rest[t[2]] - parts.rest[t[0]]
+        length = wp.length(e)
+        height = wp.length(area_of(parts, t)) / length
+        rest[k] = single(wp.vec3d(wp.float64(1.0) / length, wp.dot(e, f) / (length * height), wp.float64(1.0) / height))
+
+
+@dataclass(frozen=True, eq=False)
+class MonotonePatches:
+    """The patches of a level.
+
+    Attributes:
+        level: The level.
+        parts: Its parts by cluster.
+        clusters: Number of these.
+        table: What kernels read.
+        wide: Number of wide ones, which come first.
+        count: Number of all.
+        rest: As `measure_rest` gives it, of each face by cluster.
+    """
+
+    level: Level
+    parts: Topology
+    clusters: int
+    table: Patches
+    wide: int
+    count: int
+    rest: wp.array
+
+    @staticmethod
+    def of(level: Level, parts: Topology, clusters: int) -> MonotonePatches:
+        """The patches of a level with so many clusters."""
+        rest = wp.zeros(len(parts.faces), dtype=wp.vec3f, device=level.device)
+        out = MonotonePatches(level, parts, clusters, *domains_of(level, parts, clusters), rest)
+        out._launch(measure_rest, clusters, parts, rest)
+        return out
+
+    def measured(
+        self,
+        start: Float[Tensor, "vertices 3"],
+        end: Float[Tensor, "vertices 3"] | None,
+        *,
+        least: float,
+        enough: float,
+    ) -> Float[Tensor, " patches"]:
+        """m of each patch on the straight paths between positions [m], float64; -1 where it is not known.
+
+        Args:
+            start: Positions.
+            end: Where the vertices go; None where nothing moves.
+            least: What m must be more than.
+            enough: Of which distance at rest, at most, all that is nearer is to be left out: a part.
+        """
+        out = torch.full((self.count,), float(NOTHING), dtype=torch.float32, device=start.device)
+        x, moves = _array(start), end is not None
+        path = x if end is None else _array(end - start)
+        for begin, size in ((0, self.wide), (self.wide, self.count - self.wide)):
+            inputs = (begin, self.table, x, path, moves, least, enough, wp.from_torch(out))
+            self._launch(measure_patches, size, *inputs, least=LEAST_QUERIES)
+        return out
+
+    def still(
+        self,
+        relied: Float[Tensor, " patches"],
+        between: tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"]],
+        start: Float[Tensor, "vertices 3"],
+        end: Float[Tensor, "vertices 3"] | None,
+    ) -> bool:
+        """Whether m of each patch is not less on other paths [m], float64, than is relied on.
+
+        Args:
+            relied: What is relied on; m was greater by `MARGIN` between two positions.
+            between: These.
+            start: Positions.
+            end: Where the vertices go; None where nothing moves.
+        """
+        change = wp.zeros(self.clusters, dtype=wp.float32, device=self.level.device)
+        first, last = (_array(each) for each in between)
+        for x in (start,) if end is None else (start, end):
+            self._launch(find_changes, self.clusters, self.parts, self.rest, first, last, _array(x), change)
+        lost = wp.zeros(1, dtype=wp.int32, device=self.level.device)
+        x = _array(start)
+        inputs = (self.table, x, x if end is None else _array(end - start), end is not None, wp.from_torch(relied))
+        self._launch(find_lost, self.count, *inputs, change, lost, least=LEAST_QUERIES)
+        return int(lost.numpy()[0]) == 0
+
+    def _launch(self, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
+        """Run a kernel over patches or clusters; another thread is worth it from so many items."""
+        given = {"device": self.level.device, "threads": self.level.threads, "least": least}
+        Launch(kernel, size, list(inputs), **given)({})
+
+
+def _array(x: Tensor) -> wp.array:
+    """Positions as kernels read them."""
+    return wp.from_torch(x.contiguous(), dtype=wp.vec3d)
