@@ -67,8 +67,11 @@ def taken(tree: Path, arguments: Sequence[str], made: Path, core: int) -> tuple[
     out = made / f"{tree.name}.usdc"
     command = ["taskset", "-c", str(core), sys.executable, "-m", "physgraph_usd", "refine", *arguments]
     command += ["-o", str(out), "--report", f"{out}.json", "--overwrite"]
-    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    subprocess.run(command, cwd=tree, env=environment, capture_output=True, check=True)
+    path = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise click.ClickException(f"{tree.name}: {done.stderr[-500:]}")
     said = Path(f"{out}.json").read_text("utf-8")
     each = [sum(phases.values()) for phases in milliseconds(json.loads(said)["frames"])]
     crossings = sum(map(int, re.findall(r'"after": \{"crossings": (\d+)', said)))

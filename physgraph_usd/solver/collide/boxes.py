@@ -56,6 +56,20 @@ class Boxes:
     face_high: wp.array(dtype=wp.vec3f)
 
 
+@wp.struct
+class Swept:
+    """Of each cluster: the box that it sweeps, widened by how near it looks and how far it may leave its paths; the box
+    that it starts in; its mean path, how far it may leave that and looks, and how near it looks."""
+
+    low: wp.array(dtype=wp.vec3f)
+    high: wp.array(dtype=wp.vec3f)
+    at_low: wp.array(dtype=wp.vec3f)
+    at_high: wp.array(dtype=wp.vec3f)
+    mean: wp.array(dtype=wp.vec3d)
+    spread: wp.array(dtype=wp.float64)
+    near: wp.array(dtype=wp.float64)
+
+
 @wp.func
 def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.vec3f):
     """Whether two boxes meet; all six comparisons are made, for a wrong guess at a branch costs more."""
@@ -94,29 +108,42 @@ def reach_of(boxes: Boxes, i: wp.int32, j: wp.int32):
 
 
 @wp.kernel
-def sweep_boxes(
-    first: wp.int32,
-    parts: Topology,
-    motion: Motion,
-    low: wp.array(dtype=wp.vec3f),
-    high: wp.array(dtype=wp.vec3f),
-    near: wp.array(dtype=wp.float64),
-):
-    """The box that each cluster sweeps, with how near it looks and how far it may leave its paths; and how near."""
+def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, swept: Swept):
+    """The box that each cluster sweeps, and what bounds how near two can come."""
     i = first + wp.tid()
-    lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
-    reach, radius = wp.float64(0.0), wp.float64(0.0)
-    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
+    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
+    at_low, at_high, low, high = wp.vec3d(FAR), wp.vec3d(-FAR), wp.vec3d(FAR), wp.vec3d(-FAR)
+    reach, near, spread, mean = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.vec3d()
+    for k in range(begin, end):
         v = parts.corners[k]
-        at = motion.start[v]
-        end = at + motion.path[v]
-        lowest, highest = wp.min(lowest, wp.min(at, end)), wp.max(highest, wp.max(at, end))
+        x, path = motion.start[v], motion.path[v]
+        at_low, at_high = wp.min(at_low, x), wp.max(at_high, x)
+        low, high = wp.min(low, x + path), wp.max(high, x + path)
         reach = wp.max(reach, motion.radius[v] + motion.slack[v])
-        radius = wp.max(radius, motion.radius[v])
-    near[i] = radius
-    widened = ROUNDING * wp.max(wp.abs(lowest), wp.abs(highest)) + wp.vec3d(reach)
-    low[i] = single(lowest - widened)
-    high[i] = single(highest + widened)
+        near = wp.max(near, motion.radius[v])
+        mean += path
+    mean /= wp.float64(wp.max(end - begin, 1))
+    for k in range(begin, end):
+        spread = wp.max(spread, wp.length(motion.path[parts.corners[k]] - mean))
+    low, high = wp.min(low, at_low), wp.max(high, at_high)
+    widened = ROUNDING * wp.max(wp.abs(low), wp.abs(high)) + wp.vec3d(reach)
+    swept.low[i] = single(low - widened)
+    swept.high[i] = single(high + widened)
+    swept.at_low[i] = lowest_of(at_low)
+    swept.at_high[i] = highest_of(at_high)
+    swept.mean[i] = mean
+    swept.spread[i] = spread + reach
+    swept.near[i] = near
+
+
+@wp.func
+def can_come_near(swept: Swept, i: wp.int32, j: wp.int32):
+    """Whether the boxes of two clusters meet on their way, and how they go against each other brings them near."""
+    if not overlap(swept.low[i], swept.high[i], swept.low[j], swept.high[j]):
+        return False
+    apart = wp.max(swept.at_low[i] - swept.at_high[j], swept.at_low[j] - swept.at_high[i])
+    nearer = wp.length(swept.mean[i] - swept.mean[j]) + swept.spread[i] + swept.spread[j]
+    return wp.float64(wp.max(apart[0], wp.max(apart[1], apart[2]))) <= nearer
 
 
 @wp.kernel
@@ -160,6 +187,16 @@ def average_paths(first: wp.int32, parts: Topology, motion: Motion, active: wp.a
     boxes.spread[i] = spread
     boxes.radius[i] = radius
     boxes.asked[i] = asked
+
+
+def room_for_swept(size: int, device: str) -> Any:
+    """The same, to be filled."""
+    swept = Swept()
+    for name in ("low", "high", "at_low", "at_high"):
+        setattr(swept, name, wp.empty(size, dtype=wp.vec3f, device=device))
+    swept.mean = wp.empty(size, dtype=wp.vec3d, device=device)
+    swept.spread, swept.near = (wp.empty(size, dtype=wp.float64, device=device) for _ in range(2))
+    return swept
 
 
 def room_for_boxes(parts: Parts) -> Any:

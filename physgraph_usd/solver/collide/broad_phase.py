@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
-from .boxes import motion_of, sweep_boxes
+from .boxes import FAR, Swept, can_come_near, motion_of, overlap, room_for_swept, sweep_boxes
 from .domains import Patches, flat, holds
 from .parts import Parts
 from .patches import MARGIN, NOTHING
@@ -85,7 +85,9 @@ class ClusterPairs:
         path = torch.zeros_like(start) if end is None else end - start
         m = parts.patches.measured(start, end, least=float(LEAST + MARGIN), enough=half + float(MARGIN))
         relied = torch.full_like(m, float(NOTHING))
-        found = _in_boxes(parts, motion_of(start, path, radius=radius, slack=slack, half=half), m, relied)
+        # What all have in common of their paths brings nothing together, and would only make boxes longer.
+        motion = motion_of(start, path - path.mean(dim=0), radius=radius, slack=slack, half=half)
+        found = _in_boxes(parts, motion, m, relied)
         pairs = found[:, :2].contiguous()
         occurs = torch.zeros(parts.count, dtype=torch.bool, device=start.device)
         occurs[pairs.reshape(-1).long()] = True
@@ -125,16 +127,19 @@ def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: i
 def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor) -> Int[Tensor, "pairs 3"]:
     """Pairs of clusters whose boxes meet on their way, and what is proved of them; what that relies on is noted."""
     size, device = parts.count, str(m.device)
-    low, high = (wp.empty(size, dtype=wp.vec3f, device=device) for _ in range(2))
-    reach = wp.empty(size, dtype=wp.float64, device=device)
-    launch(parts, sweep_boxes, size, motion, low, high, reach)
-    tree, room = wp.Bvh(low, high), ROOM
+    swept = room_for_swept(size, device)
+    launch(parts, sweep_boxes, size, motion, swept)
+    table = parts.patches.table
+    groups = parts.patches.count - parts.patches.wide
+    all_low, all_high = (wp.empty(groups, dtype=wp.vec3f, device=device) for _ in range(2))
+    launch(parts, join_boxes, groups, table, swept, all_low, all_high)
+    tree, room = wp.Bvh(all_low, all_high), ROOM
     while True:
         slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
         count = torch.zeros(size, dtype=torch.int32, device=device)
-        given = [parts.patches.table, wp.from_torch(m), wp.from_torch(relied), reach, motion.half, tree.id, low, high]
+        given = [table, wp.from_torch(m), wp.from_torch(relied), motion.half, tree.id, swept, all_low, all_high]
         given += [room, wp.from_torch(slots.view(-1, 3), dtype=wp.vec3i), wp.from_torch(count)]
-        launch(parts, find_clusters, size, *given, least=LEAST_QUERIES)
+        launch(parts, find_clusters, groups, *given, least=LEAST_QUERIES)
         most = int(count.max()) if size else 0
         if most <= room:
             return slots[torch.arange(room, device=device) < count.unsqueeze(1)]
@@ -200,6 +205,104 @@ def proved(
     return most
 
 
+@wp.func
+def have_both(
+    patches: Patches,
+    m: wp.array(dtype=wp.float32),
+    relied: wp.array(dtype=wp.float32),
+    half: wp.float32,
+    p: wp.int32,
+    a: wp.int32,
+    b: wp.int32,
+):
+    """Whether a patch has two groups, and proves that nothing of the two is near; what that needs is noted."""
+    needed = wp.max(half / patches.flattest[p], LEAST)
+    if m[p] <= needed + MARGIN:
+        return False
+    begin, end = patches.first_whole[p], patches.first_whole[p + 1]
+    if not holds(patches.whole, begin, end, a):
+        return False
+    if not holds(patches.whole, begin, end, b):
+        return False
+    wp.atomic_max(relied, p, needed)
+    return True
+
+
+@wp.func
+def lie_apart(
+    patches: Patches,
+    m: wp.array(dtype=wp.float32),
+    relied: wp.array(dtype=wp.float32),
+    half: wp.float32,
+    a: wp.int32,
+    b: wp.int32,
+):
+    """Whether a patch round two groups proves that nothing of the two is near."""
+    small, other = patches.wide_count + a, patches.wide_count + b
+    if have_both(patches, m, relied, half, patches.within[small], a, b):
+        return True
+    if have_both(patches, m, relied, half, small, a, b):
+        return True
+    if a == b:
+        return False
+    if have_both(patches, m, relied, half, patches.within[other], a, b):
+        return True
+    return have_both(patches, m, relied, half, other, a, b)
+
+
+@wp.func
+def feel(parts: Topology, i: wp.int32, j: wp.int32):
+    """Whether the garments of two clusters feel one another."""
+    return parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] != 0
+
+
+@wp.kernel
+def join_boxes(
+    first: wp.int32,
+    parts: Topology,
+    patches: Patches,
+    swept: Swept,
+    all_low: wp.array(dtype=wp.vec3f),
+    all_high: wp.array(dtype=wp.vec3f),
+):
+    """The box of each group's clusters."""
+    a = first + wp.tid()
+    p = patches.wide_count + a
+    lowest, highest = wp.vec3f(wp.float32(FAR)), wp.vec3f(wp.float32(-FAR))
+    for n in range(patches.first_own[p], patches.first_own[p + 1]):
+        lowest = wp.min(lowest, swept.low[patches.own[n]])
+        highest = wp.max(highest, swept.high[patches.own[n]])
+    all_low[a] = lowest
+    all_high[a] = highest
+
+
+@wp.func
+def pairs_of(
+    parts: Topology,
+    patches: Patches,
+    m: wp.array(dtype=wp.float32),
+    relied: wp.array(dtype=wp.float32),
+    half: wp.float32,
+    swept: Swept,
+    room: wp.int32,
+    out: wp.array(dtype=wp.vec3i),
+    found: wp.array(dtype=wp.int32),
+    i: wp.int32,
+    begin: wp.int32,
+    end: wp.int32,
+):
+    """Write the pairs of a cluster and others that it can come near, those that are own ones of a patch."""
+    for k in range(begin, end):
+        j = patches.own[k]
+        if not can_come_near(swept, i, j):
+            continue
+        known = proved(patches, m, relied, swept.near[i] + swept.near[j], half, i, j)
+        if known < OUT:
+            if found[i] < room:
+                out[i * room + found[i]] = wp.vec3i(wp.min(i, j), wp.max(i, j), known)
+            found[i] = found[i] + 1
+
+
 @wp.kernel
 def find_clusters(
     first: wp.int32,
@@ -207,31 +310,34 @@ def find_clusters(
     patches: Patches,
     m: wp.array(dtype=wp.float32),
     relied: wp.array(dtype=wp.float32),
-    reach: wp.array(dtype=wp.float64),
     half: wp.float32,
     tree: wp.uint64,
-    low: wp.array(dtype=wp.vec3f),
-    high: wp.array(dtype=wp.vec3f),
+    swept: Swept,
+    all_low: wp.array(dtype=wp.vec3f),
+    all_high: wp.array(dtype=wp.vec3f),
     room: wp.int32,
     out: wp.array(dtype=wp.vec3i),
     found: wp.array(dtype=wp.int32),
 ):
-    """Clusters, no lower ones, that each cluster can come near; counted also where there is no room."""
-    i = first + wp.tid()
-    if low[i][0] > high[i][0]:
-        return
-    count, j = wp.int32(0), wp.int32(0)
-    query = wp.bvh_query_aabb(tree, low[i], high[i])
-    while wp.bvh_query_next(query, j):
-        if j < i or parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
+    """Clusters that those of each group can come near, in it and in groups after it; counted also where there is no
+    room."""
+    a = first + wp.tid()
+    b = wp.int32(0)
+    p = patches.wide_count + a
+    query = wp.bvh_query_aabb(tree, all_low[a], all_high[a])
+    while wp.bvh_query_next(query, b):
+        if b < a:
             continue
-        known = proved(patches, m, relied, reach[i] + reach[j], half, i, j)
-        if known == OUT:
+        q = patches.wide_count + b
+        if not feel(parts, patches.own[patches.first_own[p]], patches.own[patches.first_own[q]]):
             continue
-        if count < room:
-            out[i * room + count] = wp.vec3i(i, j, known)
-        count += 1
-    found[i] = count
+        if lie_apart(patches, m, relied, half, a, b):
+            continue
+        for n in range(patches.first_own[p], patches.first_own[p + 1]):
+            i = patches.own[n]
+            if overlap(swept.low[i], swept.high[i], all_low[b], all_high[b]):
+                begin, end = wp.where(a == b, n, patches.first_own[q]), patches.first_own[q + 1]
+                pairs_of(parts, patches, m, relied, half, swept, room, out, found, i, begin, end)
 
 
 @wp.kernel

@@ -171,10 +171,14 @@ class Detector:
         known = self._found is not None and ((to is None and last is self._served) or self._found.covers(at, to))
         if self._found is None or not known:
             radius = self._radius if self.reach is None else self._radius + SPARE * self._may
-            given = {"radius": radius, "slack": self._slack, "allowed": self._may, "half": self._half}
+            given = {"radius": radius, "slack": self._slack_for(at, to), "allowed": self._may, "half": self._half}
             self._found = ClusterPairs.find(self.parts, at, to, **given)
         self._served = last
         return self._found
+
+    def _slack_for(self, at: Tensor, to: Tensor | None) -> Tensor:
+        """How far vertices may leave the paths of a broad phase [m]: what goes far will go on, by up to an edge."""
+        return self._slack if to is None else self._slack + (to - at).norm(dim=1).clamp_max(self.parts.spacing)
 
     def _narrow(
         self,

@@ -50,7 +50,8 @@ class Sheet:
 class Patches:
     """Of each patch: its own clusters and all, its plane, the half-planes of its domain, and what lies there; the wide
     and the small patch that each cluster is an own one of, and the wide one that each small one lies in, -1 for wide
-    ones; the least cosine between its faces and its plane; and of each cluster its centre and radius at rest."""
+    ones; the least cosine between its faces and its plane; and of each cluster its centre and radius at rest. The own
+    clusters of the small patches are groups: those that lie in each domain as a whole, by number."""
 
     wide: wp.array(dtype=wp.int32)
     small: wp.array(dtype=wp.int32)
@@ -70,6 +71,9 @@ class Patches:
     flattest: wp.array(dtype=wp.float32)
     first_inside: wp.array(dtype=wp.int32)
     inside: wp.array(dtype=wp.int32)
+    wide_count: wp.int32
+    first_whole: wp.array(dtype=wp.int32)
+    whole: wp.array(dtype=wp.int32)
     centre: wp.array(dtype=wp.vec3d)
     size: wp.array(dtype=wp.float64)
 
@@ -420,6 +424,14 @@ def domains_of(level: Level, parts: Topology, count: int) -> tuple[Patches, int,
     within = np.asarray((small @ wide.T).argmax(axis=1)).ravel() if count else np.zeros(0)
     table.within = _array(np.concatenate([np.full(wide.shape[0], -1), within]), device)
     _fill(table, level, parts, size)
+    indices, begins = (np.asarray(each.numpy()) for each in (table.inside, table.first_inside))
+    inside = sp.csr_matrix((np.ones(len(indices), np.float32), indices, begins), shape=(size, count))
+    whole = (inside @ small.T).tocoo()
+    kept = whole.data == np.diff(small.indptr)[whole.col]
+    whole = sp.csr_matrix((whole.data[kept], (whole.row[kept], whole.col[kept])), shape=whole.shape)
+    whole.sort_indices()
+    table.wide_count = wide.shape[0]
+    table.first_whole, table.whole = _array(whole.indptr, device), _array(whole.indices, device)
     return table, wide.shape[0], size
 
 
