@@ -112,10 +112,10 @@ class ClusterPairs:
 
     def _is_near(self, x: Tensor) -> bool:
         """Whether all vertices at x [m] are near their paths."""
-        way = x - self.start
+        moved = x - self.start
         length = self.path.square().sum(dim=1)
-        part = ((way * self.path).sum(dim=1) / length.clamp_min(1e-300)).clamp(0.0, 1.0)
-        return bool(((way - part.unsqueeze(1) * self.path).square().sum(dim=1) <= self.slack.square()).all())
+        part = ((moved * self.path).sum(dim=1) / length.clamp_min(1e-300)).clamp(0.0, 1.0)
+        return bool(((moved - part.unsqueeze(1) * self.path).square().sum(dim=1) <= self.slack.square()).all())
 
 
 def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:

@@ -47,25 +47,25 @@ def _closest_of(
             if holds(members, begins, ends, k):
                 t = faces[k]
                 weight = weights_on_triangle(at, x[t[0]], x[t[1]], x[t[2]])
-                way = at + weight[1] * x[t[0]] + weight[2] * x[t[1]] + weight[3] * x[t[2]]
-                if wp.length(way) < least:
-                    least = wp.length(way)
-                    out[n] = way
+                displacement = at + weight[1] * x[t[0]] + weight[2] * x[t[1]] + weight[3] * x[t[2]]
+                if wp.length(displacement) < least:
+                    least = wp.length(displacement)
+                    out[n] = displacement
 
 
-def ways_to(
+def displacements_to(
     level: Level,
     x: Float[Tensor, "vertices 3"],
     asked: Int[Tensor, " asked"],
     which: Int[Tensor, " asked"],
     sets: csr_matrix,
 ) -> Float[Tensor, "asked 3"]:
-    """The way from the closest point of a set of faces to each of some vertices [m], float64; zero from empty sets.
+    """Displacements from the closest point of a set of faces to each of some vertices [m], float64; 0 from empty sets.
 
     Args:
         level: The level.
         x: Positions [m].
-        asked: The vertices.
+        asked: Numbers of the vertices.
         which: The row of the set that each is asked of.
         sets: Faces of each set, shape (sets, T).
     """

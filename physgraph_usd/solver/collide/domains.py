@@ -100,8 +100,8 @@ def holds(members: wp.array(dtype=wp.int32), begin: wp.int32, end: wp.int32, wan
 @wp.func
 def flat(patches: Patches, p: wp.int32, x: wp.vec3d):
     """A point at rest in the patch's plane, from its middle."""
-    way = x - patches.middle[p]
-    return wp.vec2d(wp.dot(way, patches.across[p]), wp.dot(way, patches.up[p]))
+    offset = x - patches.middle[p]
+    return wp.vec2d(wp.dot(offset, patches.across[p]), wp.dot(offset, patches.up[p]))
 
 
 @wp.func

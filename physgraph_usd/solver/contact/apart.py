@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..collide.closest import ways_to
+from ..collide.closest import displacements_to
 from ..collide.crossings import Crossings, crossings
 from ..collide.detector import Detector
 from ..deadline import is_over
@@ -37,17 +37,17 @@ class _Through:
 
     Attributes:
         vertices: Their numbers, shape (N,), int64.
-        way: From the closest point of that cloth to each [m], shape (N, 3).
+        depth: From the closest point of that cloth to each [m], shape (N, 3).
     """
 
     vertices: Int[Tensor, " vertices"]
-    way: Float[Tensor, "vertices 3"]
+    depth: Float[Tensor, "vertices 3"]
 
     def back(self, x: Tensor, gap: float) -> Tensor:
         """Positions in which they lie on the other side, as far as they were through, but at most a gap [m]."""
-        out, length = x.clone(), self.way.norm(dim=1, keepdim=True)
+        out, length = x.clone(), self.depth.norm(dim=1, keepdim=True)
         beyond = length.clamp_max(gap) / length.clamp_min(1e-30)
-        out[self.vertices] = x[self.vertices] - ((1.0 + beyond) * self.way).to(x)
+        out[self.vertices] = x[self.vertices] - ((1.0 + beyond) * self.depth).to(x)
         return out
 
 
@@ -99,9 +99,9 @@ def _gone_through(mesh: ClothMesh, found: Crossings, x: Tensor) -> _Through:
     rings = np.ceil(np.sqrt(np.bincount(piece[piece >= 0], minlength=count))).astype(int) + BESIDE
     barrier = _grown(mesh, met, rings) - _grown(mesh, own, np.full(count, BESIDE))
     barrier = sp.csr_matrix(barrier > 0)
-    way = ways_to(mesh.level, x, vertices, which, _faces_of(mesh, barrier))
-    kept = torch.nonzero((way != 0).any(dim=1)).squeeze(1)
-    return _Through(vertices[kept], way[kept])
+    depth = displacements_to(mesh.level, x, vertices, which, _faces_of(mesh, barrier))
+    kept = torch.nonzero((depth != 0).any(dim=1)).squeeze(1)
+    return _Through(vertices[kept], depth[kept])
 
 
 def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
