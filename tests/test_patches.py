@@ -208,9 +208,10 @@ def test_lips_of_a_slit_are_asked():
     assert across <= known
 
 
-def test_a_move_is_served_only_while_patches_stay_monotone():
+@pytest.mark.parametrize("shape", [flat, tube])
+def test_a_move_is_served_only_while_patches_stay_monotone(shape: Shape):
     """What serves for a move has no more to ask on another near it; bent sharply, it serves no more."""
-    cloth, rng = Cloth(flat), np.random.default_rng(5)
+    cloth, rng = Cloth(shape), np.random.default_rng(5)
     x = placed(cloth.rest, np.random.default_rng(11))
     given = {
         name: torch.full((len(x),), size, dtype=torch.float64) for name, size in (("slack", EDGE), ("radius", 0.0))

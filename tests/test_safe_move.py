@@ -158,6 +158,25 @@ class TestWhatIsFreeToGoGoes:
         assert short[first].any()
         assert not short[~first].any()
 
+    def test_what_stops_stops_what_comes_behind_it(self):
+        """Two sheets fly as fast as one another; the first meets a wall, to which the second would not come."""
+        points, faces, count = [], [], 0
+        for height in (-6.0, 0.0, 4.0):
+            x, f = sheet(np.random.default_rng(3), 40)
+            points.append(x + np.array([0.0, 0.0, height * EDGE]))
+            faces.append(f + count)
+            count += len(x)
+        start, corners = np.concatenate(points), np.concatenate(faces)
+        mesh = PolygonMesh(np.full(len(corners), 3, np.int32), corners.ravel().astype(np.int32), count)
+        level = build_levels([named((mesh, start), "Row")], [[]], dtype=torch.float64)[0]
+        wanted = start.copy()
+        wanted[:80, 2] += 9.9 * EDGE
+        parts = Parts(level, np.ones((1, 1), bool))
+        moved = safe_move(torch.as_tensor(start), torch.as_tensor(wanted), parts, floor=1e-4 * EDGE)
+        behind, first, wall = moved.x.numpy()[:, 2].reshape(3, 40)
+        assert first.max() < wall.min()
+        assert behind.max() < first.min()
+
     def test_what_is_in_one_tangle_goes_through_itself_wherever_it_is_wanted(self):
         scenes = Scenes(2, gap=0.1, far=0.0, dtype=torch.float64)
         wanted = torch.as_tensor(mirrored(scenes.start, np.random.default_rng(1)))

@@ -9,6 +9,7 @@ import pytest
 import torch
 from brute import Soup, between_edges, crossings, on_segments, on_triangles
 from folds import SHAPES, folded, frame_with, levels_of, named, placed, refiner_with, square, strip
+from meshes import grid
 
 from physgraph_usd.solver.collide.narrow_phase import Reach
 from physgraph_usd.solver.collide.near import near_pairs
@@ -40,6 +41,23 @@ class TestCagesThatPassThroughOneAnother:
                 found.append(len(crossings(Soup.of(level, x))))
         assert max(inputs) > 10
         assert results == [0] * len(results)
+
+
+def test_what_the_upsampled_cage_crosses_is_counted_though_the_cage_does_not():
+    """A quad's two triangles bend along a diagonal; its four quads sag to its centre, onto a strip that is between."""
+    mesh, flat = square(1, kind="quads")
+    triangles = levels_of(named((mesh, flat)))[0].triangles.numpy()
+    ends = np.flatnonzero(np.bincount(triangles.ravel()) == 2)
+    quad = flat.copy()
+    quad[ends, 1] += 0.01
+    length, across = np.linspace(0.2, 0.8, 5), 0.001 * np.cross(flat[ends[1]] - flat[ends[0]], [0.0, 1.0, 0.0])
+    middle = flat[ends[0]] + np.outer(length, flat[ends[1]] - flat[ends[0]]) + np.array([0.0, 0.0075, 0.0])
+    below, points = grid(4, 1, "triangles")[0], np.concatenate([middle - 0.9 * across, middle + 1.1 * across])
+    sheets = [named((mesh, flat), "A"), named((below, points), "B")]
+    solver, levels, cages = refiner_with(sheets), levels_of(*sheets), np.concatenate([quad, points])
+    assert len(crossings(Soup.of(levels[0], cages))) == 0
+    contact = solver.solve(frame_with([quad, points])).telemetry[0]["contact"]["cloth"]
+    assert contact["before"]["crossings"] == len(crossings(Soup.of(levels[-1], levels[-1].from_coarse @ cages))) > 0
 
 
 class TestNearPairs:

@@ -58,15 +58,11 @@ class Boxes:
 
 @wp.struct
 class Swept:
-    """Of each cluster: the box that it sweeps, widened by how near it looks and how far it may leave its paths; the box
-    that it starts in; its mean path, how far it may leave that and looks, and how near it looks."""
+    """Of each cluster: the box that it sweeps, widened by how near it looks and how far it may leave its paths, and how
+    near it looks."""
 
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)
-    at_low: wp.array(dtype=wp.vec3f)
-    at_high: wp.array(dtype=wp.vec3f)
-    mean: wp.array(dtype=wp.vec3d)
-    spread: wp.array(dtype=wp.float64)
     near: wp.array(dtype=wp.float64)
 
 
@@ -109,41 +105,34 @@ def reach_of(boxes: Boxes, i: wp.int32, j: wp.int32):
 
 @wp.kernel
 def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, swept: Swept):
-    """The box that each cluster sweeps, and what bounds how near two can come."""
+    """The box that each cluster sweeps, wherever on its path each vertex is: some may stop while others go on."""
     i = first + wp.tid()
-    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
-    at_low, at_high, low, high = wp.vec3d(FAR), wp.vec3d(-FAR), wp.vec3d(FAR), wp.vec3d(-FAR)
-    reach, near, spread, mean = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.vec3d()
-    for k in range(begin, end):
+    low, high = wp.vec3d(FAR), wp.vec3d(-FAR)
+    reach, near = wp.float64(0.0), wp.float64(0.0)
+    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
         v = parts.corners[k]
-        x, path = motion.start[v], motion.path[v]
-        at_low, at_high = wp.min(at_low, x), wp.max(at_high, x)
-        low, high = wp.min(low, x + path), wp.max(high, x + path)
+        at = motion.start[v]
+        end = at + motion.path[v]
+        low, high = wp.min(low, wp.min(at, end)), wp.max(high, wp.max(at, end))
         reach = wp.max(reach, motion.radius[v] + motion.slack[v])
         near = wp.max(near, motion.radius[v])
-        mean += path
-    mean /= wp.float64(wp.max(end - begin, 1))
-    for k in range(begin, end):
-        spread = wp.max(spread, wp.length(motion.path[parts.corners[k]] - mean))
-    low, high = wp.min(low, at_low), wp.max(high, at_high)
     widened = ROUNDING * wp.max(wp.abs(low), wp.abs(high)) + wp.vec3d(reach)
     swept.low[i] = single(low - widened)
     swept.high[i] = single(high + widened)
-    swept.at_low[i] = lowest_of(at_low)
-    swept.at_high[i] = highest_of(at_high)
-    swept.mean[i] = mean
-    swept.spread[i] = spread + reach
     swept.near[i] = near
 
 
 @wp.func
-def can_come_near(swept: Swept, i: wp.int32, j: wp.int32):
-    """Whether the boxes of two clusters meet on their way, and how they go against each other brings them near."""
-    if not overlap(swept.low[i], swept.high[i], swept.low[j], swept.high[j]):
-        return False
-    apart = wp.max(swept.at_low[i] - swept.at_high[j], swept.at_low[j] - swept.at_high[i])
-    nearer = wp.length(swept.mean[i] - swept.mean[j]) + swept.spread[i] + swept.spread[j]
-    return wp.float64(wp.max(apart[0], wp.max(apart[1], apart[2]))) <= nearer
+def mean_path(parts: Topology, path: wp.array(dtype=wp.vec3d), i: wp.int32):
+    """The mean path of a cluster's vertices, and how far one leaves it at most."""
+    total, most = wp.vec3d(), wp.float64(0.0)
+    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
+    for k in range(begin, end):
+        total += path[parts.corners[k]]
+    mean = total / wp.float64(wp.max(end - begin, 1))
+    for k in range(begin, end):
+        most = wp.max(most, wp.length(path[parts.corners[k]] - mean))
+    return mean, most
 
 
 @wp.kernel
@@ -171,18 +160,13 @@ def bound_parts(first: wp.int32, parts: Topology, motion: Motion, active: wp.arr
 def average_paths(first: wp.int32, parts: Topology, motion: Motion, active: wp.array(dtype=wp.int32), boxes: Boxes):
     """Of each of some clusters its mean path, how far vertices leave that, how near it looks, and if it is asked."""
     i = active[first + wp.tid()]
-    total, asked, radius = wp.vec3d(), wp.int32(0), wp.float64(0.0)
-    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
-    for k in range(begin, end):
+    asked, radius = wp.int32(0), wp.float64(0.0)
+    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
         v = parts.corners[k]
-        total += motion.path[v]
         radius = wp.max(radius, motion.radius[v] + motion.slack[v])
         if motion.asked[v]:
             asked = 1
-    mean = total / wp.float64(wp.max(end - begin, 1))
-    spread = wp.float64(0.0)
-    for k in range(begin, end):
-        spread = wp.max(spread, wp.length(motion.path[parts.corners[k]] - mean))
+    mean, spread = mean_path(parts, motion.path, i)
     boxes.mean[i] = mean
     boxes.spread[i] = spread
     boxes.radius[i] = radius
@@ -190,12 +174,10 @@ def average_paths(first: wp.int32, parts: Topology, motion: Motion, active: wp.a
 
 
 def room_for_swept(size: int, device: str) -> Any:
-    """The same, to be filled."""
+    """Boxes of whole paths to be filled."""
     swept = Swept()
-    for name in ("low", "high", "at_low", "at_high"):
-        setattr(swept, name, wp.empty(size, dtype=wp.vec3f, device=device))
-    swept.mean = wp.empty(size, dtype=wp.vec3d, device=device)
-    swept.spread, swept.near = (wp.empty(size, dtype=wp.float64, device=device) for _ in range(2))
+    swept.low, swept.high = (wp.empty(size, dtype=wp.vec3f, device=device) for _ in range(2))
+    swept.near = wp.empty(size, dtype=wp.float64, device=device)
     return swept
 
 

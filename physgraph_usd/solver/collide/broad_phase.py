@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
-from .boxes import FAR, Swept, can_come_near, motion_of, overlap, room_for_swept, sweep_boxes
+from .boxes import FAR, Swept, mean_path, motion_of, overlap, room_for_swept, sweep_boxes
 from .domains import Patches, flat, holds
 from .parts import Parts
 from .patches import MARGIN, NOTHING
@@ -85,9 +85,8 @@ class ClusterPairs:
         path = torch.zeros_like(start) if end is None else end - start
         m = parts.patches.measured(start, end, least=float(LEAST + MARGIN), enough=half + float(MARGIN))
         relied = torch.full_like(m, float(NOTHING))
-        # What all have in common of their paths brings nothing together, and would only make boxes longer.
-        motion = motion_of(start, path - path.mean(dim=0), radius=radius, slack=slack, half=half)
-        found = _in_boxes(parts, motion, m, relied)
+        motion = motion_of(start, path, radius=radius, slack=slack)
+        found = _in_boxes(parts, motion, m, relied, half=half)
         pairs = found[:, :2].contiguous()
         occurs = torch.zeros(parts.count, dtype=torch.bool, device=start.device)
         occurs[pairs.reshape(-1).long()] = True
@@ -120,11 +119,11 @@ class ClusterPairs:
 
 def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
     """Run a kernel over clusters or pairs of clusters; another thread is worth it from so many items."""
-    given = {"device": parts.level.device, "threads": parts.level.threads, "least": least}
-    Launch(kernel, size, [parts.topology, *inputs], **given)({})
+    launched = {"device": parts.level.device, "threads": parts.level.threads, "least": least}
+    Launch(kernel, size, [parts.topology, *inputs], **launched)({})
 
 
-def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor) -> Int[Tensor, "pairs 3"]:
+def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: float) -> Int[Tensor, "pairs 3"]:
     """Pairs of clusters whose boxes meet on their way, and what is proved of them; what that relies on is noted."""
     size, device = parts.count, str(m.device)
     swept = room_for_swept(size, device)
@@ -133,17 +132,28 @@ def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor) -> Int[Tenso
     groups = parts.patches.count - parts.patches.wide
     all_low, all_high = (wp.empty(groups, dtype=wp.vec3f, device=device) for _ in range(2))
     launch(parts, join_boxes, groups, table, swept, all_low, all_high)
+    proofs = Proofs()
+    proofs.m, proofs.relied, proofs.half = wp.from_torch(m), wp.from_torch(relied), half
     tree, room = wp.Bvh(all_low, all_high), ROOM
     while True:
         slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
         count = torch.zeros(size, dtype=torch.int32, device=device)
-        given = [table, wp.from_torch(m), wp.from_torch(relied), motion.half, tree.id, swept, all_low, all_high]
-        given += [room, wp.from_torch(slots.view(-1, 3), dtype=wp.vec3i), wp.from_torch(count)]
-        launch(parts, find_clusters, groups, *given, least=LEAST_QUERIES)
+        inputs = [table, proofs, tree.id, swept, all_low, all_high, room]
+        inputs += [wp.from_torch(slots.view(-1, 3), dtype=wp.vec3i), wp.from_torch(count)]
+        launch(parts, find_clusters, groups, *inputs, least=LEAST_QUERIES)
         most = int(count.max()) if size else 0
         if most <= room:
             return slots[torch.arange(room, device=device) < count.unsqueeze(1)]
         room = most
+
+
+@wp.struct
+class Proofs:
+    """m of each patch, what is relied on of it, and the part of distances at rest within which cloth is asked for."""
+
+    m: wp.array(dtype=wp.float32)
+    relied: wp.array(dtype=wp.float32)
+    half: wp.float32
 
 
 @wp.func
@@ -156,98 +166,90 @@ def gap_in(patches: Patches, p: wp.int32, i: wp.int32, j: wp.int32):
 @wp.func
 def proved_by(
     patches: Patches,
-    m: wp.array(dtype=wp.float32),
-    relied: wp.array(dtype=wp.float32),
+    proofs: Proofs,
     reach: wp.float64,
-    half: wp.float32,
     p: wp.int32,
     i: wp.int32,
     j: wp.int32,
 ):
     """What a patch proves of two clusters, and how much of m that needs is noted."""
-    if m[p] <= LEAST + MARGIN:
+    if proofs.m[p] <= LEAST + MARGIN:
         return 0
     begin, end = patches.first_inside[p], patches.first_inside[p + 1]
     if not holds(patches.inside, begin, end, i):
         return 0
     if not holds(patches.inside, begin, end, j):
         return 0
-    needed = half / patches.flattest[p]
+    needed = proofs.half / patches.flattest[p]
     gap = wp.float32(gap_in(patches, p, i, j))
     if gap > wp.float32(0.0):
         needed = wp.min(needed, wp.float32(reach) / gap)
     needed = wp.max(needed, LEAST)
-    if m[p] > needed + MARGIN:
-        wp.atomic_max(relied, p, needed)
+    if proofs.m[p] > needed + MARGIN:
+        wp.atomic_max(proofs.relied, p, needed)
         return OUT
-    wp.atomic_max(relied, p, LEAST)
+    wp.atomic_max(proofs.relied, p, LEAST)
     return APART
 
 
 @wp.func
 def proved(
     patches: Patches,
-    m: wp.array(dtype=wp.float32),
-    relied: wp.array(dtype=wp.float32),
+    proofs: Proofs,
     reach: wp.float64,
-    half: wp.float32,
     i: wp.int32,
     j: wp.int32,
 ):
     """What the patches round two clusters prove of them."""
-    most = proved_by(patches, m, relied, reach, half, patches.wide[i], i, j)
+    most = proved_by(patches, proofs, reach, patches.wide[i], i, j)
     if most < OUT:
-        most = wp.max(most, proved_by(patches, m, relied, reach, half, patches.small[i], i, j))
+        most = wp.max(most, proved_by(patches, proofs, reach, patches.small[i], i, j))
     if most < OUT and patches.wide[j] != patches.wide[i]:
-        most = wp.max(most, proved_by(patches, m, relied, reach, half, patches.wide[j], i, j))
+        most = wp.max(most, proved_by(patches, proofs, reach, patches.wide[j], i, j))
     if most < OUT and patches.small[j] != patches.small[i]:
-        most = wp.max(most, proved_by(patches, m, relied, reach, half, patches.small[j], i, j))
+        most = wp.max(most, proved_by(patches, proofs, reach, patches.small[j], i, j))
     return most
 
 
 @wp.func
 def have_both(
     patches: Patches,
-    m: wp.array(dtype=wp.float32),
-    relied: wp.array(dtype=wp.float32),
-    half: wp.float32,
+    proofs: Proofs,
     p: wp.int32,
     a: wp.int32,
     b: wp.int32,
 ):
     """Whether a patch has two groups, and proves that nothing of the two is near; what that needs is noted."""
-    needed = wp.max(half / patches.flattest[p], LEAST)
-    if m[p] <= needed + MARGIN:
+    needed = wp.max(proofs.half / patches.flattest[p], LEAST)
+    if proofs.m[p] <= needed + MARGIN:
         return False
     begin, end = patches.first_whole[p], patches.first_whole[p + 1]
     if not holds(patches.whole, begin, end, a):
         return False
     if not holds(patches.whole, begin, end, b):
         return False
-    wp.atomic_max(relied, p, needed)
+    wp.atomic_max(proofs.relied, p, needed)
     return True
 
 
 @wp.func
 def lie_apart(
     patches: Patches,
-    m: wp.array(dtype=wp.float32),
-    relied: wp.array(dtype=wp.float32),
-    half: wp.float32,
+    proofs: Proofs,
     a: wp.int32,
     b: wp.int32,
 ):
     """Whether a patch round two groups proves that nothing of the two is near."""
     small, other = patches.wide_count + a, patches.wide_count + b
-    if have_both(patches, m, relied, half, patches.within[small], a, b):
+    if have_both(patches, proofs, patches.within[small], a, b):
         return True
-    if have_both(patches, m, relied, half, small, a, b):
+    if have_both(patches, proofs, small, a, b):
         return True
     if a == b:
         return False
-    if have_both(patches, m, relied, half, patches.within[other], a, b):
+    if have_both(patches, proofs, patches.within[other], a, b):
         return True
-    return have_both(patches, m, relied, half, other, a, b)
+    return have_both(patches, proofs, other, a, b)
 
 
 @wp.func
@@ -280,9 +282,7 @@ def join_boxes(
 def pairs_of(
     parts: Topology,
     patches: Patches,
-    m: wp.array(dtype=wp.float32),
-    relied: wp.array(dtype=wp.float32),
-    half: wp.float32,
+    proofs: Proofs,
     swept: Swept,
     room: wp.int32,
     out: wp.array(dtype=wp.vec3i),
@@ -294,9 +294,9 @@ def pairs_of(
     """Write the pairs of a cluster and others that it can come near, those that are own ones of a patch."""
     for k in range(begin, end):
         j = patches.own[k]
-        if not can_come_near(swept, i, j):
+        if not overlap(swept.low[i], swept.high[i], swept.low[j], swept.high[j]):
             continue
-        known = proved(patches, m, relied, swept.near[i] + swept.near[j], half, i, j)
+        known = proved(patches, proofs, swept.near[i] + swept.near[j], i, j)
         if known < OUT:
             if found[i] < room:
                 out[i * room + found[i]] = wp.vec3i(wp.min(i, j), wp.max(i, j), known)
@@ -308,9 +308,7 @@ def find_clusters(
     first: wp.int32,
     parts: Topology,
     patches: Patches,
-    m: wp.array(dtype=wp.float32),
-    relied: wp.array(dtype=wp.float32),
-    half: wp.float32,
+    proofs: Proofs,
     tree: wp.uint64,
     swept: Swept,
     all_low: wp.array(dtype=wp.vec3f),
@@ -331,13 +329,13 @@ def find_clusters(
         q = patches.wide_count + b
         if not feel(parts, patches.own[patches.first_own[p]], patches.own[patches.first_own[q]]):
             continue
-        if lie_apart(patches, m, relied, half, a, b):
+        if lie_apart(patches, proofs, a, b):
             continue
         for n in range(patches.first_own[p], patches.first_own[p + 1]):
             i = patches.own[n]
             if overlap(swept.low[i], swept.high[i], all_low[b], all_high[b]):
                 begin, end = wp.where(a == b, n, patches.first_own[q]), patches.first_own[q + 1]
-                pairs_of(parts, patches, m, relied, half, swept, room, out, found, i, begin, end)
+                pairs_of(parts, patches, proofs, swept, room, out, found, i, begin, end)
 
 
 @wp.kernel
@@ -351,14 +349,8 @@ def average(
 ):
     """How far the vertices of each of some clusters went on the mean, and how far from that at most."""
     i = active[first + wp.tid()]
-    total, most = wp.vec3d(), wp.float64(0.0)
-    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
-    for k in range(begin, end):
-        total += path[parts.corners[k]]
-    total /= wp.float64(end - begin)
-    for k in range(begin, end):
-        most = wp.max(most, wp.length(path[parts.corners[k]] - total))
-    mean[i] = total
+    path_of_it, most = mean_path(parts, path, i)
+    mean[i] = path_of_it
     spread[i] = most
 
 

@@ -55,7 +55,7 @@ class _Listed:
 
 
 class _Places:
-    """Positions in double precision, and which of them a broad phase serves for; tensors are known until written to."""
+    """Positions in double precision, as copies: known for the same tensor until that is written to."""
 
     def __init__(self) -> None:
         self._known: list[tuple[Tensor, int, Tensor]] = []
@@ -65,7 +65,7 @@ class _Places:
         for known, version, double in self._known:
             if known is x and version == x._version:
                 return double
-        self._known = [*self._known[-KNOWN + 1 :], (x, x._version, x.double())]
+        self._known = [*self._known[-KNOWN + 1 :], (x, x._version, x.to(torch.float64, copy=True))]
         return self._known[-1][2]
 
 
@@ -105,8 +105,8 @@ class Detector:
         assert self.reach is not None
         at = self._places.of(x)
         found, last, reach = self._broad(at, None), self._listed, self.reach
-        given = {"radius": self._radius, "play": reach.play, "slack": SPARE * self._may, "half": reach.half}
-        motion = motion_of(at, torch.zeros_like(at), **given)
+        limits = {"radius": self._radius, "play": reach.play, "slack": SPARE * self._may, "half": reach.half}
+        motion = motion_of(at, torch.zeros_like(at), **limits)
         if last is None or last.found is not found:
             pairs, owner = self._narrow(found, found.pairs, motion, at, room=NEAR)
             self._listed = _Listed(found, at, torch.zeros_like(found.allowed), pairs, owner)
@@ -171,8 +171,8 @@ class Detector:
         known = self._found is not None and ((to is None and last is self._served) or self._found.covers(at, to))
         if self._found is None or not known:
             radius = self._radius if self.reach is None else self._radius + SPARE * self._may
-            given = {"radius": radius, "slack": self._slack_for(at, to), "allowed": self._may, "half": self._half}
-            self._found = ClusterPairs.find(self.parts, at, to, **given)
+            limits = {"radius": radius, "slack": self._slack_for(at, to), "allowed": self._may, "half": self._half}
+            self._found = ClusterPairs.find(self.parts, at, to, **limits)
         self._served = last
         return self._found
 

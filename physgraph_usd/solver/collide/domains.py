@@ -438,7 +438,7 @@ def domains_of(level: Level, parts: Topology, count: int) -> tuple[Patches, int,
 def _fill(table: Patches, level: Level, parts: Topology, size: int) -> None:
     """Find the planes, the domains and what lies in them."""
     device, clusters = level.device, len(parts.first_face) - 1
-    given = {"device": device, "threads": level.threads, "least": LEAST_QUERIES}
+    launched = {"device": device, "threads": level.threads, "least": LEAST_QUERIES}
     faces = parts.faces.numpy().reshape(-1, 3)
     sheet = Sheet()
     sheet.beside = _array(_beside(faces), device, wp.vec3i)
@@ -451,23 +451,23 @@ def _fill(table: Patches, level: Level, parts: Topology, size: int) -> None:
     table.flattest = wp.zeros(size, dtype=wp.float32, device=device)
     table.centre = wp.zeros(clusters, dtype=wp.vec3d, device=device)
     table.size = wp.zeros(clusters, dtype=wp.float64, device=device)
-    Launch(enclose, clusters, [parts, table], **given)({})
+    Launch(enclose, clusters, [parts, table], **launched)({})
     table.plane_count, rims = (wp.zeros(size, dtype=wp.int32, device=device) for _ in range(2))
     rim = wp.empty(size * int(RIM), dtype=wp.vec4d, device=device)
     at_hem = wp.empty(size * int(RIM), dtype=wp.bool, device=device)
     width = wp.zeros(size, dtype=wp.float64, device=device)
-    Launch(place_planes, size, [parts, table], **given)({})
-    Launch(find_rims, size, [parts, sheet, table, rim, at_hem, rims, width], **given)({})
-    Launch(bound_domains, size, [table, rim, at_hem, rims, width], **given)({})
+    Launch(place_planes, size, [parts, table], **launched)({})
+    Launch(find_rims, size, [parts, sheet, table, rim, at_hem, rims, width], **launched)({})
+    Launch(bound_domains, size, [table, rim, at_hem, rims, width], **launched)({})
     counts = [wp.zeros(size, dtype=wp.int32, device=device) for _ in range(2)]
     table.first_face = table.first_inside = wp.zeros(size + 1, dtype=wp.int32, device=device)
-    Launch(fill_domains, size, [parts, sheet, table, width, *counts, False], **given)({})
+    Launch(fill_domains, size, [parts, sheet, table, width, *counts, False], **launched)({})
     begins = [np.concatenate([[0], np.cumsum(each.numpy())]) for each in counts]
     table.first_face, table.first_inside = (_array(each, device) for each in begins)
     table.faces = wp.zeros(int(begins[0][-1]), dtype=wp.vec3i, device=device)
     table.inverse = wp.zeros(int(begins[0][-1]), dtype=wp.vec4f, device=device)
     table.inside = wp.zeros(int(begins[1][-1]), dtype=wp.int32, device=device)
-    Launch(fill_domains, size, [parts, sheet, table, width, *counts, True], **given)({})
+    Launch(fill_domains, size, [parts, sheet, table, width, *counts, True], **launched)({})
 
 
 def _array(values: np.ndarray, device: str, dtype: type = wp.int32) -> wp.array:

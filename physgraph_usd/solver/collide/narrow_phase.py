@@ -294,10 +294,10 @@ def find(
         The pairs, and which pair of clusters each is of.
     """
     size, device = len(clusters), clusters.device
-    given = (parts, clusters, kernel, motion, boxes)
+    inputs = (parts, clusters, kernel, motion, boxes)
     begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
     slots, count = _room(room * size, device), torch.zeros_like(begin[:size])
-    _write(*given, begin=begin, count=count, out=slots)
+    _write(*inputs, begin=begin, count=count, out=slots)
     over = count > room
     kept = torch.nonzero((torch.arange(room, device=device) < count.unsqueeze(1)) & ~over.unsqueeze(1))
     first, owner = slots.where(kept[:, 0] * room + kept[:, 1]), kept[:, 0]
@@ -306,7 +306,7 @@ def find(
     begin[0] = 0  # Those without room are written again, now that they are counted.
     begin[1:] = (count * over).cumsum(dim=0)
     rest = _room(int(begin[-1]), device)
-    _write(*given, begin=begin, count=count, out=rest)
+    _write(*inputs, begin=begin, count=count, out=rest)
     more = torch.arange(size, device=device).repeat_interleave(count * over)
     return first.joined(rest), torch.cat([owner, more])
 

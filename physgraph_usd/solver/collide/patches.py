@@ -82,9 +82,10 @@ def fitted(
 
 @wp.func
 def has_changed(patches: Patches, p: wp.int32, change: wp.array(dtype=wp.float32)):
-    """Whether a gradient in a patch has changed by more than the margin."""
+    """Whether a gradient in a patch has changed by more than the margin; in its plane it changes by more than at rest,
+    by one over the cosine."""
     for n in range(patches.first_member[p], patches.first_member[p + 1]):
-        if change[patches.members[n]] > MARGIN:
+        if change[patches.members[n]] > MARGIN * patches.flattest[p]:
             return True
     return False
 
@@ -281,8 +282,8 @@ class MonotonePatches:
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
         """Run a kernel over patches or clusters; another thread is worth it from so many items."""
-        given = {"device": self.level.device, "threads": self.level.threads, "least": least}
-        Launch(kernel, size, list(inputs), **given)({})
+        launched = {"device": self.level.device, "threads": self.level.threads, "least": least}
+        Launch(kernel, size, list(inputs), **launched)({})
 
 
 def _array(x: Tensor) -> wp.array:

@@ -183,10 +183,6 @@ class ClothView:
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
-    def is_near(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether any parts are near one another at x [m]."""
-        return len(self._near_pairs(x).face) > 0
-
     def _near_pairs(self, x: Tensor) -> NearPairs:
         """Parts that are near one another at x [m]."""
         return near_pairs(self.parts, x, self.near, detector=self.detector)
@@ -219,20 +215,19 @@ class ClothView:
         return PairConstraints(near.corners[kept], near.weight[kept], normal, offset[kept].contiguous(), stiffness)
 
     def measure(
-        self, before: Float[Tensor, "vertices 3"] | None, x: Float[Tensor, "vertices 3"]
+        self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
     ) -> tuple[dict[str, dict[str, int]], Bool[Tensor, " vertices"]]:
         """What crosses before and after, as plain values, and the vertices of what does after.
 
         What safe moves reached from where nothing crossed is not looked for again: nothing crosses there.
 
         Args:
-            before: The upsampled cage [m]; None where nothing crosses there.
+            before: The upsampled cage [m]: it may cross where the cage does not.
             x: The result [m].
         """
         found = self.crossings(x)
-        first = Crossings.none(x.device) if before is None else crossings(self.parts, before)
         said = {
             name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
-            for name, each in (("before", first), ("after", found))
+            for name, each in (("before", crossings(self.parts, before)), ("after", found))
         }
         return said, self.mesh.crossed(found)

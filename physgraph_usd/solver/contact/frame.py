@@ -201,7 +201,7 @@ class FrameContact:
 
     @cached_property
     def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None]:
-        """The same, and whether the input crosses, where that was looked for."""
+        """That cage, and whether the input crosses, where that was looked for."""
         cage, out, crosses = self._levels[0], self._coarse, None
         if self._cloth is None:
             return out, crosses
@@ -288,7 +288,7 @@ class FrameContact:
         if self._bodies is not None:
             said |= self._bodies.measure(finest, base, x, view=view.bodies_around(x))
         if view.cloth is not None:
-            cloth, crossing = view.cloth.measure(view.closed(base) if self.crossed else None, x)
-            near = view.cloth.is_near(x) or any(each["crossings"] for each in cloth.values())
+            cloth, crossing = view.cloth.measure(view.closed(base), x)
+            near = view.cloth.term(x) is not None or any(each["crossings"] for each in cloth.values())
             said["cloth"] = {"near": near, **cloth}
         return said, crossing
