@@ -83,7 +83,7 @@ class Promise:
             if width:
                 way = moves * carried(at, rest, width=width * parts.spacing)
             else:
-                way = along(at, rest, met, free=moves & parts.level.free)
+                way = along(at, rest, met, free=moves & parts.level.free, threads=parts.level.threads)
             moved = safe_move(x, self.view.closed((at + way).to(aim)), parts, **given)
             x, met = moved.x, met.joined(moved.met)
             if is_over() or (not width and not bool(moved.short.any())):

@@ -127,5 +127,7 @@ def incidence(
     """
     flat = elements.reshape(-1)
     starts = torch.zeros(vertex_count + 1, dtype=torch.int32, device=elements.device)
-    starts[1:] = torch.bincount(flat, minlength=vertex_count).cumsum(dim=0)
+    count = torch.zeros_like(starts[1:])
+    count.scatter_add_(0, flat.long(), torch.ones_like(count[:1]).expand(len(flat)))  # bincount waits for the device.
+    starts[1:] = count.cumsum(dim=0)
     return starts, torch.argsort(flat, stable=True).to(torch.int32)
