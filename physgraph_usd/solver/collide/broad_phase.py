@@ -9,7 +9,8 @@ and plane more than the part of their distance at rest that is, they are not nea
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch, lanes_on
 from .boxes import FAR, Swept, mean_path, motion_of, overlap, room_for_swept, sweep_boxes
 from .domains import Patches, flat, holds
 from .parts import Parts
@@ -30,6 +31,8 @@ ROOM = 48
 """Pairs of a cluster that there is room for before they are counted."""
 LEAST = wp.constant(wp.float32(0.01))
 """What m is asked to be at least: single precision rounds it to some millionths."""
+KNOWN = 3
+"""Positions of which it is known that they are near the paths, and how far clusters went to them."""
 APART, OUT = wp.constant(1), wp.constant(2)
 """What patches prove of two clusters: that they do not touch on any path that is served, or that they are not near."""
 
@@ -59,6 +62,8 @@ class ClusterPairs:
     apart: Bool[Tensor, " pairs"]
     allowed: Float[Tensor, " pairs"]
     relied: Float[Tensor, " patches"]
+    _near: list[tuple[Tensor, wp.array]] = field(default_factory=list)
+    _went: list[tuple[Tensor, Tensor, tuple[wp.array, wp.array]]] = field(default_factory=list)
 
     @staticmethod
     def find(
@@ -94,27 +99,74 @@ class ClusterPairs:
         least = parts.least_of(allowed)[pairs.long()].sum(dim=1)
         return ClusterPairs(parts, start, path, slack, pairs, active, found[:, 2] == APART, least, relied)
 
-    def nearer(self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " pairs"]:
-        """How much nearer the clusters of each pair can have come between two positions [m], float64."""
-        size, device, out = self.parts.count, str(x.device), x.new_empty(len(self.pairs))
-        mean, spread = wp.empty(size, dtype=wp.vec3d, device=device), wp.empty(size, dtype=wp.float64, device=device)
-        path, pairs = wp.from_torch(x - before, dtype=wp.vec3d), wp.from_torch(self.pairs, dtype=wp.vec2i)
-        launch(self.parts, average, len(self.active), path, wp.from_torch(self.active), mean, spread)
-        launch(self.parts, approach, len(out), pairs, mean, spread, wp.from_torch(out))
+    def nearer(self, before: Float[Tensor, "vertices 3"], *places: Float[Tensor, "vertices 3"]) -> Tensor:
+        """How much nearer the clusters of each pair can have come to one of two places [m], or to one, float64.
+
+        Args:
+            before: Where the vertices were [m].
+            places: The places: what is known of them is kept, so they must not be written to.
+
+        Returns:
+            Shape (pairs,).
+        """
+        out = before.new_empty(len(self.pairs))
+        first, second = self._gone(before, places[0]), self._gone(before, places[-1])
+        pairs = wp.from_torch(self.pairs, dtype=wp.vec2i)
+        launch(self.parts, approach, len(out), pairs, *first, *second, wp.from_torch(out))
         return out
 
-    def covers(self, start: Float[Tensor, "vertices 3"], end: Float[Tensor, "vertices 3"] | None) -> bool:
-        """Whether it serves for a move between positions [m], or for positions: m of its patches must do there."""
-        if not self._is_near(start) or (end is not None and not self._is_near(end)):
-            return False
-        return self.parts.patches.still(self.relied, (self.start, self.start + self.path), start, end)
+    def _gone(self, before: Tensor, x: Tensor) -> tuple[wp.array, wp.array]:
+        """How far the vertices of each cluster in a pair went on the mean, and how far from that at most [m]."""
+        for start, end, known in self._went:
+            if start is before and end is x:
+                return known
+        size, device = self.parts.count, str(x.device)
+        mean, spread = wp.empty(size, dtype=wp.vec3d, device=device), wp.empty(size, dtype=wp.float64, device=device)
+        path = wp.from_torch(x - before, dtype=wp.vec3d)
+        launch(self.parts, average, len(self.active), path, wp.from_torch(self.active), mean, spread)
+        _keep(self._went, (before, x, (mean, spread)))
+        return mean, spread
 
-    def _is_near(self, x: Tensor) -> bool:
-        """Whether all vertices at x [m] are near their paths."""
-        moved = x - self.start
-        length = self.path.square().sum(dim=1)
-        part = ((moved * self.path).sum(dim=1) / length.clamp_min(1e-300)).clamp(0.0, 1.0)
-        return bool(((moved - part.unsqueeze(1) * self.path).square().sum(dim=1) <= self.slack.square()).all())
+    def covers(self, start: Float[Tensor, "vertices 3"], end: Float[Tensor, "vertices 3"] | None) -> bool:
+        """Whether it serves for a move between positions, or for positions: m of its patches must do there.
+
+        What is known of positions is kept, so they must not be written to.
+
+        Args:
+            start: Positions [m], float64.
+            end: Where the vertices go [m], float64; None where nothing moves.
+        """
+        lost = torch.zeros(1, dtype=torch.int32, device=start.device)
+        places = (start, start if end is None else end)
+        first = self._changes(start, lost)
+        changes = (first, first if end is None else self._changes(end, lost))
+        self.parts.patches.look(self.relied, start, end, changes=changes, lost=lost)
+        if int(lost):
+            return False
+        for known in zip(places, changes, strict=True):
+            _keep(self._near, known)
+        return True
+
+    def _changes(self, x: Tensor, lost: Tensor) -> wp.array:
+        """What has changed in each cluster at x [m]; ``lost`` becomes 1 where a vertex is not near its path."""
+        for known, change in self._near:
+            if known is x:
+                return change
+        paths = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (x, self.start, self.path))
+        launch(self.parts, find_strays, len(x), *paths, wp.from_torch(self.slack), wp.from_torch(lost))
+        return self.parts.patches.changes((self.start, self._end), x, lost)
+
+    @cached_property
+    def _end(self) -> Float[Tensor, "vertices 3"]:
+        """Where the paths end [m]."""
+        return self.start + self.path
+
+
+def _keep(known: list[Any], one: tuple[Any, ...]) -> None:
+    """Keep one more of what is known, and no more than so many."""
+    if not any(all(a is b for a, b in zip(each[:-1], one[:-1], strict=True)) for each in known):
+        known.append(one)
+        del known[:-KNOWN]
 
 
 def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
@@ -134,13 +186,13 @@ def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: flo
     launch(parts, join_boxes, groups, table, swept, all_low, all_high)
     proofs = Proofs()
     proofs.m, proofs.relied, proofs.half = wp.from_torch(m), wp.from_torch(relied), half
-    tree, room = wp.Bvh(all_low, all_high), ROOM
+    tree, room, lanes = wp.Bvh(all_low, all_high), ROOM, lanes_on(device)
     while True:
         slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
         count = torch.zeros(size, dtype=torch.int32, device=device)
-        inputs = [table, proofs, tree.id, swept, all_low, all_high, room]
+        inputs = [lanes, table, proofs, tree.id, swept, all_low, all_high, room]
         inputs += [wp.from_torch(slots.view(-1, 3), dtype=wp.vec3i), wp.from_torch(count)]
-        launch(parts, find_clusters, groups, *inputs, least=LEAST_QUERIES)
+        launch(parts, find_clusters, groups * lanes, *inputs, least=LEAST_QUERIES)
         most = int(count.max()) if size else 0
         if most <= room:
             return slots[torch.arange(room, device=device) < count.unsqueeze(1)]
@@ -258,6 +310,16 @@ def feel(parts: Topology, i: wp.int32, j: wp.int32):
     return parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] != 0
 
 
+@wp.func
+def box_of(patches: Patches, swept: Swept, begin: wp.int32, end: wp.int32, step: wp.int32):
+    """The box of some clusters of a group."""
+    lowest, highest = wp.vec3f(wp.float32(FAR)), wp.vec3f(wp.float32(-FAR))
+    for n in range(begin, end, step):
+        lowest = wp.min(lowest, swept.low[patches.own[n]])
+        highest = wp.max(highest, swept.high[patches.own[n]])
+    return lowest, highest
+
+
 @wp.kernel
 def join_boxes(
     first: wp.int32,
@@ -270,10 +332,7 @@ def join_boxes(
     """The box of each group's clusters."""
     a = first + wp.tid()
     p = patches.wide_count + a
-    lowest, highest = wp.vec3f(wp.float32(FAR)), wp.vec3f(wp.float32(-FAR))
-    for n in range(patches.first_own[p], patches.first_own[p + 1]):
-        lowest = wp.min(lowest, swept.low[patches.own[n]])
-        highest = wp.max(highest, swept.high[patches.own[n]])
+    lowest, highest = box_of(patches, swept, patches.first_own[p], patches.first_own[p + 1], 1)
     all_low[a] = lowest
     all_high[a] = highest
 
@@ -307,6 +366,7 @@ def pairs_of(
 def find_clusters(
     first: wp.int32,
     parts: Topology,
+    lanes: wp.int32,
     patches: Patches,
     proofs: Proofs,
     tree: wp.uint64,
@@ -318,11 +378,15 @@ def find_clusters(
     found: wp.array(dtype=wp.int32),
 ):
     """Clusters that those of each group can come near, in it and in groups after it; counted also where there is no
-    room."""
-    a = first + wp.tid()
+    room. Each lane takes a part of a group's clusters."""
+    a = (first + wp.tid()) // lanes
     b = wp.int32(0)
     p = patches.wide_count + a
-    query = wp.bvh_query_aabb(tree, all_low[a], all_high[a])
+    begin_own, end_own = patches.first_own[p] + (first + wp.tid()) % lanes, patches.first_own[p + 1]
+    if begin_own >= end_own:
+        return
+    lowest, highest = box_of(patches, swept, begin_own, end_own, lanes)
+    query = wp.bvh_query_aabb(tree, lowest, highest)
     while wp.bvh_query_next(query, b):
         if b < a:
             continue
@@ -331,11 +395,32 @@ def find_clusters(
             continue
         if lie_apart(patches, proofs, a, b):
             continue
-        for n in range(patches.first_own[p], patches.first_own[p + 1]):
+        for n in range(begin_own, end_own, lanes):
             i = patches.own[n]
             if overlap(swept.low[i], swept.high[i], all_low[b], all_high[b]):
                 begin, end = wp.where(a == b, n, patches.first_own[q]), patches.first_own[q + 1]
                 pairs_of(parts, patches, proofs, swept, room, out, found, i, begin, end)
+
+
+@wp.kernel
+def find_strays(
+    first: wp.int32,
+    parts: Topology,
+    x: wp.array(dtype=wp.vec3d),
+    start: wp.array(dtype=wp.vec3d),
+    path: wp.array(dtype=wp.vec3d),
+    slack: wp.array(dtype=wp.float64),
+    lost: wp.array(dtype=wp.int32),
+):
+    """Whether a vertex is farther from its path than it may be."""
+    v = first + wp.tid()
+    if lost[0] > 0:
+        return
+    moved, way = x[v] - start[v], path[v]
+    part = wp.dot(moved, way) / wp.max(wp.dot(way, way), wp.float64(1.0e-300))
+    off = moved - wp.clamp(part, wp.float64(0.0), wp.float64(1.0)) * way
+    if not wp.dot(off, off) <= slack[v] * slack[v]:
+        lost[0] = 1
 
 
 @wp.kernel
@@ -361,9 +446,12 @@ def approach(
     clusters: wp.array(dtype=wp.vec2i),
     mean: wp.array(dtype=wp.vec3d),
     spread: wp.array(dtype=wp.float64),
+    other_mean: wp.array(dtype=wp.vec3d),
+    other_spread: wp.array(dtype=wp.float64),
     out: wp.array(dtype=wp.float64),
 ):
-    """How much nearer the clusters of each pair can have come."""
+    """How much nearer the clusters of each pair can have come to one of two places."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
-    out[n] = wp.length(mean[i] - mean[j]) + spread[i] + spread[j]
+    here = wp.length(mean[i] - mean[j]) + spread[i] + spread[j]
+    out[n] = wp.max(here, wp.length(other_mean[i] - other_mean[j]) + other_spread[i] + other_spread[j])

@@ -9,6 +9,7 @@ more; within it a list of near pairs serves while vertices hardly move.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -52,6 +53,11 @@ class _Listed:
     drift: Tensor
     pairs: Pairs
     owner: Tensor
+
+    @cached_property
+    def doubtful(self) -> Pairs:
+        """Pairs of parts of clusters that are not proved to stay apart on the paths."""
+        return self.pairs.where(~self.found.apart[self.owner])
 
 
 class _Places:
@@ -143,7 +149,7 @@ class Detector:
             tangle: The tangle that each vertex is in, int32, -1 where in none: pairs of one alone are not asked; or
                 None.
         """
-        if not bool(asked.any()):
+        if _is_known_empty(asked):
             return Pairs.none(asked.device)
         at, to = self._places.of(start), self._places.of(end)
         path = to - at
@@ -152,18 +158,16 @@ class Detector:
         motion = motion_of(at, path, asked=asked, tangle=tangle)
         motion.share, motion.floor = share, floor
         if last is not None and last.found is found:
-            near = of_list(self.parts, last.pairs.where(asks[last.owner]), motion)
-            drift = last.drift + torch.maximum(found.nearer(last.x, at), found.nearer(last.x, to))
-            asks = asks & (drift > found.allowed)
-        clusters = found.pairs[asks]
-        return near.joined(self._narrow(found, clusters, motion, at, room=IMPACTS)[0]) if len(clusters) else near
+            near = of_list(self.parts, last.doubtful, motion)
+            asks &= last.drift + found.nearer(last.x, at, to) > found.allowed
+        return near.joined(self._narrow(found, found.pairs, motion, at, room=IMPACTS, asked=asks)[0])
 
     def still(self, kernel: wp.Kernel, x: Float[Tensor, "vertices 3"]) -> Pairs:
         """Pairs of parts that a kernel with the parameters of `find_pairs` finds at x [m]."""
         at = self._places.of(x)
         found = self._broad(at, None)
         motion = motion_of(at, torch.zeros_like(at))
-        return self._narrow(found, found.pairs[~found.apart], motion, at, room=IMPACTS, kernel=kernel)[0]
+        return self._narrow(found, found.pairs, motion, at, room=IMPACTS, kernel=kernel, asked=~found.apart)[0]
 
     def _broad(self, at: Tensor, to: Tensor | None) -> ClusterPairs:
         """Pairs of clusters that serve for a move from some positions to others, or for positions."""
@@ -189,11 +193,19 @@ class Detector:
         *,
         room: int,
         kernel: wp.Kernel = find_pairs,
+        asked: Bool[Tensor, " clusters"] | None = None,
     ) -> tuple[Pairs, Int[Tensor, " pairs"]]:
-        """The pairs of parts in some of a broad phase's pairs of clusters, and of which they are."""
+        """The pairs of parts in some of a broad phase's pairs of clusters, of those asked, and of which they are."""
+        if asked is not None and _is_known_empty(asked):
+            return Pairs.none(at.device), found.pairs[:0, 0].long()
         active = wp.from_torch(found.active)
         if self._boxes is None or self._boxes[0] is not found or self._boxes[1] is not at:
             self._boxes = found, at, room_for_boxes(self.parts) if self._boxes is None else self._boxes[2]
             launch(self.parts, bound_parts, len(found.active), motion, active, self._boxes[2])
         launch(self.parts, average_paths, len(found.active), motion, active, self._boxes[2])
-        return find(self.parts, clusters, kernel, motion, self._boxes[2], room=room)
+        return find(self.parts, clusters, kernel, motion, self._boxes[2], room=room, asked=asked)
+
+
+def _is_known_empty(asked: Tensor) -> bool:
+    """Whether nothing is asked, where that is known: on CUDA the answer would be waited for longer than it saves."""
+    return not asked.is_cuda and not bool(asked.any())

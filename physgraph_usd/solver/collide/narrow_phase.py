@@ -24,8 +24,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Found:
-    """Where each pair of clusters writes its pairs of parts, how many it has, and what `Pairs` holds."""
+    """Which pairs of clusters are asked, where each writes its pairs of parts, how many it has, and what `Pairs`
+    holds."""
 
+    asked: wp.array(dtype=wp.bool)
     begin: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
     corners: wp.array(dtype=wp.vec4i)
@@ -78,6 +80,8 @@ class Pairs:
 
     def where(self, kept: Bool[Tensor, " pairs"] | Int[Tensor, " kept"]) -> Pairs:
         """Some of these pairs."""
+        if kept.dtype == torch.bool:  # Once for all three.
+            kept = torch.nonzero(kept).squeeze(1)
         return Pairs(self.corners[kept], self.value[kept], self.face[kept])
 
 
@@ -252,7 +256,9 @@ def find_pairs(
     """The pairs of each two clusters' vertices with faces and of edges with edges, so far as there is room."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
-    if found.begin[n + 1] == found.begin[n] or (boxes.asked[i] == 0 and boxes.asked[j] == 0):
+    if not found.asked[n] or found.begin[n + 1] == found.begin[n]:
+        return
+    if boxes.asked[i] == 0 and boxes.asked[j] == 0:
         return
     if outside(boxes.low[i], boxes.high[i], boxes.low[j], boxes.high[j], reach_of(boxes, i, j)):
         return
@@ -277,8 +283,39 @@ def values_of(
     value[i] = value_of(face[i], c[0], c[1], c[2], c[3], parts, motion)
 
 
+@wp.kernel
+def pack(
+    first: wp.int32,
+    room: wp.int32,
+    found: Found,
+    ends: wp.array(dtype=wp.int32),
+    corners: wp.array(dtype=wp.vec4i),
+    value: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.bool),
+    owner: wp.array(dtype=wp.int64),
+):
+    """Write what pairs of clusters have found one after the other, of those that had room, and whose it is."""
+    n = first + wp.tid()
+    count = found.count[n]
+    if count > room:
+        return
+    for k in range(count):
+        place = ends[n] - count + k
+        corners[place] = found.corners[found.begin[n] + k]
+        value[place] = found.value[found.begin[n] + k]
+        face[place] = found.face[found.begin[n] + k]
+        owner[place] = wp.int64(n)
+
+
 def find(
-    parts: Parts, clusters: Int[Tensor, "clusters 2"], kernel: wp.Kernel, motion: Any, boxes: Any, *, room: int
+    parts: Parts,
+    clusters: Int[Tensor, "clusters 2"],
+    kernel: wp.Kernel,
+    motion: Any,
+    boxes: Any,
+    *,
+    room: int,
+    asked: Bool[Tensor, " clusters"] | None = None,
 ) -> tuple[Pairs, Int[Tensor, " pairs"]]:
     """The pairs of parts that a kernel with the parameters of `find_pairs` finds in pairs of clusters.
 
@@ -289,19 +326,24 @@ def find(
         motion: What moves.
         boxes: Boxes of the clusters that occur.
         room: Pairs of parts of two clusters that there is room for before they are counted.
+        asked: Which pairs of clusters are asked; all where None.
 
     Returns:
         The pairs, and which pair of clusters each is of.
     """
     size, device = len(clusters), clusters.device
-    inputs = (parts, clusters, kernel, motion, boxes)
+    if not size:
+        return _room(0, device), torch.zeros(0, dtype=torch.int64, device=device)
+    asked = torch.ones(size, dtype=torch.bool, device=device) if asked is None else asked
+    inputs = (parts, clusters, kernel, motion, boxes, asked)
     begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
-    slots, count = _room(room * size, device), torch.zeros_like(begin[:size])
-    _write(*inputs, begin=begin, count=count, out=slots)
+    count = torch.zeros_like(begin[:size])
+    found = _write(*inputs, begin=begin, count=count, out=_room(room * size, device))
     over = count > room
-    kept = torch.nonzero((torch.arange(room, device=device) < count.unsqueeze(1)) & ~over.unsqueeze(1))
-    first, owner = slots.where(kept[:, 0] * room + kept[:, 1]), kept[:, 0]
-    if not bool(over.any()):
+    ends = torch.where(over, 0, count).cumsum(dim=0, dtype=torch.int32)
+    total, most = torch.stack([ends[-1], count.amax()]).tolist()
+    first, owner = _packed(parts, found, ends, size=size, room=room, total=total)
+    if most <= room:
         return first, owner
     begin[0] = 0  # Those without room are written again, now that they are counted.
     begin[1:] = (count * over).cumsum(dim=0)
@@ -311,28 +353,44 @@ def find(
     return first.joined(rest), torch.cat([owner, more])
 
 
+def _packed(
+    parts: Parts, found: Any, ends: Int[Tensor, " clusters"], *, size: int, room: int, total: int
+) -> tuple[Pairs, Int[Tensor, " pairs"]]:
+    """What was found and had room, one after the other up to the ends that are given, and whose it is."""
+    out, owner = _room(total, ends.device), torch.empty(total, dtype=torch.int64, device=ends.device)
+    if total:
+        arrays = (wp.from_torch(out.corners, dtype=wp.vec4i), *(wp.from_torch(each) for each in (out.value, out.face)))
+        inputs = [room, found, wp.from_torch(ends), *arrays, wp.from_torch(owner)]
+        Launch(pack, size, inputs, device=str(ends.device), threads=parts.level.threads)({})
+    return out, owner
+
+
 def _write(
     parts: Parts,
     clusters: Tensor,
     kernel: wp.Kernel,
     motion: Any,
     boxes: Any,
+    asked: Tensor,
     *,
     begin: Tensor,
     count: Tensor,
     out: Pairs,
-) -> None:
-    """Count the pairs of each two clusters, and write those that there is room for."""
+) -> Any:
+    """Count the pairs of each two clusters, and write those that there is room for; where that is."""
     found = Found()
-    found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
+    found.asked, found.begin, found.count = (wp.from_torch(each) for each in (asked, begin, count))
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
     found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
     pairs = wp.from_torch(clusters, dtype=wp.vec2i)
     launch(parts, kernel, len(clusters), pairs, motion, boxes, found, least=LEAST_QUERIES)
+    return found
 
 
 def of_list(parts: Parts, pairs: Pairs, motion: Any) -> Pairs:
     """Those of some pairs that would come too near on the paths of a motion."""
+    if not len(pairs.value):
+        return pairs
     value = torch.ones_like(pairs.value)
     inputs = [parts.topology, motion, wp.from_torch(pairs.corners, dtype=wp.vec4i)]
     inputs += [wp.from_torch(pairs.face), wp.from_torch(value)]

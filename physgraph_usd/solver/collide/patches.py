@@ -24,11 +24,11 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch, lanes_on
 from .domains import Patches, area_of, domains_of, single
 from .topology import Topology
 
@@ -81,11 +81,13 @@ def fitted(
 
 
 @wp.func
-def has_changed(patches: Patches, p: wp.int32, change: wp.array(dtype=wp.float32)):
-    """Whether a gradient in a patch has changed by more than the margin; in its plane it changes by more than at rest,
-    by one over the cosine."""
+def has_changed(patches: Patches, p: wp.int32, change: wp.array(dtype=wp.float32), other: wp.array(dtype=wp.float32)):
+    """Whether a gradient in a patch has changed by more than the margin at one of two positions; in its plane it
+    changes by more than at rest, by one over the cosine."""
+    most = MARGIN * patches.flattest[p]
     for n in range(patches.first_member[p], patches.first_member[p + 1]):
-        if change[patches.members[n]] > MARGIN * patches.flattest[p]:
+        c = patches.members[n]
+        if change[c] > most or other[c] > most:
             return True
     return False
 
@@ -98,11 +100,14 @@ def least_of(
     path: wp.array(dtype=wp.vec3d),
     moves: wp.bool,
     wanted: wp.float32,
+    lane: wp.int32,
+    lanes: wp.int32,
 ):
-    """m of a patch over a move, by Q fitted half way; `NOTHING` where it is less than what is wanted."""
+    """m of a patch over a move in one lane's part of its faces, by Q fitted half way; `NOTHING` where it is less than
+    what is wanted."""
     q1, q2 = fitted(patches, p, start, path, wp.where(moves, wp.float64(0.5), wp.float64(0.0)))
     least = wp.float32(1.0)
-    for k in range(patches.first_face[p], patches.first_face[p + 1]):
+    for k in range(patches.first_face[p] + lane, patches.first_face[p + 1], lanes):
         inverse = patches.inverse[k]
         for at in range(wp.where(moves, 2, 1)):
             u, v = sides_of(patches.faces[k], start, path, wp.float64(at))
@@ -119,6 +124,7 @@ def least_of(
 @wp.kernel
 def measure_patches(
     first: wp.int32,
+    lanes: wp.int32,
     begin_at: wp.int32,
     patches: Patches,
     start: wp.array(dtype=wp.vec3d),
@@ -126,37 +132,43 @@ def measure_patches(
     moves: wp.bool,
     least: wp.float32,
     enough: wp.float32,
+    known: wp.array(dtype=wp.float32),
     found: wp.array(dtype=wp.float32),
 ):
-    """m of some patches over a move along straight paths; of small ones only where that of the wide one round them is
-    not enough in every case."""
-    p = begin_at + first + wp.tid()
+    """m of some patches over a move along straight paths, by lanes; of small ones only where that of the wide one round
+    them, which is known, is not enough in every case."""
+    place = (first + wp.tid()) + begin_at * lanes
+    p, lane = place // lanes, place % lanes
     if patches.first_face[p] == patches.first_face[p + 1]:
         return
     around = patches.within[p]
     if around >= 0:
-        if found[around] * patches.flattest[around] > enough:
+        if known[around] * patches.flattest[around] > enough:
             return
-    found[p] = least_of(patches, p, start, path, moves, least)
+    found[place] = least_of(patches, p, start, path, moves, least, lane, lanes)
 
 
 @wp.kernel
 def find_lost(
     first: wp.int32,
+    lanes: wp.int32,
     patches: Patches,
     start: wp.array(dtype=wp.vec3d),
     path: wp.array(dtype=wp.vec3d),
     moves: wp.bool,
     relied: wp.array(dtype=wp.float32),
     change: wp.array(dtype=wp.float32),
+    other: wp.array(dtype=wp.float32),
     lost: wp.array(dtype=wp.int32),
 ):
-    """Whether m of any patch is less than is relied on over a move; known where its gradients have changed little."""
-    p = first + wp.tid()
+    """Whether m of any patch is less than is relied on over a move; known where its gradients have changed little at
+    both ends."""
+    place = first + wp.tid()
+    p, lane = place // lanes, place % lanes
     if lost[0] > 0 or relied[p] == NOTHING:
         return
-    if has_changed(patches, p, change):
-        if least_of(patches, p, start, path, moves, relied[p]) == NOTHING:
+    if has_changed(patches, p, change, other):
+        if least_of(patches, p, start, path, moves, relied[p], lane, lanes) == NOTHING:
             lost[0] = 1
 
 
@@ -168,11 +180,15 @@ def find_changes(
     start: wp.array(dtype=wp.vec3d),
     end: wp.array(dtype=wp.vec3d),
     x: wp.array(dtype=wp.vec3d),
+    lost: wp.array(dtype=wp.int32),
     change: wp.array(dtype=wp.float32),
 ):
-    """The greatest change of a gradient in each cluster from one of two positions to a third, if it is greater."""
+    """The greatest change of a gradient in each cluster from the nearer of two positions to a third, where it counts
+    still."""
     i = first + wp.tid()
-    most = wp.float32(0.0) + change[i]
+    if lost[0] > 0:
+        return
+    most = wp.float32(0.0)
     for k in range(parts.first_face[i], parts.first_face[i + 1]):
         t, r = parts.faces[k], rest[k]
         most = wp.max(most, wp.min(change_of(t, r, start, x), change_of(t, r, end, x)))
@@ -247,38 +263,57 @@ class MonotonePatches:
             least: What m must be more than.
             enough: Of which distance at rest, at most, all that is nearer is to be left out: a part.
         """
-        out = torch.full((self.count,), float(NOTHING), dtype=torch.float32, device=start.device)
-        x, moves = _array(start), end is not None
+        lanes = lanes_on(self.level.device)
+        by_lane = torch.full((self.count, lanes), float(NOTHING), dtype=torch.float32, device=start.device)
+        out, x, moves = by_lane[:, 0].clone(), _array(start), end is not None
         path = x if end is None else _array(end - start)
         for begin, size in ((0, self.wide), (self.wide, self.count - self.wide)):
             inputs = (begin, self.table, x, path, moves, least, enough, wp.from_torch(out))
-            self._launch(measure_patches, size, *inputs, least=LEAST_QUERIES)
+            self._launch(
+                measure_patches, size * lanes, lanes, *inputs, wp.from_torch(by_lane.view(-1)), least=LEAST_QUERIES
+            )
+            out = by_lane.amin(dim=1)
         return out
 
-    def still(
+    def changes(
+        self,
+        between: tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"]],
+        x: Float[Tensor, "vertices 3"],
+        lost: Int[Tensor, " 1"],
+    ) -> wp.array:
+        """The greatest change of a gradient in each cluster, from the nearer of two positions [m] to x [m], float64.
+
+        Args:
+            between: The two.
+            x: The third.
+            lost: Above 0 where it does not count any more.
+        """
+        change = wp.empty(self.clusters, dtype=wp.float32, device=self.level.device)
+        arrays = (*(_array(each) for each in (*between, x)), wp.from_torch(lost), change)
+        self._launch(find_changes, self.clusters, self.parts, self.rest, *arrays)
+        return change
+
+    def look(
         self,
         relied: Float[Tensor, " patches"],
-        between: tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"]],
         start: Float[Tensor, "vertices 3"],
         end: Float[Tensor, "vertices 3"] | None,
-    ) -> bool:
-        """Whether m of each patch is not less on other paths [m], float64, than is relied on.
+        *,
+        changes: tuple[wp.array, wp.array],
+        lost: Int[Tensor, " 1"],
+    ) -> None:
+        """See whether m of each patch is not less on other paths [m], float64, than is relied on.
 
         Args:
             relied: What is relied on; m was greater by `MARGIN` between two positions.
-            between: These.
             start: Positions.
             end: Where the vertices go; None where nothing moves.
+            changes: What has changed in each cluster at both.
+            lost: Becomes 1 where it is less; nothing is looked at where it is that already.
         """
-        change = wp.zeros(self.clusters, dtype=wp.float32, device=self.level.device)
-        first, last = (_array(each) for each in between)
-        for x in (start,) if end is None else (start, end):
-            self._launch(find_changes, self.clusters, self.parts, self.rest, first, last, _array(x), change)
-        lost = wp.zeros(1, dtype=wp.int32, device=self.level.device)
-        x = _array(start)
+        x, lanes = _array(start), lanes_on(self.level.device)
         inputs = (self.table, x, x if end is None else _array(end - start), end is not None, wp.from_torch(relied))
-        self._launch(find_lost, self.count, *inputs, change, lost, least=LEAST_QUERIES)
-        return int(lost.numpy()[0]) == 0
+        self._launch(find_lost, self.count * lanes, lanes, *inputs, *changes, wp.from_torch(lost), least=LEAST_QUERIES)
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
         """Run a kernel over patches or clusters; another thread is worth it from so many items."""

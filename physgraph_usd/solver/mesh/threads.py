@@ -29,6 +29,9 @@ SLICES, LEAST_SLICE = 8, 32
 """Slices a thread there, and what they have at least on average: some items cost a hundred times as much as others, so
 whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
 
+LANES = 16
+"""Threads that share an item of many elements on CUDA, where few items leave most of the device idle."""
+
 
 @functools.cache
 def start_warp() -> None:
@@ -36,6 +39,11 @@ def start_warp() -> None:
     wp.config.log_level = wp.LOG_WARNING
     with nullcontext() if torch.cuda.is_available() else _stderr_to_nowhere():
         wp.init()
+
+
+def lanes_on(device: str) -> int:
+    """How many threads share an item of many elements."""
+    return 1 if device == "cpu" else LANES
 
 
 def compile_kernels(device: str) -> None:
