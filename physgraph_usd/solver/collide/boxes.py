@@ -4,6 +4,7 @@
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
@@ -195,6 +196,28 @@ def room_for_boxes(parts: Parts) -> Any:
     return boxes
 
 
+class _Nothing:
+    """What a motion holds of vertices where nothing is said of them; kernels only read it.
+
+    Attributes:
+        all: True for each vertex.
+        tangle: -1 for each.
+        zero: 0 for each.
+    """
+
+    def __init__(self, count: int, device: torch.device) -> None:
+        """Fill the arrays."""
+        self.all = wp.from_torch(torch.ones(count, dtype=torch.bool, device=device))
+        self.tangle = wp.from_torch(torch.full((count,), -1, dtype=torch.int32, device=device))
+        self.zero = wp.from_torch(torch.zeros(count, dtype=torch.float64, device=device))
+
+    @staticmethod
+    @functools.lru_cache(maxsize=4)
+    def of(count: int, device: torch.device) -> _Nothing:
+        """The same arrays for the same number of vertices."""
+        return _Nothing(count, device)
+
+
 def motion_of(
     start: Tensor,
     path: Tensor,
@@ -218,14 +241,12 @@ def motion_of(
         slack: How far each vertex may be elsewhere [m], or None.
         half: As for `Reach`.
     """
-    motion, nothing = Motion(), torch.zeros_like(start[:, 0])
+    motion, nothing = Motion(), _Nothing.of(len(start), start.device)
     motion.start, motion.path = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (start, path))
-    asked = torch.ones(len(start), dtype=torch.bool, device=start.device) if asked is None else asked
-    motion.asked = wp.from_torch(asked.contiguous())
-    tangle = torch.full_like(asked, -1, dtype=torch.int32) if tangle is None else tangle
-    motion.tangle = wp.from_torch(tangle.contiguous())
+    motion.asked = nothing.all if asked is None else wp.from_torch(asked.contiguous())
+    motion.tangle = nothing.tangle if tangle is None else wp.from_torch(tangle.contiguous())
     motion.is_still, motion.half = radius is not None, half
     motion.radius, motion.play, motion.slack = (
-        wp.from_torch((nothing if each is None else each).contiguous()) for each in (radius, play, slack)
+        nothing.zero if each is None else wp.from_torch(each.contiguous()) for each in (radius, play, slack)
     )
     return motion

@@ -86,5 +86,5 @@ def near_pairs(
     radius = near.radius[corners]
     of_face = radius[:, 0] + radius[:, 1:].amax(dim=1)
     of_edges = radius[:, :2].amax(dim=1) + radius[:, 2:].amax(dim=1)
-    kept = way.norm(dim=1) < torch.where(pairs.face, of_face, of_edges)
+    kept = torch.nonzero(way.norm(dim=1) < torch.where(pairs.face, of_face, of_edges)).squeeze(1)
     return NearPairs(pairs.corners[kept], weight[kept].to(x), way[kept].to(x), pairs.face[kept])

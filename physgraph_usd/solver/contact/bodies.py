@@ -85,7 +85,7 @@ class LevelBodies:
         reach = track.offset + float(self.level.spacing.mean())
         asked = torch.where(still, torch.full_like(reach, -torch.inf), reach)
         track, vertex, normal, signed = track.refresh(x, asked)
-        near = signed < reach[vertex]
+        near = torch.nonzero(signed < reach[vertex]).squeeze(1)
         vertex, normal, signed = vertex[near], normal[near], signed[near]
         sight = known.renewed(
             x,

@@ -208,7 +208,9 @@ class ClothView:
             tangles = self.tangles(x)
             kept &= ~self.mesh.crossed(found)[corners].any(dim=1)
             kept &= tangles is None or order or ~tangles.given_up[corners].all(dim=1)
-        corners, area = corners[kept], self._level.vertex_area[corners[kept]]
+        kept = torch.nonzero(kept).squeeze(1)  # Once for all that follows.
+        corners = corners[kept]
+        area = self._level.vertex_area[corners]
         share = torch.where(near.face[kept], area[:, 0], area.amin(dim=1) / 3.0)
         normal = torch.nn.functional.normalize(way[kept], dim=1, eps=1e-30).contiguous()
         stiffness = self._settings.cloth_stiffness * share

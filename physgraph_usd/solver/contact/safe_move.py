@@ -124,10 +124,11 @@ def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertice
     late = length * (1.0 - share)
     first, second = parts.links.T
     within = STRAINS * parts.lengths
+    least = LEAST * within.mean()
     while True:
         new = late.scatter_reduce(0, second, late[first] - within, "amax")
         new = new.scatter_reduce(0, first, new[second] - within, "amax")
-        if is_over() or not bool((new > late + LEAST * within.mean()).any()):
+        if is_over() or not bool((new > late + least).any()):
             break
         late = new
     return torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))

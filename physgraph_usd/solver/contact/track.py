@@ -90,6 +90,7 @@ class Track:
         normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
         if self.passing is not None:
             kept &= ~self.passing[which]
+        kept = torch.nonzero(kept).squeeze(1)
         return replace(self, at=at, known=known), which[kept], normal[kept], (distance * sign)[kept]
 
     def between(self, x: Tensor) -> tuple[Tensor, Tensor]:
