@@ -18,7 +18,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch, lanes_on
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, lanes_on, run
 from .boxes import FAR, Swept, mean_path, motion_of, overlap, room_for_swept, sweep_boxes
 from .domains import Patches, flat, holds
 from .parts import Parts
@@ -111,8 +111,8 @@ class ClusterPairs:
         """
         out = before.new_empty(len(self.pairs))
         first, second = self._gone(before, places[0]), self._gone(before, places[-1])
-        pairs = wp.from_torch(self.pairs, dtype=wp.vec2i)
-        launch(self.parts, approach, len(out), pairs, *first, *second, wp.from_torch(out))
+        pairs = argument(self.pairs, wp.vec2i)
+        launch(self.parts, approach, len(out), pairs, *first, *second, argument(out))
         return out
 
     def _gone(self, before: Tensor, x: Tensor) -> tuple[wp.array, wp.array]:
@@ -122,8 +122,8 @@ class ClusterPairs:
                 return known
         size, device = self.parts.count, str(x.device)
         mean, spread = wp.empty(size, dtype=wp.vec3d, device=device), wp.empty(size, dtype=wp.float64, device=device)
-        path = wp.from_torch(x - before, dtype=wp.vec3d)
-        launch(self.parts, average, len(self.active), path, wp.from_torch(self.active), mean, spread)
+        path = argument(x - before, wp.vec3d)
+        launch(self.parts, average, len(self.active), path, argument(self.active), mean, spread)
         _keep(self._went, (before, x, (mean, spread)))
         return mean, spread
 
@@ -152,8 +152,8 @@ class ClusterPairs:
         for known, change in self._near:
             if known is x:
                 return change
-        paths = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (x, self.start, self.path))
-        launch(self.parts, find_strays, len(x), *paths, wp.from_torch(self.slack), wp.from_torch(lost))
+        paths = (argument(each.contiguous(), wp.vec3d) for each in (x, self.start, self.path))
+        launch(self.parts, find_strays, len(x), *paths, argument(self.slack), argument(lost))
         return self.parts.patches.changes((self.start, self._end), x, lost)
 
     @cached_property
@@ -172,7 +172,7 @@ def _keep(known: list[Any], one: tuple[Any, ...]) -> None:
 def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
     """Run a kernel over clusters or pairs of clusters; another thread is worth it from so many items."""
     launched = {"device": parts.level.device, "threads": parts.level.threads, "least": least}
-    Launch(kernel, size, [parts.topology, *inputs], **launched)({})
+    run(kernel, size, [parts.topology, *inputs], **launched)
 
 
 def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: float) -> Int[Tensor, "pairs 3"]:
@@ -191,7 +191,7 @@ def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: flo
         slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
         count = torch.zeros(size, dtype=torch.int32, device=device)
         inputs = [lanes, table, proofs, tree.id, swept, all_low, all_high, room]
-        inputs += [wp.from_torch(slots.view(-1, 3), dtype=wp.vec3i), wp.from_torch(count)]
+        inputs += [argument(slots.view(-1, 3), wp.vec3i), argument(count)]
         launch(parts, find_clusters, groups * lanes, *inputs, least=LEAST_QUERIES)
         most = int(count.max()) if size else 0
         if most <= room:

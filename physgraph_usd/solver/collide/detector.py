@@ -17,6 +17,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..mesh.threads import argument
 from .boxes import average_paths, bound_parts, motion_of, room_for_boxes
 from .broad_phase import ClusterPairs, launch
 from .narrow_phase import Pairs, Reach, find, find_pairs, of_list
@@ -198,7 +199,7 @@ class Detector:
         """The pairs of parts in some of a broad phase's pairs of clusters, of those asked, and of which they are."""
         if asked is not None and _is_known_empty(asked):
             return Pairs.none(at.device), found.pairs[:0, 0].long()
-        active = wp.from_torch(found.active)
+        active = argument(found.active)
         if self._boxes is None or self._boxes[0] is not found or self._boxes[1] is not at:
             self._boxes = found, at, room_for_boxes(self.parts) if self._boxes is None else self._boxes[2]
             launch(self.parts, bound_parts, len(found.active), motion, active, self._boxes[2])

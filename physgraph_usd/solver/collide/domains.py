@@ -15,7 +15,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..level import Level
-from ..mesh.threads import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, run
 from .clusters import gathered
 from .topology import Topology
 
@@ -451,23 +451,23 @@ def _fill(table: Patches, level: Level, parts: Topology, size: int) -> None:
     table.flattest = wp.zeros(size, dtype=wp.float32, device=device)
     table.centre = wp.zeros(clusters, dtype=wp.vec3d, device=device)
     table.size = wp.zeros(clusters, dtype=wp.float64, device=device)
-    Launch(enclose, clusters, [parts, table], **launched)({})
+    run(enclose, clusters, [parts, table], **launched)
     table.plane_count, rims = (wp.zeros(size, dtype=wp.int32, device=device) for _ in range(2))
     rim = wp.empty(size * int(RIM), dtype=wp.vec4d, device=device)
     at_hem = wp.empty(size * int(RIM), dtype=wp.bool, device=device)
     width = wp.zeros(size, dtype=wp.float64, device=device)
-    Launch(place_planes, size, [parts, table], **launched)({})
-    Launch(find_rims, size, [parts, sheet, table, rim, at_hem, rims, width], **launched)({})
-    Launch(bound_domains, size, [table, rim, at_hem, rims, width], **launched)({})
+    run(place_planes, size, [parts, table], **launched)
+    run(find_rims, size, [parts, sheet, table, rim, at_hem, rims, width], **launched)
+    run(bound_domains, size, [table, rim, at_hem, rims, width], **launched)
     counts = [wp.zeros(size, dtype=wp.int32, device=device) for _ in range(2)]
     table.first_face = table.first_inside = wp.zeros(size + 1, dtype=wp.int32, device=device)
-    Launch(fill_domains, size, [parts, sheet, table, width, *counts, False], **launched)({})
+    run(fill_domains, size, [parts, sheet, table, width, *counts, False], **launched)
     begins = [np.concatenate([[0], np.cumsum(each.numpy())]) for each in counts]
     table.first_face, table.first_inside = (_array(each, device) for each in begins)
     table.faces = wp.zeros(int(begins[0][-1]), dtype=wp.vec3i, device=device)
     table.inverse = wp.zeros(int(begins[0][-1]), dtype=wp.vec4f, device=device)
     table.inside = wp.zeros(int(begins[1][-1]), dtype=wp.int32, device=device)
-    Launch(fill_domains, size, [parts, sheet, table, width, *counts, True], **launched)({})
+    run(fill_domains, size, [parts, sheet, table, width, *counts, True], **launched)
 
 
 def _array(values: np.ndarray, device: str, dtype: type = wp.int32) -> wp.array:

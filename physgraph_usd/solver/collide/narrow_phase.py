@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.threads import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, argument, run
 from .boxes import Boxes, Motion, highest_of, lowest_of, outside, overlap, reach_of
 from .broad_phase import launch
 from .impact import can_meet, distance_of, impact_of, motion_of
@@ -359,9 +359,9 @@ def _packed(
     """What was found and had room, one after the other up to the ends that are given, and whose it is."""
     out, owner = _room(total, ends.device), torch.empty(total, dtype=torch.int64, device=ends.device)
     if total:
-        arrays = (wp.from_torch(out.corners, dtype=wp.vec4i), *(wp.from_torch(each) for each in (out.value, out.face)))
-        inputs = [room, found, wp.from_torch(ends), *arrays, wp.from_torch(owner)]
-        Launch(pack, size, inputs, device=str(ends.device), threads=parts.level.threads)({})
+        arrays = (argument(out.corners, wp.vec4i), *(argument(each) for each in (out.value, out.face)))
+        inputs = [room, found, argument(ends), *arrays, argument(owner)]
+        run(pack, size, inputs, device=str(ends.device), threads=parts.level.threads)
     return out, owner
 
 
@@ -382,7 +382,7 @@ def _write(
     found.asked, found.begin, found.count = (wp.from_torch(each) for each in (asked, begin, count))
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
     found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
-    pairs = wp.from_torch(clusters, dtype=wp.vec2i)
+    pairs = argument(clusters, wp.vec2i)
     launch(parts, kernel, len(clusters), pairs, motion, boxes, found, least=LEAST_QUERIES)
     return found
 
@@ -392,9 +392,9 @@ def of_list(parts: Parts, pairs: Pairs, motion: Any) -> Pairs:
     if not len(pairs.value):
         return pairs
     value = torch.ones_like(pairs.value)
-    inputs = [parts.topology, motion, wp.from_torch(pairs.corners, dtype=wp.vec4i)]
-    inputs += [wp.from_torch(pairs.face), wp.from_torch(value)]
-    Launch(values_of, len(value), inputs, device=str(value.device), threads=parts.level.threads)({})
+    inputs = [parts.topology, motion, argument(pairs.corners, wp.vec4i)]
+    inputs += [argument(pairs.face), argument(value)]
+    run(values_of, len(value), inputs, device=str(value.device), threads=parts.level.threads)
     met = torch.nonzero(value < 1.0).squeeze(1)
     return Pairs(pairs.corners[met], value[met], pairs.face[met])
 

@@ -11,7 +11,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.threads import Launch
+from ..mesh.threads import argument, run
 from .detector import Detector
 from .distance import weights_of
 from .narrow_phase import Reach
@@ -62,9 +62,9 @@ def weights(
         threads: Most threads on the CPU.
     """
     out = torch.zeros((len(face), 4), dtype=torch.float64, device=x.device)
-    inputs = [wp.from_torch(x.contiguous(), dtype=wp.vec3d), wp.from_torch(corners, dtype=wp.vec4i)]
-    inputs += [wp.from_torch(face), wp.from_torch(out, dtype=wp.vec4d)]
-    Launch(_closest, len(out), inputs, device=str(x.device), threads=threads)({})
+    inputs = [argument(x.contiguous(), wp.vec3d), argument(corners, wp.vec4i)]
+    inputs += [argument(face), argument(out, wp.vec4d)]
+    run(_closest, len(out), inputs, device=str(x.device), threads=threads)
     return out
 
 

@@ -28,7 +28,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch, lanes_on
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, lanes_on, run
 from .domains import Patches, area_of, domains_of, single
 from .topology import Topology
 
@@ -268,10 +268,8 @@ class MonotonePatches:
         out, x, moves = by_lane[:, 0].clone(), _array(start), end is not None
         path = x if end is None else _array(end - start)
         for begin, size in ((0, self.wide), (self.wide, self.count - self.wide)):
-            inputs = (begin, self.table, x, path, moves, least, enough, wp.from_torch(out))
-            self._launch(
-                measure_patches, size * lanes, lanes, *inputs, wp.from_torch(by_lane.view(-1)), least=LEAST_QUERIES
-            )
+            inputs = (begin, self.table, x, path, moves, least, enough, argument(out))
+            self._launch(measure_patches, size * lanes, lanes, *inputs, argument(by_lane.view(-1)), least=LEAST_QUERIES)
             out = by_lane.amin(dim=1)
         return out
 
@@ -289,7 +287,7 @@ class MonotonePatches:
             lost: Above 0 where it does not count any more.
         """
         change = wp.empty(self.clusters, dtype=wp.float32, device=self.level.device)
-        arrays = (*(_array(each) for each in (*between, x)), wp.from_torch(lost), change)
+        arrays = (*(_array(each) for each in (*between, x)), argument(lost), change)
         self._launch(find_changes, self.clusters, self.parts, self.rest, *arrays)
         return change
 
@@ -312,15 +310,15 @@ class MonotonePatches:
             lost: Becomes 1 where it is less; nothing is looked at where it is that already.
         """
         x, lanes = _array(start), lanes_on(self.level.device)
-        inputs = (self.table, x, x if end is None else _array(end - start), end is not None, wp.from_torch(relied))
-        self._launch(find_lost, self.count * lanes, lanes, *inputs, *changes, wp.from_torch(lost), least=LEAST_QUERIES)
+        inputs = (self.table, x, x if end is None else _array(end - start), end is not None, argument(relied))
+        self._launch(find_lost, self.count * lanes, lanes, *inputs, *changes, argument(lost), least=LEAST_QUERIES)
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
         """Run a kernel over patches or clusters; another thread is worth it from so many items."""
         launched = {"device": self.level.device, "threads": self.level.threads, "least": least}
-        Launch(kernel, size, list(inputs), **launched)({})
+        run(kernel, size, list(inputs), **launched)
 
 
 def _array(x: Tensor) -> wp.array:
     """Positions as kernels read them."""
-    return wp.from_torch(x.contiguous(), dtype=wp.vec3d)
+    return argument(x.contiguous(), wp.vec3d)

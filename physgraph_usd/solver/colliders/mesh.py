@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..mesh.threads import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, argument, run
 from .base import Nearest
 from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
@@ -177,9 +177,9 @@ class MeshSurface:
         face = torch.zeros(count, dtype=torch.int32, device=x.device)
         side = torch.zeros_like(distance)
         if count:
-            outputs = [wp.from_torch(distance), *(_vectors(each) for each in (point, normal)), wp.from_torch(face)]
-            outputs += [_vectors(weight), wp.from_torch(side)]
-            self.run(_closest, mesh, count, [_vectors(asked), wp.from_torch(limit), *outputs])
+            outputs = [argument(distance), *(_vectors(each) for each in (point, normal)), argument(face)]
+            outputs += [_vectors(weight), argument(side)]
+            self.run(_closest, mesh, count, [_vectors(asked), argument(limit), *outputs])
         rim = self._on_rim(face.long(), weight) & distance.isfinite()
         return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
 
@@ -196,7 +196,7 @@ class MeshSurface:
                 _winding,
                 self.mesh,
                 len(x),
-                [_vectors(asked), wp.float32(far), wp.float32(parts - 0.5), wp.from_torch(side)],
+                [_vectors(asked), wp.float32(far), wp.float32(parts - 0.5), argument(side)],
             )
         return side < 0
 
@@ -228,7 +228,7 @@ class MeshSurface:
     def run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
         """Launch over points in slices on several threads."""
         given = {"device": self.device, "threads": self.threads, "least": LEAST_QUERIES}
-        Launch(kernel, count, [mesh.id, *inputs], **given)({})
+        run(kernel, count, [mesh.id, *inputs], **given)
 
     def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
         """Whether closest points lie on a rim edge or a rim vertex."""
@@ -324,7 +324,7 @@ class Faces:
             return self._surface.inside(asked)
         far = wp.float32(2.0 * float(np.linalg.norm(size)))
         self._surface.run(
-            _meets, self._surface.mesh, len(vertices), [_vectors(asked), _vectors(up), far, wp.from_torch(out)]
+            _meets, self._surface.mesh, len(vertices), [_vectors(asked), _vectors(up), far, argument(out)]
         )
         met = torch.nonzero(out | (up == 0.0).all(dim=1)).squeeze(1)  # Flat faces have no normal to look along.
         out[met] = self._surface.inside(asked[met])
@@ -397,4 +397,4 @@ def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh
 
 
 def _vectors(tensor: Tensor) -> wp.array:
-    return wp.from_torch(tensor, dtype=wp.vec3f, requires_grad=False)
+    return argument(tensor, wp.vec3f)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.stencil import vectors
-from ..mesh.threads import Launch, start_warp
+from ..mesh.threads import argument, run, start_warp
 from ..mesh.topology import joined_by
 from .base import Nearest, Surface
 
@@ -169,14 +169,14 @@ def _sides(
 def _contradicted(side: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Bool[Tensor, " vertices"]:
     """Vertices told to be on the other side of a neighbour that no surface divides them from."""
     out = torch.zeros(len(side), dtype=torch.bool, device=side.device)
-    _ask_edges(_contradict, edges, x, distance, wp.from_torch(side.to(torch.int8)), wp.from_torch(out))
+    _ask_edges(_contradict, edges, x, distance, argument(side.to(torch.int8)), argument(out))
     return out
 
 
 def _clear_among(some: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Int[Tensor, "edges 2"]:
     """The edges between some vertices that no surface divides."""
     out = torch.zeros(len(edges), dtype=torch.bool, device=x.device)
-    _ask_edges(_join, edges, x, distance, wp.from_torch(some), wp.from_torch(out))
+    _ask_edges(_join, edges, x, distance, argument(some), argument(out))
     return edges[out].long()
 
 
@@ -186,8 +186,8 @@ def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *m
         return
     start_warp()  # Views of tensors do not start Warp by themselves.
     points, away = (each.to(torch.float32).contiguous() for each in (x, distance))
-    where = [wp.from_torch(edges.to(torch.int32).contiguous(), dtype=wp.vec2i), vectors(points), wp.from_torch(away)]
-    Launch(kernel, len(edges), [*where, *more], device=str(x.device))({})
+    where = [argument(edges.to(torch.int32).contiguous(), wp.vec2i), vectors(points), argument(away)]
+    run(kernel, len(edges), [*where, *more], device=str(x.device))
 
 
 def _joined(which: Tensor, pairs: Tensor, count: int) -> tuple[Tensor, Tensor]:

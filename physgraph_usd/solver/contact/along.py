@@ -12,7 +12,7 @@ from torch import Tensor
 from ..collide.narrow_phase import Pairs
 from ..collide.near import weights
 from ..mesh.stencil import incidence
-from ..mesh.threads import Launch
+from ..mesh.threads import Launch, argument
 
 wp.set_module_options({"enable_backward": False})
 
@@ -95,12 +95,12 @@ def along(
     gives = (weight * free[places].squeeze(2)).contiguous()
     count = starts.diff().to(x)
     stiffness = (gives.square() * count[places]).sum(dim=1).clamp_min(1e-300)
-    pairs = [wp.from_torch(corners, dtype=wp.vec4i), *(wp.from_torch(each, dtype=wp.vec4d) for each in (weight, gives))]
-    pairs += [wp.from_torch(normal.contiguous(), dtype=wp.vec3d)]
+    pairs = [argument(corners, wp.vec4i), *(argument(each, wp.vec4d) for each in (weight, gives))]
+    pairs += [argument(normal.contiguous(), wp.vec3d)]
     moved = way.clone(memory_format=torch.contiguous_format)
-    push, wanted, out = wp.from_torch(torch.zeros_like(distance)), _vectors(way), _vectors(moved)
-    push_apart = [*pairs, wp.from_torch(COMES * distance), wp.from_torch(stiffness), out, push]
-    add_pushes = [wp.from_torch(starts), wp.from_torch(slots), pairs[2], pairs[3], push, wanted, out]
+    push, wanted, out = argument(torch.zeros_like(distance)), _vectors(way), _vectors(moved)
+    push_apart = [*pairs, argument(COMES * distance), argument(stiffness), out, push]
+    add_pushes = [argument(starts), argument(slots), pairs[2], pairs[3], push, wanted, out]
     launched = {"device": str(x.device), "threads": threads}
     launches = [
         Launch(_push_apart, len(corners), push_apart, **launched),
@@ -133,4 +133,4 @@ def _distinct(met: Pairs, count: int) -> tuple[Int[Tensor, "pairs 4"], Bool[Tens
 
 def _vectors(x: Tensor) -> wp.array:
     """Vectors as kernels read them."""
-    return wp.from_torch(x.contiguous(), dtype=wp.vec3d)
+    return argument(x.contiguous(), wp.vec3d)

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..colliders.base import Nearest, Surface
 from ..colliders.mesh import MeshSurface
 from ..level import Level
-from ..mesh.threads import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, argument, run
 
 wp.set_module_options({"enable_backward": False})
 
@@ -299,8 +299,8 @@ def _faces_met(
     """
     face = torch.full((len(edges),), -1, dtype=torch.int32, device=points.device)
     if len(edges):
-        reach = [wp.from_torch(each.to(torch.float32).contiguous()) for each in (clear, longest)]
-        ends = wp.from_torch(edges.contiguous(), dtype=wp.vec2i)
-        inputs = [mesh.id, ends, wp.from_torch(points, dtype=wp.vec3f), *reach, wp.from_torch(face)]
-        Launch(_pierce, len(edges), inputs, device=str(points.device), threads=threads, least=LEAST_QUERIES)({})
+        reach = [argument(each.to(torch.float32).contiguous()) for each in (clear, longest)]
+        ends = argument(edges.contiguous(), wp.vec2i)
+        inputs = [mesh.id, ends, argument(points, wp.vec3f), *reach, argument(face)]
+        run(_pierce, len(edges), inputs, device=str(points.device), threads=threads, least=LEAST_QUERIES)
     return face

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
-from ..mesh.threads import LEAST_QUERIES, Launch
+from ..mesh.threads import LEAST_QUERIES, argument, run
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,9 +57,7 @@ def room_above(
     found = room.to(torch.float32)
     start, along = (each.to(torch.float32).contiguous() for each in (point + OFF * normal, normal))
     limit = reach.to(torch.float32).contiguous()
-    inputs = [wp.from_torch(each, dtype=wp.vec3f) for each in (start, along)]
-    inputs += [wp.from_torch(each) for each in (limit, found)]
-    Launch(
-        _ahead, len(point), [surface.mesh.id, *inputs], device=str(point.device), threads=threads, least=LEAST_QUERIES
-    )({})
+    inputs = [argument(each, wp.vec3f) for each in (start, along)]
+    inputs += [argument(each) for each in (limit, found)]
+    run(_ahead, len(point), [surface.mesh.id, *inputs], device=str(point.device), threads=threads, least=LEAST_QUERIES)
     return found.to(room)

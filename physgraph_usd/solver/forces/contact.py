@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.stencil import SCALAR, VECTOR, overloads, vectors
-from ..mesh.threads import Launch, start_warp
+from ..mesh.threads import Launch, argument, start_warp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -99,8 +99,8 @@ class Contact:
     def _prepare(level: Level, planes: Planes, weight: Tensor, energy: Tensor) -> Launch:
         start_warp()  # Views of tensors do not start Warp by themselves.
         x = vectors(torch.zeros_like(level.rest))
-        plane_arrays = [wp.from_torch(planes.vertex), vectors(planes.normal), wp.from_torch(planes.height)]
-        inputs = [x, *plane_arrays, wp.from_torch(weight), wp.from_torch(energy), x]
+        plane_arrays = [argument(planes.vertex), vectors(planes.normal), argument(planes.height)]
+        inputs = [x, *plane_arrays, argument(weight), argument(energy), x]
         return Launch(_PUSH[level.dtype], len(planes.vertex), inputs, device=level.device, threads=level.threads)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:

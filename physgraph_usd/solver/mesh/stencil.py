@@ -14,7 +14,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .threads import Launch
+from .threads import Launch, argument
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,11 +58,11 @@ def overloads(kernel: Any, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
 _GATHER = overloads(_gather_rows, wp.int32, wp.int32, SCALAR, VECTOR, VECTOR)
 
 
-def vectors(tensor: Tensor) -> wp.array:
-    """A Warp view of a contiguous (N, 3) tensor as N vectors, without a copy."""
+def vectors(tensor: Tensor) -> Any:
+    """A kernel's view of a contiguous (N, 3) tensor as N vectors, without a copy."""
     if not len(tensor):  # Empty tensors keep strides that Warp refuses.
         return wp.empty(0, dtype=VECTOR[tensor.dtype], device=str(tensor.device))
-    return wp.from_torch(tensor, dtype=VECTOR[tensor.dtype], requires_grad=False)
+    return argument(tensor, VECTOR[tensor.dtype])
 
 
 def add_at(total: Tensor, places: Int[Tensor, " items"], values: Tensor) -> Tensor:

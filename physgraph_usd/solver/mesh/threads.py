@@ -14,9 +14,11 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from ...interrupts import undisturbed
 
@@ -137,6 +139,30 @@ class Launch:
                 wait(others)
         for other in others:
             other.result()
+
+
+def run(
+    kernel: wp.Kernel,
+    size: int,
+    inputs: Sequence[Any],
+    *,
+    device: str,
+    threads: int = 1,
+    least: int = LEAST_PER_THREAD,
+) -> None:
+    """Run a kernel once, as a `Launch` does."""
+    if device == "cpu":
+        Launch(kernel, size, inputs, device=device, threads=threads, least=least)({})
+    elif size:
+        wp.launch(kernel, dim=size, inputs=[0, *inputs], device=device, stream=current_stream(device))
+
+
+def argument(tensor: Tensor, dtype: type | None = None) -> Any:
+    """A contiguous tensor as an array that a kernel takes, without a copy, of so many values or of vectors.
+
+    It cannot be asked anything, nor be part of a struct, but costs a third of an array of Warp's to make.
+    """
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def _tapered(size: int, slices: int) -> list[int]:
