@@ -78,9 +78,14 @@ def strained_parts(
     return sorted(parts, key=lambda part: -part.share)
 
 
+def extent(points: np.ndarray) -> np.ndarray:
+    """How large points, shape (N, 3), are along each axis, shape (3,): axis by axis, for rows of three are slow."""
+    return np.array([np.ptp(points[:, axis]) for axis in range(3)])
+
+
 def size_left(garment: Garment, points: np.ndarray) -> float:
     """How large a cage at positions [m], shape (V, 3), is along its longest axis over its rest shape; 1 without one."""
-    sizes = [float(np.ptp(each, axis=0).max()) if len(each) else 0.0 for each in (points, garment.rest)]
+    sizes = [float(extent(each).max()) if len(each) else 0.0 for each in (points, garment.rest)]
     return sizes[0] / sizes[1] if sizes[1] > 0 else 1.0
 
 
@@ -96,7 +101,7 @@ def strayed(cage: np.ndarray, fine: np.ndarray, *, before: np.ndarray | None = N
     if not len(cage) or not len(fine):
         return ""
     earlier = cage if before is None else before
-    size, fine_size, earlier_size = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (cage, fine, earlier))
+    size, fine_size, earlier_size = (float(np.linalg.norm(extent(each))) for each in (cage, fine, earlier))
     away = float(np.linalg.norm(fine.mean(axis=0) - cage.mean(axis=0)))
     if away > size:
         return f"the refined cloth lies {1e3 * away:.4g} mm from its cage, which is {1e3 * size:.4g} mm large"

@@ -419,9 +419,9 @@ def domains_of(level: Level, parts: Topology, count: int) -> tuple[Patches, int,
         matrix.sort_indices()
         setattr(table, f"first_{name}", _array(matrix.indptr, device))
         setattr(table, "members" if name == "member" else name, _array(matrix.indices, device))
-    homes = [np.asarray(each.argmax(axis=0)).ravel() if count else np.zeros(0) for each in (wide, small)]
+    homes = [each.tocsc().indices for each in (wide, small)]  # Each cluster is in one.
     table.wide, table.small = _array(homes[0], device), _array(homes[1] + wide.shape[0], device)
-    within = np.asarray((small @ wide.T).argmax(axis=1)).ravel() if count else np.zeros(0)
+    within = sp.csr_matrix(small @ wide.T).indices
     table.within = _array(np.concatenate([np.full(wide.shape[0], -1), within]), device)
     _fill(table, level, parts, size)
     indices, begins = (np.asarray(each.numpy()) for each in (table.inside, table.first_inside))

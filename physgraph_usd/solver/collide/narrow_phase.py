@@ -75,6 +75,8 @@ class Pairs:
 
     def joined(self, other: Pairs) -> Pairs:
         """These pairs and others."""
+        if not len(self.value) or not len(other.value):
+            return self if len(self.value) else other
         parts = ((getattr(self, name), getattr(other, name)) for name in ("corners", "value", "face"))
         return Pairs(*(torch.cat(each) for each in parts))
 

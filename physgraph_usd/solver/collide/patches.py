@@ -21,6 +21,7 @@ James 2010). Here one 2x2 matrix a triangle replaces both the cone and the conto
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -319,6 +320,6 @@ class MonotonePatches:
         run(kernel, size, list(inputs), **launched)
 
 
-def _array(x: Tensor) -> wp.array:
+def _array(x: Tensor) -> Any:
     """Positions as kernels read them."""
     return argument(x.contiguous(), wp.vec3d)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -396,5 +397,5 @@ def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh
     return wp.Mesh(points=points, indices=indices, support_winding_number=closed)
 
 
-def _vectors(tensor: Tensor) -> wp.array:
+def _vectors(tensor: Tensor) -> Any:
     return argument(tensor, wp.vec3f)

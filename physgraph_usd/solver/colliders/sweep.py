@@ -133,7 +133,7 @@ class Sweep:
         if not len(self._triangles) or not len(start):
             return np.zeros(len(start), np.int32), np.zeros(len(start), bool)
         corners = before[self._triangles].reshape(-1, 3)
-        middle, nudge = corners.mean(axis=0), NUDGE * np.ptp(corners, axis=0).max()
+        middle, nudge = corners.mean(axis=0), NUDGE * max(np.ptp(corners[:, axis]) for axis in range(3))
         poses = [
             np.ascontiguousarray(each - middle, np.float32) for each in (before, after, start + nudge, end + nudge)
         ]

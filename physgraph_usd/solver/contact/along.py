@@ -4,6 +4,8 @@
 # pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int
@@ -131,6 +133,6 @@ def _distinct(met: Pairs, count: int) -> tuple[Int[Tensor, "pairs 4"], Bool[Tens
     return met.corners[order], met.face[order].bool()
 
 
-def _vectors(x: Tensor) -> wp.array:
+def _vectors(x: Tensor) -> Any:
     """Vectors as kernels read them."""
     return argument(x.contiguous(), wp.vec3d)

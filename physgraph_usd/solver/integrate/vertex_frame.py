@@ -54,7 +54,7 @@ class VertexFrame:
         return out
 
     @property
-    def positions(self) -> wp.array:
+    def positions(self) -> Any:
         """The positions, for kernels."""
         return vectors(self._x)
 

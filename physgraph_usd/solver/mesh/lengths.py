@@ -81,5 +81,5 @@ class ElementValues:
         return out
 
 
-def _packed(out: Tensor) -> wp.array:
+def _packed(out: Tensor) -> Any:
     return vectors(out) if out.ndim == 2 else wp.from_torch(out)
