@@ -18,7 +18,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, lanes_on, run
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run, workers_on
 from .boxes import FAR, Swept, mean_path, motion_of, overlap, room_for_swept, sweep_boxes
 from .domains import Patches, flat, holds
 from .parts import Parts
@@ -186,13 +186,13 @@ def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: flo
     launch(parts, join_boxes, groups, table, swept, all_low, all_high)
     proofs = Proofs()
     proofs.m, proofs.relied, proofs.half = wp.from_torch(m), wp.from_torch(relied), half
-    tree, room, lanes = wp.Bvh(all_low, all_high), ROOM, lanes_on(device)
+    tree, room, workers = wp.Bvh(all_low, all_high), ROOM, workers_on(device)
     while True:
         slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
         count = torch.zeros(size, dtype=torch.int32, device=device)
-        inputs = [lanes, table, proofs, tree.id, swept, all_low, all_high, room]
+        inputs = [workers, table, proofs, tree.id, swept, all_low, all_high, room]
         inputs += [argument(slots.view(-1, 3), wp.vec3i), argument(count)]
-        launch(parts, find_clusters, groups * lanes, *inputs, least=LEAST_QUERIES)
+        launch(parts, find_clusters, groups * workers, *inputs, least=LEAST_QUERIES)
         most = int(count.max()) if size else 0
         if most <= room:
             return slots[torch.arange(room, device=device) < count.unsqueeze(1)]
@@ -366,7 +366,7 @@ def pairs_of(
 def find_clusters(
     first: wp.int32,
     parts: Topology,
-    lanes: wp.int32,
+    workers: wp.int32,
     patches: Patches,
     proofs: Proofs,
     tree: wp.uint64,
@@ -378,14 +378,14 @@ def find_clusters(
     found: wp.array(dtype=wp.int32),
 ):
     """Clusters that those of each group can come near, in it and in groups after it; counted also where there is no
-    room. Each lane takes a part of a group's clusters."""
-    a = (first + wp.tid()) // lanes
+    room. Each worker takes a part of a group's clusters."""
+    a = (first + wp.tid()) // workers
     b = wp.int32(0)
     p = patches.wide_count + a
-    begin_own, end_own = patches.first_own[p] + (first + wp.tid()) % lanes, patches.first_own[p + 1]
+    begin_own, end_own = patches.first_own[p] + (first + wp.tid()) % workers, patches.first_own[p + 1]
     if begin_own >= end_own:
         return
-    lowest, highest = box_of(patches, swept, begin_own, end_own, lanes)
+    lowest, highest = box_of(patches, swept, begin_own, end_own, workers)
     query = wp.bvh_query_aabb(tree, lowest, highest)
     while wp.bvh_query_next(query, b):
         if b < a:
@@ -395,7 +395,7 @@ def find_clusters(
             continue
         if lie_apart(patches, proofs, a, b):
             continue
-        for n in range(begin_own, end_own, lanes):
+        for n in range(begin_own, end_own, workers):
             i = patches.own[n]
             if overlap(swept.low[i], swept.high[i], all_low[b], all_high[b]):
                 begin, end = wp.where(a == b, n, patches.first_own[q]), patches.first_own[q + 1]

@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, lanes_on, run
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run, workers_on
 from .domains import Patches, area_of, domains_of, single
 from .topology import Topology
 
@@ -101,14 +101,14 @@ def least_of(
     path: wp.array(dtype=wp.vec3d),
     moves: wp.bool,
     wanted: wp.float32,
-    lane: wp.int32,
-    lanes: wp.int32,
+    worker: wp.int32,
+    workers: wp.int32,
 ):
-    """m of a patch over a move in one lane's part of its faces, by Q fitted half way; `NOTHING` where it is less than
+    """m of a patch over a move in one worker's part of its faces, by Q fitted half way; `NOTHING` where it is less than
     what is wanted."""
     q1, q2 = fitted(patches, p, start, path, wp.where(moves, wp.float64(0.5), wp.float64(0.0)))
     least = wp.float32(1.0)
-    for k in range(patches.first_face[p] + lane, patches.first_face[p + 1], lanes):
+    for k in range(patches.first_face[p] + worker, patches.first_face[p + 1], workers):
         inverse = patches.inverse[k]
         for at in range(wp.where(moves, 2, 1)):
             u, v = sides_of(patches.faces[k], start, path, wp.float64(at))
@@ -125,7 +125,7 @@ def least_of(
 @wp.kernel
 def measure_patches(
     first: wp.int32,
-    lanes: wp.int32,
+    workers: wp.int32,
     begin_at: wp.int32,
     patches: Patches,
     start: wp.array(dtype=wp.vec3d),
@@ -136,23 +136,23 @@ def measure_patches(
     known: wp.array(dtype=wp.float32),
     found: wp.array(dtype=wp.float32),
 ):
-    """m of some patches over a move along straight paths, by lanes; of small ones only where that of the wide one round
-    them, which is known, is not enough in every case."""
-    place = (first + wp.tid()) + begin_at * lanes
-    p, lane = place // lanes, place % lanes
+    """m of some patches over a move along straight paths, by each worker; of small ones only where that of the wide one
+    round them, which is known, is not enough in every case."""
+    place = (first + wp.tid()) + begin_at * workers
+    p, worker = place // workers, place % workers
     if patches.first_face[p] == patches.first_face[p + 1]:
         return
     around = patches.within[p]
     if around >= 0:
         if known[around] * patches.flattest[around] > enough:
             return
-    found[place] = least_of(patches, p, start, path, moves, least, lane, lanes)
+    found[place] = least_of(patches, p, start, path, moves, least, worker, workers)
 
 
 @wp.kernel
 def find_lost(
     first: wp.int32,
-    lanes: wp.int32,
+    workers: wp.int32,
     patches: Patches,
     start: wp.array(dtype=wp.vec3d),
     path: wp.array(dtype=wp.vec3d),
@@ -165,11 +165,11 @@ def find_lost(
     """Whether m of any patch is less than is relied on over a move; known where its gradients have changed little at
     both ends."""
     place = first + wp.tid()
-    p, lane = place // lanes, place % lanes
+    p, worker = place // workers, place % workers
     if lost[0] > 0 or relied[p] == NOTHING:
         return
     if has_changed(patches, p, change, other):
-        if least_of(patches, p, start, path, moves, relied[p], lane, lanes) == NOTHING:
+        if least_of(patches, p, start, path, moves, relied[p], worker, workers) == NOTHING:
             lost[0] = 1
 
 
@@ -264,14 +264,16 @@ class MonotonePatches:
             least: What m must be more than.
             enough: Of which distance at rest, at most, all that is nearer is to be left out: a part.
         """
-        lanes = lanes_on(self.level.device)
-        by_lane = torch.full((self.count, lanes), float(NOTHING), dtype=torch.float32, device=start.device)
-        out, x, moves = by_lane[:, 0].clone(), _array(start), end is not None
+        workers = workers_on(self.level.device)
+        by_worker = torch.full((self.count, workers), float(NOTHING), dtype=torch.float32, device=start.device)
+        out, x, moves = by_worker[:, 0].clone(), _array(start), end is not None
         path = x if end is None else _array(end - start)
         for begin, size in ((0, self.wide), (self.wide, self.count - self.wide)):
             inputs = (begin, self.table, x, path, moves, least, enough, argument(out))
-            self._launch(measure_patches, size * lanes, lanes, *inputs, argument(by_lane.view(-1)), least=LEAST_QUERIES)
-            out = by_lane.amin(dim=1)
+            self._launch(
+                measure_patches, size * workers, workers, *inputs, argument(by_worker.view(-1)), least=LEAST_QUERIES
+            )
+            out = by_worker.amin(dim=1)
         return out
 
     def changes(
@@ -310,9 +312,9 @@ class MonotonePatches:
             changes: What has changed in each cluster at both.
             lost: Becomes 1 where it is less; nothing is looked at where it is that already.
         """
-        x, lanes = _array(start), lanes_on(self.level.device)
+        x, workers = _array(start), workers_on(self.level.device)
         inputs = (self.table, x, x if end is None else _array(end - start), end is not None, argument(relied))
-        self._launch(find_lost, self.count * lanes, lanes, *inputs, *changes, argument(lost), least=LEAST_QUERIES)
+        self._launch(find_lost, self.count * workers, workers, *inputs, *changes, argument(lost), least=LEAST_QUERIES)
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
         """Run a kernel over patches or clusters; another thread is worth it from so many items."""

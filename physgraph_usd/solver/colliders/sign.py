@@ -9,6 +9,8 @@ that such edges join.
 # pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 import warp as wp
@@ -180,7 +182,7 @@ def _clear_among(some: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) ->
     return edges[out].long()
 
 
-def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *more: wp.array) -> None:
+def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *more: Any) -> None:
     """Launch over edges; the kernel is told first where they are and how far their ends are from the surface."""
     if not len(edges):
         return

@@ -31,7 +31,7 @@ SLICES, LEAST_SLICE = 8, 32
 """Slices a thread there, and what they have at least on average: some items cost a hundred times as much as others, so
 whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
 
-LANES = 16
+WORKERS = 16
 """Threads that share an item of many elements on CUDA, where few items leave most of the device idle."""
 
 
@@ -43,9 +43,9 @@ def start_warp() -> None:
         wp.init()
 
 
-def lanes_on(device: str) -> int:
+def workers_on(device: str) -> int:
     """How many threads share an item of many elements."""
-    return 1 if device == "cpu" else LANES
+    return 1 if device == "cpu" else WORKERS
 
 
 def compile_kernels(device: str) -> None:
@@ -86,7 +86,7 @@ class Launch:
         self,
         kernel: wp.Kernel,
         size: int,
-        inputs: Sequence[wp.array],
+        inputs: Sequence[Any],
         *,
         device: str,
         threads: int = 1,
@@ -111,13 +111,13 @@ class Launch:
         if whole is not None and size:
             self._commands = [whole] if slices == 1 else [_part(whole, a, b) for a, b in pairwise(bounds)]
 
-    def change(self, changed: Mapping[int, wp.array]) -> None:
+    def change(self, changed: Mapping[int, Any]) -> None:
         """Replace some inputs from now on, by their place in ``inputs``."""
         for command in self._commands:
             for place, array in changed.items():
                 command.set_param_at_index(place + 1, array)
 
-    def __call__(self, changed: Mapping[int, wp.array]) -> None:
+    def __call__(self, changed: Mapping[int, Any]) -> None:
         """Run with some inputs replaced, by their place in ``inputs``."""
         self.change(changed)
         if self._device is not None:
