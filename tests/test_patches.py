@@ -7,6 +7,7 @@ much touches. The toolkit says which parts touch on the way, and each of these m
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import torch
 from folds import named
 from meshes import grid
 
+from physgraph_usd.solver.collide import broad_phase, patches
 from physgraph_usd.solver.collide.broad_phase import ClusterPairs
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.level import Level, build_levels
@@ -224,3 +226,39 @@ def test_a_move_is_served_only_while_patches_stay_monotone(shape: Shape):
             served += 1
             assert cloth.judged(found, start, end)[1] == 0
     assert 3 < served < 40
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_several_threads_to_a_patch_find_what_one_finds(shape: Shape, monkeypatch: pytest.MonkeyPatch):
+    """As on CUDA; they may rely on less, for each looks at the boxes of its own clusters."""
+    cloth, rng = Cloth(shape), np.random.default_rng(5)
+    for _ in range(4):
+        x = placed(cloth.rest, rng)
+        end, found = x + placed(0.2 * cloth.rest, rng), []
+        for workers in (1, 5):
+            for module in (broad_phase, patches):
+                monkeypatch.setattr(module, "workers_on", lambda _, count=workers: count)
+            m = cloth.parts.patches.measured(torch.as_tensor(x), torch.as_tensor(end), least=0.1, enough=0.2)
+            found.append((m, cloth.pairs(x, end)))
+        (m, one), (others, several) = found
+        assert torch.equal(m, others)
+        assert asked(one) == asked(several)
+        assert len(one.pairs) == len(several.pairs)
+        assert bool((several.relied <= one.relied).all())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_is_known_of_positions_changes_no_answer(shape: Shape):
+    cloth, rng, served = Cloth(shape), np.random.default_rng(6), []
+    for _ in range(3):
+        start = placed(cloth.rest, rng)
+        given = {"radius": torch.zeros(len(start)).double(), "allowed": torch.zeros(len(start)).double(), "half": 0.0}
+        slack = torch.full((len(start),), 0.5 * EDGE, dtype=torch.float64)
+        at = torch.as_tensor(start)
+        found = ClusterPairs.find(cloth.parts, at, None, slack=slack, **given)
+        places = [at + EDGE * 10.0 ** rng.uniform(-3.0, 0.0) * torch.randn_like(at) for _ in range(6)]
+        for _ in range(20):
+            x, end = (places[int(rng.integers(6))] for _ in range(2))
+            served.append(found.covers(x, end))
+            assert served[-1] == replace(found, _near=[], _went=[]).covers(x, end)
+    assert 0 < sum(served) < len(served)
