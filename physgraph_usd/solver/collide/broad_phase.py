@@ -33,6 +33,8 @@ LEAST = wp.constant(wp.float32(0.01))
 """What m is asked to be at least: single precision rounds it to some millionths."""
 KNOWN = 3
 """Positions of which it is known that they are near the paths, and how far clusters went to them."""
+GRADES = wp.constant(64)
+"""Grades of m in which is noted what is relied on."""
 APART, OUT = wp.constant(1), wp.constant(2)
 """What patches prove of two clusters: that they do not touch on any path that is served, or that they are not near."""
 
@@ -89,9 +91,8 @@ class ClusterPairs:
         """
         path = torch.zeros_like(start) if end is None else end - start
         m = parts.patches.measured(start, end, least=float(LEAST + MARGIN), enough=half + float(MARGIN))
-        relied = torch.full_like(m, float(NOTHING))
         motion = motion_of(start, path, radius=radius, slack=slack)
-        found = _in_boxes(parts, motion, m, relied, half=half)
+        found, relied = _in_boxes(parts, motion, m, half=half)
         pairs = found[:, :2].contiguous()
         occurs = torch.zeros(parts.count, dtype=torch.bool, device=start.device)
         occurs[pairs.reshape(-1).long()] = True
@@ -175,8 +176,10 @@ def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: i
     run(kernel, size, [parts.topology, *inputs], **launched)
 
 
-def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: float) -> Int[Tensor, "pairs 3"]:
-    """Pairs of clusters whose boxes meet on their way, and what is proved of them; what that relies on is noted."""
+def _in_boxes(
+    parts: Parts, motion: Any, m: Tensor, *, half: float
+) -> tuple[Int[Tensor, "pairs 3"], Float[Tensor, " patches"]]:
+    """Pairs of clusters whose boxes meet on their way, what is proved of them, and what that relies on of m."""
     size, device = parts.count, str(m.device)
     swept = room_for_swept(size, device)
     launch(parts, sweep_boxes, size, motion, swept)
@@ -184,8 +187,9 @@ def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: flo
     groups = parts.patches.count - parts.patches.wide
     all_low, all_high = (wp.empty(groups, dtype=wp.vec3f, device=device) for _ in range(2))
     launch(parts, join_boxes, groups, table, swept, all_low, all_high)
+    grades = torch.zeros((len(m), int(GRADES) + 1), dtype=torch.uint8, device=device)
     proofs = Proofs()
-    proofs.m, proofs.relied, proofs.half = wp.from_torch(m), wp.from_torch(relied), half
+    proofs.m, proofs.grades, proofs.half = wp.from_torch(m), wp.from_torch(grades.view(-1)), half
     tree, room, workers = wp.Bvh(all_low, all_high), ROOM, workers_on(device)
     while True:
         slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
@@ -195,16 +199,26 @@ def _in_boxes(parts: Parts, motion: Any, m: Tensor, relied: Tensor, *, half: flo
         launch(parts, find_clusters, groups * workers, *inputs, least=LEAST_QUERIES)
         most = int(count.max()) if size else 0
         if most <= room:
-            return slots[torch.arange(room, device=device) < count.unsqueeze(1)]
+            return slots[torch.arange(room, device=device) < count.unsqueeze(1)], _relied(m, grades)
         room = most
+
+
+def _relied(m: Float[Tensor, " patches"], grades: Tensor) -> Float[Tensor, " patches"]:
+    """The highest grade that was noted of each patch, as a part of its m; -1 where nothing is relied on."""
+    highest = (grades * torch.arange(int(GRADES) + 1, dtype=torch.uint8, device=m.device)).amax(dim=1)
+    return torch.where(highest > 0, highest * (m / float(GRADES)), float(NOTHING))
 
 
 @wp.struct
 class Proofs:
-    """m of each patch, what is relied on of it, and the part of distances at rest within which cloth is asked for."""
+    """m of each patch, what is relied on of it, and the part of distances at rest within which cloth is asked for.
+
+    What is relied on is noted as a mark in one of `GRADES` grades of m, rounded up: marks of several threads are the
+    same whichever comes last, and a greatest value would not be, since on the CPU Warp finds one without a lock.
+    """
 
     m: wp.array(dtype=wp.float32)
-    relied: wp.array(dtype=wp.float32)
+    grades: wp.array(dtype=wp.uint8)
     half: wp.float32
 
 
@@ -213,6 +227,13 @@ def gap_in(patches: Patches, p: wp.int32, i: wp.int32, j: wp.int32):
     """Least distance of two clusters at rest in a patch's plane."""
     between = wp.length(flat(patches, p, patches.centre[i]) - flat(patches, p, patches.centre[j]))
     return wp.max(between - patches.size[i] - patches.size[j], wp.float64(0.0))
+
+
+@wp.func
+def note(proofs: Proofs, p: wp.int32, needed: wp.float32):
+    """Mark what is relied on of a patch's m, which is greater."""
+    grade = wp.min(wp.int32(wp.ceil(needed / proofs.m[p] * wp.float32(GRADES))), GRADES)
+    proofs.grades[p * (GRADES + 1) + grade] = wp.uint8(1)
 
 
 @wp.func
@@ -238,9 +259,9 @@ def proved_by(
         needed = wp.min(needed, wp.float32(reach) / gap)
     needed = wp.max(needed, LEAST)
     if proofs.m[p] > needed + MARGIN:
-        wp.atomic_max(proofs.relied, p, needed)
+        note(proofs, p, needed)
         return OUT
-    wp.atomic_max(proofs.relied, p, LEAST)
+    note(proofs, p, LEAST)
     return APART
 
 
@@ -280,7 +301,7 @@ def have_both(
         return False
     if not holds(patches.whole, begin, end, b):
         return False
-    wp.atomic_max(proofs.relied, p, needed)
+    note(proofs, p, needed)
     return True
 
 
