@@ -1,4 +1,4 @@
-"""Recorded steps of `physgraph`: the same numbers as step by step. Replaying on CUDA is tested in `test_cuda.py`."""
+"""Recorded steps: the same numbers as step by step. Replaying on CUDA is tested in `test_cuda.py`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.fused import fused_physgraph
 from physgraph_usd.solver.integrate.learned import LearnedMetric
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.weights import random_network
 from physgraph_usd.solver.scene import GarmentFrame
 
@@ -65,6 +66,33 @@ def test_recorded_steps_are_the_same_steps(config: PhysgraphConfig):
             assert other == pytest.approx(one, rel=1e-4)
         else:
             assert float((one - other).abs().max()) < 1e-3 * float(system.spacing.mean())
+
+
+class RecordedQuasiNewton(QuasiNewton):
+    """Records although it is not on CUDA, as `Recorder` does."""
+
+    def records(self, system: System) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("squeeze", [1.0, 0.2])
+def test_quasi_newtons_recorded_steps_are_the_same_steps(squeeze: float):
+    """Also where a first trial fails and the host goes on, and where carries are resumed."""
+    system, x = problem()
+    x = x * torch.tensor([squeeze, 1.0, 1.0])
+    ends = []
+    for kind in (QuasiNewton, RecordedQuasiNewton):
+        integrator = kind()
+        carry, energies = integrator.start(system, x), []
+        for step in range(8):
+            carry = integrator.step(system, integrator.resume(system, carry) if step == 5 else carry)
+            energies.append(carry.energy)
+        ends.append((carry, energies))
+    (one, energies), (other, recorded) = ends
+    assert recorded == pytest.approx(energies, rel=1e-4)
+    assert float((one.x - other.x).abs().max()) < 2e-3 * float(system.spacing.mean())
+    assert other.mover == "quasi-newton"
+    assert len(one.memory.secants) == len(other.memory.secants)
 
 
 @pytest.mark.parametrize("made", [0, 1, 3, 7])

@@ -33,7 +33,7 @@ from .guard import Guard
 from .network import Physgraph
 from .paper_network import DirectedEdges, PaperNetwork
 from .quasi_newton import QuasiNewton
-from .recorded import MOST_GARMENTS, Memory, Recording
+from .recorded import MOST_GARMENTS, Memory, Recording, Recordings, pays
 from .secants import Dot, dot, secant_direction
 from .vertex_frame import VertexFrame
 
@@ -41,10 +41,6 @@ NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
 
 LONGEST = 5.0
 """Most edge lengths that a vertex moves in a step."""
-RECORDINGS = 6
-"""Recordings kept: of the levels of a garment, or of two."""
-WORTH = 6
-"""Steps from which those of a system that is used only once are recorded: recording costs as much as four."""
 
 
 class LearnedMetric:
@@ -63,7 +59,7 @@ class LearnedMetric:
         self._network = network
         self._trained = not any(parameter.requires_grad for parameter in network.parameters())
         self._fuse, self._record = fuse and self._trained, record and self._trained
-        self._recordings: dict[System, Recording] = {}
+        self._recordings = Recordings[Recording]()
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory; the network counts as precisely as the system does."""
@@ -135,25 +131,17 @@ class LearnedMetric:
     def records(self, system: System) -> bool:
         """Whether a system's steps are recorded: on CUDA, once trained, where it is used again or takes many."""
         few = system.level is None or len(system.level.spans) <= MOST_GARMENTS
-        pays = system.lasting or system.expected >= WORTH
-        return self._record and pays and system.spacing.is_cuda and few
+        return self._record and few and pays(system)
 
     def _recording(self, system: System) -> Recording:
-        """The recording of a system's steps.
+        """The recording of a system's steps."""
 
-        Those of the last few lasting systems are kept, and the last of another.
-        """
-        recording = self._recordings.pop(system, None)
-        if recording is None:
+        def make() -> Recording:
             # A recording keeps what its kernels write to: what is cached for all may be dropped.
             propose = partial(self._combined, system=system, fused=self._fused(system))
-            recording = Recording(system, propose, dot=self._dot(system))
-            for other in [each for each in self._recordings if not (each.lasting or system.lasting)]:
-                del self._recordings[other]
-        self._recordings[system] = recording
-        while len(self._recordings) > RECORDINGS:
-            del self._recordings[next(iter(self._recordings))]
-        return recording
+            return Recording(system, propose, dot=self._dot(system))
+
+        return self._recordings.of(system, make)
 
 
 def _secant_direction(carry: Carry) -> Tensor:

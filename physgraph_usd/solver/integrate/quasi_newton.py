@@ -11,13 +11,16 @@ are secants, since a triangle that opens would stay as slow as it was.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, Solver, System
+from .recorded import SECANTS, Memory, Recording, Recordings, pays
 from .secants import Secant, dot, secant_direction
 
 ARMIJO = 1e-4
@@ -64,15 +67,17 @@ class QuasiNewton:
         name: "quasi-newton" or "lbfgs".
     """
 
-    def __init__(self, *, history: int = 5, use_metric: bool = True) -> None:
+    def __init__(self, *, history: int = SECANTS, use_metric: bool = True, record: bool = True) -> None:
         """Choose the memory and the first guess.
 
         Args:
             history: Number of secants kept.
             use_metric: False scales by the Hessian's diagonal at the start instead of H0.
+            record: On CUDA, record a step on H0 and replay it.
         """
         self.name = "quasi-newton" if use_metric else "lbfgs"
         self._history, self._use_metric = history, use_metric
+        self._record, self._recordings = record and use_metric and history == SECANTS, Recordings[_Trial]()
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory."""
@@ -94,6 +99,9 @@ class QuasiNewton:
         the next one has to be, too, the metric misled both, and the one after uses the present state's stiffness.
         """
         memory = self._softened(system, carry) if carry.memory.stiff >= self._history else carry.memory
+        tried = self._replayed(system, carry) if memory.inverse is None and self.records(system) else None
+        if tried is not None:
+            return tried
         direction = secant_direction(carry.force, memory.image, memory.secants)
         slope = dot(carry.force, direction)
         if not slope > 0:
@@ -113,6 +121,21 @@ class QuasiNewton:
         if newest.curvature < math.inf:
             secants = (*secants, newest)[-self._history :]
         return self._carry(x, energy, force, _Memory(secants, memory.inverse, image, memory.stiff + bool(memory.stiff)))
+
+    def records(self, system: System) -> bool:
+        """Whether a system's steps are recorded."""
+        return self._record and pays(system)
+
+    def _replayed(self, system: System, carry: Carry) -> Carry | None:
+        """The carry after a step's first trial; None where that is not good enough."""
+        secants = carry.memory.secants
+        known = Memory(carry.force, (carry.memory.image, carry.memory.image), secants)
+        after = self._recordings.of(system, lambda: _Trial(system)).step(replace(carry, memory=known))
+        if after.preconditioned is None:
+            return None
+        if after.mover != _MISLED:
+            secants = tuple(replace(each, dot=dot) for each in after.memory.secants[-len(secants) - 1 :])
+        return replace(after, mover=self.name, memory=_Memory(secants, None, after.preconditioned))
 
     def _begin(self, system: System, x: Tensor, energy: float, force: Tensor, *, inverse: Solver | None) -> Carry:
         stiff = int(inverse is not None and self._use_metric)
@@ -168,6 +191,53 @@ class _Memory:
     shortened: bool = False
 
 
+_MISLED = "misled"
+"""Who made a trial whose secant changes nothing."""
+
+
+class _Trial(Recording):
+    """The first trial of a step on CUDA."""
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system, lambda carry, *, secant: secant(carry), dot=_tensor_dot, together=True)
+
+    def _measures(self, before: Carry, after: Carry, move: Tensor) -> list[Tensor]:
+        slopes = [_tensor_dot(each.force, move) for each in (before, after)]
+        return [*slopes, after.memory.secants[-1].curvature]
+
+    def _judged(self, before: Carry, after: Carry, measures: Sequence[float]) -> Carry:
+        slope, end, curvature = measures
+        if not (slope > 0 and _is_enough(before, after.energy, slope, lambda: end)):
+            return replace(after, preconditioned=None)
+        return after if curvature < math.inf else after.moved_by(_MISLED)
+
+    def _image(self, force: Tensor) -> Tensor:
+        return self._system.apply_metric_inverse(force)
+
+
+def _tensor_dot(a: Tensor, b: Tensor) -> Tensor:
+    """The scalar product of two fields, for which nobody waits."""
+    return torch.dot(a.reshape(-1), b.reshape(-1))
+
+
+def _is_enough(
+    before: Carry, energy: float, slope: float, end: Callable[[], float] | None, *, length: float = 1.0
+) -> bool:
+    """Whether a step lowers the energy enough.
+
+    Args:
+        before: Where it starts.
+        energy: Where it ends [J].
+        slope: force . direction at its start [J].
+        end: The same at its end, where it may be accepted by that; or None.
+        length: Its length over the direction's.
+    """
+    if energy <= before.energy - ARMIJO * length * slope:
+        return True
+    rounding = torch.finfo(before.x.dtype).eps * abs(before.energy)
+    return end is not None and energy <= before.energy + rounding and end() >= (2.0 * ARMIJO - 1.0) * slope
+
+
 def backtrack(
     system: System, carry: Carry, direction: Float[Tensor, "vertices 3"], slope: float, *, by_force: bool = False
 ) -> tuple[Tensor, float, Tensor] | None:
@@ -191,13 +261,12 @@ def backtrack(
     """
     if not slope > 0:
         return None
-    length, level = 1.0, carry.energy + torch.finfo(carry.x.dtype).eps * abs(carry.energy)
+    length = 1.0
     for trial in range(MAX_BACKTRACKS):
         x = carry.x + length * direction
         energy, force = system.energy_and_force(x)
-        if energy <= carry.energy - ARMIJO * length * slope:
-            return x, energy, force
-        if by_force and energy <= level and dot(force, direction) >= (2.0 * ARMIJO - 1.0) * slope:
+        end = partial(dot, force, direction) if by_force else None
+        if _is_enough(carry, energy, slope, end, length=length):
             return x, energy, force
         cut = truncated(system, carry.x, direction) if trial == 0 else None
         if cut is not None and (less := dot(carry.force, cut)) > 0:

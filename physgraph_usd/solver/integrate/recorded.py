@@ -1,4 +1,4 @@
-"""`physgraph` on CUDA: a step recorded once as a graph of kernels and replayed.
+"""Steps on CUDA: recorded once as a graph of kernels and replayed.
 
 A step of some hundred small kernels costs a GPU a tenth of a millisecond and Python several: replayed, only the first
 is left. A graph reads and writes buffers that stay where they are, so a carry is copied in before it and out after.
@@ -20,10 +20,10 @@ from __future__ import annotations
 import functools
 import gc
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 import warp as wp
@@ -39,6 +39,10 @@ SECANTS = 5
 """Secants kept."""
 MOST_GARMENTS = 8
 """Garments solved together beyond which steps are not recorded: each has scalar products of its own."""
+KEPT = 6
+"""Recordings kept: of the levels of a garment, or of two."""
+WORTH = 6
+"""Steps from which those of a system that is used only once are recorded: recording costs as much as four."""
 COMBINED, FIELDS = 3 * SECANTS + 2, 3 * SECANTS + 6
 """Fields that the L-BFGS direction combines, and all."""
 
@@ -76,23 +80,25 @@ class Propose(Protocol):
 
 
 class Recording:
-    """The steps of one system on CUDA."""
+    """The steps of one system on CUDA; those of the network, and what any integrator's have in common."""
 
-    def __init__(self, system: System, propose: Propose, *, dot: Dot) -> None:
+    def __init__(self, system: System, propose: Propose, *, dot: Dot, together: bool = False) -> None:
         """Make the buffers.
 
         Args:
             system: The system.
             propose: Gives the next displacement [m].
             dot: The scalar product for steps that are not recorded.
+            together: Whether all garments have one L-BFGS direction.
         """
         self._system, self._propose, self._dot = system, propose, dot
         like = {"dtype": system.spacing.dtype, "device": system.spacing.device}
         self._fields = torch.zeros((FIELDS, len(system.spacing), 3), **like)
         self._after, self._nothing = torch.zeros_like(self._fields), torch.zeros_like(self._fields[0])
-        self._scalars_after = torch.zeros(2, dtype=torch.float64, device=like["device"])
+        self._scalars_after: Tensor | None = None
         self._step = torch.zeros((), device=like["device"])
-        self._spans = (slice(0, len(system.spacing)),) if system.level is None else system.level.spans
+        each = None if together or system.level is None else system.level.spans
+        self._spans = each or (slice(0, len(system.spacing)),)
         self._products = torch.zeros((len(self._spans), COMBINED, COMBINED), **like)
         self._coefficients = torch.zeros((len(self._spans), COMBINED), **like)
         arrays = [wp.from_torch(self._products), wp.from_torch(self._coefficients)]
@@ -108,8 +114,17 @@ class Recording:
         self._run()
         self._system.evaluations += 1
         after = self._carry_of(self._after.clone(), step + 1)
-        energy, remaining = self._scalars_after.tolist()  # One wait for both.
-        return replace(after, energy=energy, remaining=remaining)
+        assert self._scalars_after is not None
+        energy, remaining, *others = self._scalars_after.tolist()  # One wait for all.
+        return self._judged(carry, replace(after, energy=energy, remaining=remaining), others)
+
+    def _judged(self, before: Carry, after: Carry, measures: Sequence[float]) -> Carry:
+        """The carry to go on with, by the one before, the one after and what `_measures` found."""
+        return after
+
+    def _measures(self, before: Carry, after: Carry, move: Tensor) -> list[Tensor]:
+        """Numbers of a step beside its energy and remaining move."""
+        return []
 
     def _fields_of(self, carry: Carry) -> list[Tensor]:
         """The fields of a carry, in their order."""
@@ -164,10 +179,47 @@ class Recording:
         x = before.x + move
         energy, force = system.field.energy_and_force(x)
         force = force * system.free
-        image = system.apply_smooth_inverse(force)
+        image = self._image(force)
         memory = before.memory.after(before, move, force, image, dot=self._dot)
-        torch.stack(self._fields_of(Carry(x, math.nan, force, image, memory=memory)), out=self._after)
-        self._scalars_after.copy_(torch.stack([energy.double(), system.relative_move(image)]))
+        after = Carry(x, math.nan, force, image, memory=memory)
+        torch.stack(self._fields_of(after), out=self._after)
+        scalars = [energy, system.relative_move(image), *self._measures(before, after, move)]
+        found = torch.stack([each.double().reshape(()) for each in scalars])
+        if self._scalars_after is None:  # The first step is not recorded.
+            self._scalars_after = torch.zeros_like(found)
+        self._scalars_after.copy_(found)
+
+    def _image(self, force: Tensor) -> Tensor:
+        """H0^-1 F [m]."""
+        return self._system.apply_smooth_inverse(force)
+
+
+RecordingT = TypeVar("RecordingT", bound=Recording)
+
+
+class Recordings(Generic[RecordingT]):
+    """The recordings of the last few lasting systems, and the last of another."""
+
+    def __init__(self) -> None:
+        """Keep none yet."""
+        self._kept: dict[System, RecordingT] = {}
+
+    def of(self, system: System, make: Callable[[], RecordingT]) -> RecordingT:
+        """The recording of a system's steps, made where there is none."""
+        recording = self._kept.pop(system, None)
+        if recording is None:
+            recording = make()
+            for other in [each for each in self._kept if not (each.lasting or system.lasting)]:
+                del self._kept[other]
+        self._kept[system] = recording
+        while len(self._kept) > KEPT:
+            del self._kept[next(iter(self._kept))]
+        return recording
+
+
+def pays(system: System) -> bool:
+    """Whether a system's steps are worth recording: on CUDA, where it is used again or takes many."""
+    return system.spacing.is_cuda and (system.lasting or system.expected >= WORTH)
 
 
 @functools.cache
