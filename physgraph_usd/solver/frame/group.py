@@ -20,6 +20,7 @@ from ..forces.base import ForceModule
 from ..forces.guide import GuideMap
 from ..integrate.base import Integrator, System
 from ..integrate.learned import guarded
+from ..integrate.quasi_newton import QuasiNewton
 from ..integrate.weights import shipped_network
 from ..level import Level, Placed, build_levels, unhindered
 from ..mesh.subdivide import Refinement
@@ -56,7 +57,7 @@ class Group:
     # The lasting terms by potential and materials, of the last ones alone; and integrators, which last on CUDA with
     # what they recorded.
     _forces: dict[tuple[object, ...], list[LevelForces]] = field(default_factory=dict)
-    _integrators: dict[Callable[[], Integrator] | None, Integrator] = field(default_factory=dict)
+    _integrators: dict[Callable[[], Integrator], Integrator] = field(default_factory=dict)
 
     @staticmethod
     def of(
@@ -123,10 +124,17 @@ class Group:
 
     def integrator(self, *, learned: bool) -> Integrator:
         """The shipped network's integrator, or the one that the settings name; built when first asked for."""
-        name = None if learned else self.settings.method.build
-        if name not in self._integrators:
-            self._integrators[name] = guarded(shipped_network("physgraph")) if name is None else name()
-        return self._integrators[name]
+        return self._built(_shipped if learned else self.settings.method.build)
+
+    @property
+    def untangler(self) -> Integrator:
+        """Makes the steps that draw apart what crosses: forces that end there mislead the network."""
+        return self._built(QuasiNewton)
+
+    def _built(self, build: Callable[[], Integrator]) -> Integrator:
+        if build not in self._integrators:
+            self._integrators[build] = build()
+        return self._integrators[build]
 
     def contact(
         self,
@@ -224,3 +232,8 @@ class Group:
         world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
         coarse = self.tensor((world - world.mean(dim=0)).numpy())
         return [lasting.module(coarse) for lasting in self.forces_for(frames)], coarse
+
+
+def _shipped() -> Integrator:
+    """The integrator of the network that ships."""
+    return guarded(shipped_network("physgraph"))

@@ -45,6 +45,7 @@ class LevelProblem:
         alone: Its system where nothing touches, tied to its start in a warm frame.
         view: What its cloth may touch, or None.
         integrator: What makes the steps.
+        untangler: What makes those that draw apart what crosses.
         budget: When to stop.
         outward: As `leave_saddle` takes it.
     """
@@ -54,6 +55,7 @@ class LevelProblem:
     alone: System
     view: LevelContact | None
     integrator: Integrator
+    untangler: Integrator
     budget: Budget
     outward: Float[Tensor, " garments"]
 
@@ -172,7 +174,8 @@ class Problem:
         alone = lasting.lasting_system(self.aim, tie) if recorded else lasting.system(module, tie)
         budget = settings.budget(self.finest - index, self.began, more=steps, warm=self.warm)
         budget = replace(budget, steps=0) if self.start.rests else budget
-        return LevelProblem(lasting, module, alone, self.view(index), integrator, budget, self.group.outward)
+        who, outward = (integrator, self.group.untangler), self.group.outward
+        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, outward)
 
     def begun(
         self, index: int, below: Float[Tensor, "below 3"] | None

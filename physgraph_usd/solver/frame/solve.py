@@ -138,7 +138,7 @@ def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Pla
             break
         view, terms = view.terms(x, order=cold)
         system = problem.system(view, terms, x)
-        wanted, report = solve_level(system, problem.integrator, x, level=level.index, budget=short)
+        wanted, report = solve_level(system, problem.untangler, x, level=level.index, budget=short)
         x = _safe_step(view.drawn if cold else view.moved, system, x, wanted)
         reports.append(report)
     return view.without_hope(x, start) if cold else x, reports
