@@ -9,9 +9,9 @@ levels and at the finest alone, with growing steps. Warm: frames in a row with e
 on. Time is of solving (on the CPU one core's processor time, on CUDA the wall's), its median over the frames; energy
 is their mean, judged anew at the positions returned, contact included.
 
-A ratio is a method's time over the least time of any method to the same energy; up to 1.1 counts as level. Every other
-shot was held out when the rules of `choose` were set. What was measured lies in the journal, build/choice.DEVICE.jsonl
-unless it is named: what is there is not measured again, and `--jobs 0` prints its table.
+A ratio is a method's time over the least time of any method to the same energy; up to 1.1 counts as level. What was
+measured lies in the journal, build/choice.DEVICE.jsonl unless it is named: what is there is not measured again, and
+`--jobs 0` prints its table.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import statistics
 import subprocess
 import sys
 import time
@@ -26,6 +27,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ import click
 import numpy as np
 
 from benchmarks.contact_shots import jumps
-from benchmarks.rows import say
+from benchmarks.rows import say, table
 from benchmarks.shots import opened
 from benchmarks.temporal import detail_of
 from physgraph_usd.lab.chart.problem import DEFAULT, judge, plain_detail
@@ -73,8 +75,7 @@ SHOTS: dict[str, tuple[Sequence[str], Sequence[str], int, int]] = {
     "12_variants/c_zup_cm.usdc": (*SHIRT, 2, 6),
     "dancer": ((), (), 20, 6),
 }
-"""Shots, those to set the rules by and those to check them on in turn: garments, bodies, the number of the first frame
-and how many follow it."""
+"""Shots: garments, bodies, the number of the first frame and how many follow it."""
 COARSE = ("04_tiered_dress_kick_zup.usdc",)
 """Those that take too long at more than one subdivision."""
 STEPS = (12, 6, 24, 3)
@@ -263,7 +264,65 @@ def made(telemetry: Sequence[Mapping[str, Any]]) -> tuple[dict[str, int], str]:
 
 
 def report(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the tables."""
+    """Print a table of ratios, time and energy at the default's steps, and how many of them count as level."""
+    found: dict[tuple[str, int, str], dict[tuple[str, int], list[dict[str, Any]]]] = {}
+    for row in rows:
+        case = found.setdefault((row["shot"], row["level"], "warm" if row["number"] else "cold"), {})
+        case.setdefault((row["method"], row["steps"]), []).append(row)
+    names = ("auto", *dict.fromkeys(row["method"] for row in rows if row["method"] != "auto"))
+    lines, ratios = [], defaultdict(list)
+    for (shot, level, kind), runs in sorted(found.items(), key=lambda each: (each[0][2], each[0][1])):
+        whole = {key: run for key, run in runs.items() if len(run) == max(map(len, runs.values()))}
+        cells = []
+        for name in names:
+            if run := whole.get((name, DEFAULT.steps)):
+                ratio = ratio_of(run, whole)
+                ratios[kind, name].append(ratio)
+                left = [sum(row[what] for row in run) for what in ("cloth", "body", "unsettled", "jumps")]
+                cells.append(f"{ratio:.2f}: {milliseconds(run):.0f} ms, {energy(run):.4g} J, {left}")
+            else:
+                cells.append("-")
+        lines.append([Path(shot).parts[0].partition(".")[0] if "." in shot else shot, level, kind, *cells])
+    say(table(("shot", "level", "", *names), lines))
+    say("\nin brackets: crossings of cloth and cloth, of cloth and bodies, frames unsettled, jumps\n")
+    level_with = {key: f"{sum(each <= LEVEL_WITH for each in own)} of {len(own)}" for key, own in ratios.items()}
+    say(table(("", *names), [[k, *(level_with.get((k, name), "-") for name in names)] for k in ("cold", "warm")]))
+
+
+def ratio_of(run: Sequence[dict[str, Any]], runs: Mapping[tuple[str, int], Sequence[dict[str, Any]]]) -> float:
+    """A run's time over the least of any named method to its energy; 1 where none gets there."""
+    times = [milliseconds(run)]
+    for name in {method for method, _ in runs} - {"auto"}:
+        points = [(milliseconds(own), energy(own)) for (method, _), own in runs.items() if method == name]
+        times += [time] if (time := time_to(points, energy(run))) is not None else []
+    return milliseconds(run) / min(times)
+
+
+def time_to(points: Sequence[tuple[float, float]], wanted: float) -> float | None:
+    """Time in which a method's runs, of which these are times and energies, come to an energy; None if never.
+
+    Between two runs its logarithm is linear in the energy.
+    """
+    best: list[tuple[float, float]] = []
+    for point in sorted(points):
+        if not best or point[1] < best[-1][1]:
+            best.append(point)
+    if best and best[0][1] <= wanted:
+        return best[0][0]
+    for (less, above), (more, below) in pairwise(best):
+        if below <= wanted:
+            return less * (more / less) ** ((above - wanted) / (above - below))
+    return None
+
+
+def milliseconds(run: Sequence[dict[str, Any]]) -> float:
+    """Median time of a run's frames."""
+    return statistics.median(row["ms"] for row in run)
+
+
+def energy(run: Sequence[dict[str, Any]]) -> float:
+    """Mean energy of a run's frames [J]."""
+    return statistics.fmean(row["energy"] for row in run)
 
 
 if __name__ == "__main__":
