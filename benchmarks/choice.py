@@ -295,7 +295,7 @@ def ratio_of(run: Sequence[dict[str, Any]], runs: Mapping[tuple[str, int], Seque
     for name in {method for method, _ in runs} - {"auto"}:
         points = [(milliseconds(own), energy(own)) for (method, _), own in runs.items() if method == name]
         times += [time] if (time := time_to(points, energy(run))) is not None else []
-    return milliseconds(run) / min(times)
+    return milliseconds(run) / min(times) if min(times) > 0.0 else 1.0
 
 
 def time_to(points: Sequence[tuple[float, float]], wanted: float) -> float | None:

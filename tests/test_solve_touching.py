@@ -76,6 +76,7 @@ class Fold:
             alone=system,
             system=lambda *_, **__: system,
             integrator=QuasiNewton(),
+            untangler=QuasiNewton(),
             budget=Budget(steps, tolerance=1e-6),
             outward=torch.ones(1),
         )
