@@ -132,9 +132,8 @@ class Group:
         return self._built(QuasiNewton)
 
     def _built(self, build: Callable[[], Integrator]) -> Integrator:
-        if build not in self._integrators:
-            self._integrators[build] = build()
-        return self._integrators[build]
+        built = self._integrators.get(build)
+        return built or self._integrators.setdefault(build, build())
 
     def contact(
         self,
