@@ -71,9 +71,7 @@ class LevelContact:
             return plain
         last = known if isinstance(known, HeldMetric) else None
         stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
-        if self.comes_apart(x):
-            return HeldMetric(plain, stiff, factored=False)
-        if last is None:
+        if last is None or self.comes_apart(x):
             return HeldMetric(plain, stiff) if bool((stiff > 0).any()) else plain  # Things are near, but none pushes.
         return last if last.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, last.stiff))
 

@@ -59,7 +59,7 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
         choice = choose(problem, group.settings.method.nested)
         x, reports, module = None, list[LevelReport](), ForceModule(())
         for index in problem.levels(nested=choice.nested):
-            level = problem.level(index, steps=choice.steps, integrator=group.integrator(learned=choice.learned))
+            level = problem.level(index, choice)
             x, made, module = solve_one_level(level, *problem.begun(index, x))
             if index < problem.finest:
                 made[-1].energies = module.energies(x)
@@ -108,7 +108,8 @@ def solve_one_level(
     carry, last, terms, made, touched = None, None, (), 0, False
     while not made or made < _most_steps(budget, reports[-1], touched=touched):
         view, terms = view.terms(x)
-        touched |= bool(terms)
+        if terms and not touched:
+            touched, budget = True, problem.touching
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
         of_round = _round_budget(budget, system, first=not made, steps=STEPS if terms else LONGEST)
