@@ -13,11 +13,16 @@ class Fabric:
     """One fabric's parameters.
 
     Attributes:
-        stretch: In-plane Young's modulus of the sheet, Y = E h [N/m].
-        bend: Bending stiffness D = E h^3 / 12 (1 - nu^2) [N m].
+        stretch: In-plane Young's modulus of the sheet, Y = E h [N/m]; along the warp where the weft's differs.
+        bend: Bending stiffness D = E h^3 / 12 (1 - nu^2) [N m]; along the warp where the weft's differs.
         density: Areal density [kg/m^2].
         thickness: Sheet thickness [m].
-        shear: Shear stiffness G h [N/m]; None selects edge springs (G = 0.375 Y).
+        shear: Shear stiffness G h [N/m]; None is 0.375 Y, that of an isotropic sheet.
+        weft_stretch: Young's modulus along the weft [N/m]; None is the warp's.
+        weft_bend: Bending stiffness along the weft [N m]; None is the warp's.
+        stretch_limit: Strain from which the cloth stiffens; None is never.
+        warp_ease: Length along the warp that the cloth has and its rest shape does not show, as a fraction.
+        weft_ease: The same along the weft.
     """
 
     stretch: float = 30.0
@@ -25,6 +30,21 @@ class Fabric:
     density: float = 0.187
     thickness: float = 1e-3
     shear: float | None = None
+    weft_stretch: float | None = None
+    weft_bend: float | None = None
+    stretch_limit: float | None = None
+    warp_ease: float = 0.0
+    weft_ease: float = 0.0
+
+    @property
+    def has_membrane(self) -> bool:
+        """Whether edge springs cannot stand for it: they have one stiffness, its shear, and no limit."""
+        return any(each is not None for each in (self.shear, self.weft_stretch, self.stretch_limit))
+
+    @property
+    def is_eased(self) -> bool:
+        """Whether its cloth is longer than the rest shape."""
+        return bool(self.warp_ease or self.weft_ease)
 
 
 PRESETS: dict[str, Fabric] = {

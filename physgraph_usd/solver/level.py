@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import NewType
@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .fabric import Fabric
+from .grain import LevelGrain, axes, edge_cosines, longer
 from .mesh.defects import FLAT
 from .mesh.lengths import LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
@@ -78,6 +80,7 @@ class Level:
         smooth_from_below: Smooth map from there, None at the first level.
         flat_from_below: Map onto the triangles of the level below, None at the first level.
         threads: Most threads that a kernel over the level uses on the CPU.
+        grain: Which way warp and weft lie at its elements, or None where no garment says.
     """
 
     index: int
@@ -111,6 +114,24 @@ class Level:
     smooth_from_below: Stencil | None
     flat_from_below: Stencil | None
     threads: int = 1
+    grain: LevelGrain | None = None
+
+    def eased(self, fabrics: Sequence[Fabric]) -> Level:
+        """The level with the rest lengths and areas that its garments' fabrics have; itself where none has ease."""
+        if self.grain is None or not (self.grain.gathers or any(each.is_eased for each in fabrics)):
+            return self
+        ease = self.rest.new_tensor([[each.warp_ease, each.weft_ease] for each in fabrics])
+        warp, weft = (self.grain.edge_scale.unsqueeze(1) * ease[self.edge_garment.long()]).unbind(dim=1)
+        length, more = longer(self.grain.edge, warp, weft + self.grain.edge_gather), weft + self.grain.edge_gather
+        along, across = (self.grain.triangle_scale.unsqueeze(1) * ease[self.triangle_garment.long()]).unbind(dim=1)
+        sides = 1.0 + torch.stack([along, across + self.grain.triangle_gather], dim=1)
+        return replace(
+            self,
+            rest_length=self.rest_length * length,
+            edge_area=self.edge_area * (1.0 + warp) * (1.0 + more),
+            triangle_area=self.triangle_area * sides.prod(dim=1),
+            triangle_inverse=self.triangle_inverse / sides.repeat(1, 2),
+        )
 
     @property
     def dtype(self) -> torch.dtype:
@@ -215,6 +236,7 @@ class _GarmentLevel:
     hinge_factor: np.ndarray
     bent_rest: bool
     vertex_values: dict[str, np.ndarray]
+    warp: np.ndarray | None
     linear: sp.csr_matrix
     smooth: sp.csr_matrix
     linear_step: sp.csr_matrix
@@ -226,12 +248,13 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     """Carry one garment to a level, or to the end of its chain of refinements, at which it stays."""
     mesh, chain = garment.mesh, whole[:index]
     linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    face = np.arange(mesh.face_count)
     for number, refinement in enumerate(chain):
         split = mesh.triangulate(None if number else garment.rest)
         flat_step = on_triangles(mesh, refinement, split)
         linear_step, smooth_step = refinement.linear, sp.csr_matrix(smooth(mesh, refinement))
         smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
-        mesh = refinement.mesh
+        mesh, face = refinement.mesh, face[refinement.parent_face]
     if index > len(chain):
         linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
     rest = np.asarray(linear @ np.asarray(garment.rest, dtype=np.float64))
@@ -240,7 +263,9 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     edges = edges_of(triangles, mesh.vertex_count).vertices
     from_quad, diagonal = quad_edges(split, mesh.counts, edges)
     edge_factor, at_edge = (1.0 + from_quad * (np.where(diagonal, f[1], f[0]) - 1.0) for f in (QUAD_SPRING, QUAD_HINGE))
-    names = ("stretch_scale", "bend_scale", "pin")
+    painted = {name: getattr(garment, name) for name in ("stretch_scale", "bend_scale", "pin")}
+    if garment.grain is not None:
+        painted |= {"ease_scale": garment.grain.ease_scale, "gather": garment.grain.gather}
     return _GarmentLevel(
         vertex_count=mesh.vertex_count,
         rest=rest,
@@ -250,7 +275,8 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         edge_factor=edge_factor,
         hinge_factor=at_edge[find_edges(edges, hinges[:, :2])],
         bent_rest=garment.bent_rest,
-        vertex_values={name: np.asarray(linear @ getattr(garment, name).astype(np.float64)) for name in names},
+        vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
+        warp=None if garment.grain is None else garment.grain.warp[face[split.face]],
         linear=linear,
         smooth=smoothing,
         linear_step=linear_step,
@@ -289,7 +315,9 @@ def _join(
     owners = {"vertex_garment": counts}
     owners |= {f"{name[:-1]}_garment": [len(getattr(part, name)) for part in parts] for name in elements}
     whole = elements | {name: np.repeat(np.arange(len(parts)), sizes) for name, sizes in owners.items()}
-    real = _measured(parts, elements["triangles"], elements["edges"], hinges=elements["hinges"])
+    warp, grain = _grain(parts, elements)
+    real = _measured(parts, elements["triangles"], elements["edges"], hinges=elements["hinges"], warp=warp)
+    tensors = {n: torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device) for n, a in grain.items()}
     return Level(
         index=index,
         spans=tuple(slice(int(a), int(b)) for a, b in pairwise(starts)),
@@ -301,16 +329,42 @@ def _join(
         smooth_from_below=below[1],
         flat_from_below=below[2],
         threads=threads,
+        grain=LevelGrain(**tensors) if tensors else None,
     )
 
 
+def _grain(
+    parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The warp's direction on each triangle, shape (T, 3), 0 where unknown, and the fields of `LevelGrain`, if any."""
+    triangles, edges, hinges = (elements[name] for name in ("triangles", "edges", "hinges"))
+    if all(part.warp is None for part in parts):
+        return np.zeros((len(triangles), 3)), {}
+    rest = np.concatenate([part.rest for part in parts])
+    warp = np.concatenate([np.zeros((len(p.triangles), 3)) if p.warp is None else p.warp for p in parts])
+    cosines = edge_cosines(rest, triangles, edges, warp=warp)
+    scale, gather = (
+        np.concatenate([part.vertex_values.get(name, np.full(part.vertex_count, none)) for part in parts])
+        for name, none in (("ease_scale", 1.0), ("gather", 0.0))
+    )
+    along = cosines[find_edges(edges, hinges[:, :2])]
+    return warp, {
+        "edge": cosines,
+        "hinge": along[:, 1] - along[:, 0],  # A hinge bends across its edge.
+        "edge_scale": scale[edges].mean(axis=1),
+        "triangle_scale": scale[triangles].mean(axis=1),
+        "edge_gather": gather[edges].mean(axis=1),
+        "triangle_gather": gather[triangles].mean(axis=1),
+    }
+
+
 def _measured(
-    parts: Sequence[_GarmentLevel], triangles: np.ndarray, edges: np.ndarray, *, hinges: np.ndarray
+    parts: Sequence[_GarmentLevel], triangles: np.ndarray, edges: np.ndarray, *, hinges: np.ndarray, warp: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Every real-valued field of a level, under its name there."""
     rest = np.concatenate([part.rest for part in parts])
     bent = np.repeat([part.bent_rest for part in parts], [len(part.hinges) for part in parts])
-    area, inverse = triangle_shape(rest, triangles)
+    area, inverse = triangle_shape(rest, triangles, warp)
     stretch, bend, pin = (
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
@@ -366,30 +420,24 @@ def rest_shape(
     }
 
 
-def triangle_shape(rest: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Area of each triangle and its sides' inverse in the material's axes.
-
-    The first material axis of a triangle is the rest frame's axis that lies most nearly in its plane, projected into
-    it; the second is a quarter turn further. A membrane with equal stiffness along both axes is the same after a
-    quarter turn, so wherever the cloth is tangent to a rest axis, neighbours agree whichever of the axes they take.
+def triangle_shape(
+    rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Area of each triangle and its sides' inverse in the material's axes, which are warp and weft (`axes`).
 
     Args:
         rest: Rest positions [m], shape (V, 3), float64.
         triangles: Shape (T, 3).
+        warp: Direction of the warp on each triangle, shape (T, 3), 0 where unknown; None where it is on all.
 
     Returns:
         Areas [m^2], shape (T,), and the rows of the inverse [1/m], shape (T, 4), zero where there is no area.
     """
     corners = rest[triangles]
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(first, second)
-    double = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.maximum(double, np.finfo(float).tiny)
-    warp = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    warp = warp - normal * np.einsum("tc,tc->t", warp, normal)[:, None]
-    warp /= np.linalg.norm(warp, axis=1, keepdims=True)
-    weft = np.cross(normal, warp)
-    a, b, c, d = (np.einsum("tc,tc->t", s, axis) for axis in (warp, weft) for s in (first, second))
+    double = np.linalg.norm(np.cross(first, second), axis=1, keepdims=True)
+    along, across = axes(rest, triangles, np.zeros((len(triangles), 3)) if warp is None else warp)
+    a, b, c, d = (np.einsum("tc,tc->t", s, axis) for axis in (along, across) for s in (first, second))
     sides = (first**2).sum(axis=1, keepdims=True) + (second**2).sum(axis=1, keepdims=True)
     whole = double > 1e-12 * sides
     adjugate = np.stack([d, -b, -c, a], axis=1)

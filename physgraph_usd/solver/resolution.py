@@ -130,9 +130,10 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
         level = 0 if garment.level == AUTO else garment.level
         count = fine_count(garment.mesh, level)
         return LevelChoice(level, "there are no faces or no readable frames to go by", 0.0, 0.0, level, (count, count))
-    rest = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
-    strain, edge = _compression(rest, ends, frames), float(rest.mean())
     fabric = frames[0].fabric
+    rest = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
+    rest = rest * (1.0 + max(fabric.warp_ease, fabric.weft_ease))
+    strain, edge = _compression(rest, ends, frames), float(rest.mean())
     wave = 2.0 * math.pi * math.sqrt(fabric.bend / max(fabric.stretch * strain, LEAST_TENSION))
     text = f"wrinkles of {1e3 * wave:.1f} mm (compression {strain:.2g}), cage edges of {1e3 * edge:.1f} mm"
     needed = math.ceil(math.log2(max(edge * EDGES_PER_WAVE / max(wave, SHORTEST_WAVE * edge), 1.0)))

@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import GarmentError
 from .colliders.pose import Collider, Pose
 from .fabric import Fabric
+from .grain import Grain
 from .mesh.topology import PolygonMesh
 
 FARTHEST = 1e9
@@ -52,6 +53,7 @@ class Garment:
         self_contact: Whether it feels itself.
         layer: Place in the order of garments, lower is nearer to the body; None, or equal to another's: not ordered.
         apart_from: Paths of the garments that it never touches; each of them names it too.
+        grain: Which way its warp lies, and its painted ease; None is unknown, and none.
     """
 
     path: str
@@ -69,6 +71,7 @@ class Garment:
     self_contact: bool = True
     layer: int | None = None
     apart_from: tuple[str, ...] = ()
+    grain: Grain | None = None
 
     @staticmethod
     def of(

@@ -62,14 +62,24 @@ class Tunable:
         return low * (high / low) ** place if self.decades else low + (high - low) * place
 
 
+def _percent(value: float | None) -> float | None:
+    """A fraction as the attribute holds it."""
+    return None if value is None else 100.0 * value
+
+
 TUNABLES: dict[str, Tunable] = {
     each.name: each
     for each in (
         Tunable("stretchStiffness", "N/m", 1.0, lambda f: f.fabric.stretch),
+        Tunable("weftStretchStiffness", "N/m", 1.0, lambda f: f.fabric.weft_stretch),
         Tunable("shearStiffness", "N/m", 1.0, lambda f: f.fabric.shear),
         Tunable("bendStiffness", "µN·m", 1e6, lambda f: f.fabric.bend),
+        Tunable("weftBendStiffness", "µN·m", 1e6, lambda f: f.fabric.weft_bend),
         Tunable("density", "g/m²", 1e3, lambda f: f.fabric.density),
         Tunable("thickness", "mm", 1e3, lambda f: f.fabric.thickness),
+        Tunable("stretchLimit", "%", 1.0, lambda f: _percent(f.fabric.stretch_limit), decades=False),
+        Tunable("rest:warpEase", "%", 1.0, lambda f: _percent(f.fabric.warp_ease), decades=False),
+        Tunable("rest:weftEase", "%", 1.0, lambda f: _percent(f.fabric.weft_ease), decades=False),
         Tunable("guide:stiffness", "N/m³", 1.0, lambda f: f.guide),
         Tunable("refine:detail", "", 1.0, lambda f: f.detail, decades=False),
         Tunable("contact:offset", "mm", 1e3, lambda f: f.offset),

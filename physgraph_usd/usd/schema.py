@@ -25,7 +25,8 @@ AUTO_LEVEL = -1
 
 SI = " SI, whatever the stage's metersPerUnit."
 """End of the doc of every property that has a unit."""
-REFINEMENT, FABRIC, CONTACT, PAINTED, COLLISION = "Refinement", "Fabric", "Contact", "Painted Maps", "Collider"
+REFINEMENT, FABRIC, REST = "Refinement", "Fabric", "Rest Shape"
+CONTACT, PAINTED, COLLISION = "Contact", "Painted Maps", "Collider"
 """Display groups."""
 SIDES = ("auto", "winding", "start", "front", "back")
 """Rules for the side of a mesh on which cloth belongs.
@@ -107,15 +108,23 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     return (
         row(
             "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, unit="N/m", ends=(1e-3, 1e9), soft=(1.0, 1e4),
-            doc="In-plane stiffness E h: Young's modulus of the sheet.",
+            doc="In-plane stiffness E h: Young's modulus of the sheet; along the warp where the weft's is given.",
+        ),
+        row(
+            "weftStretchStiffness", "Weft Stretch Stiffness", None, unit="N/m", ends=(1e-3, 1e9), soft=(1.0, 1e4),
+            doc="Stretch stiffness along the weft, where it is not the warp's.",
         ),
         row(
             "shearStiffness", "Shear Stiffness", None, unit="N/m", ends=(0.0, 1e9), soft=(0.1, 1e4),
-            doc="Shear stiffness G h; authoring it selects the triangle membrane.",
+            doc="Shear stiffness G h; without one it is 0.375 times the stretch stiffness.",
         ),
         row(
             "bendStiffness", "Bending Stiffness", _JERSEY.bend, unit="N m", ends=(0.0, 1e5), soft=(1e-7, 1e-2),
-            doc="Bending stiffness E h^3 / 12 (1 - nu^2).",
+            doc="Bending stiffness E h^3 / 12 (1 - nu^2); along the warp where the weft's is given.",
+        ),
+        row(
+            "weftBendStiffness", "Weft Bending Stiffness", None, unit="N m", ends=(0.0, 1e5), soft=(1e-7, 1e-2),
+            doc="Bending stiffness along the weft, where it is not the warp's; a quarter to four times that.",
         ),
         row(
             "density", "Density", _JERSEY.density, unit="kg/m^2", ends=(1e-4, 1e5), soft=(0.01, 2.0),
@@ -125,6 +134,20 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
             "thickness", "Thickness", _JERSEY.thickness, unit="m", ends=(1e-6, 1.0), soft=(1e-4, 1e-2),
             doc="Thickness of the cloth.",
         ),
+        Property(
+            schema, MATERIAL + "stretchLimit", "float", None, "%", 0.0, 1000.0,
+            "Strain along warp or weft from which the cloth is twenty times as stiff; without one it never is.",
+            "Stretch Limit", FABRIC, (1.0, 50.0),
+        ),
+    )  # fmt: skip
+
+
+def _ease(way: str) -> Property:
+    """Row of the length that cloth has along warp or weft and its rest shape does not show."""
+    doc = f"Length along the {way} that the cloth has and the rest shape does not show; folds come from it."
+    return Property(
+        GARMENT_API, f"physgraph:rest:{way}Ease", "float", 0.0, "%", -50.0, 100.0, doc,
+        f"{way.title()} Ease", REST, (0.0, 10.0),
     )  # fmt: skip
 
 
@@ -156,6 +179,8 @@ PROPERTIES: tuple[Property, ...] = (
         "How firmly the mean of the fine cloth follows the coarse animation." + SI,
         "Guide Stiffness", REFINEMENT, (10.0, 1e6),
     ),
+    _ease("warp"),
+    _ease("weft"),
     Property(
         GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, 10.0,
         "Distance kept from colliders." + SI, "Contact Offset", CONTACT, (1e-4, 3e-2),
@@ -194,6 +219,18 @@ PROPERTIES: tuple[Property, ...] = (
         "guideScale", "Guide Stiffness Scale", 1.0, most=1e4, soft=10.0,
         doc="Painted multiplier of the guide stiffness; vertex or constant.",
     ),
+    _scale("easeScale", "Ease Scale", 1.0, most=100.0, soft=10.0, doc="Painted multiplier of the ease; vertex or constant."),
+    Property(
+        GARMENT_API, "primvars:physgraph:gather", "float[]", 0.0, "%", -50.0, 400.0,
+        "Painted length that the cloth has more along the weft, as at a gathered seam; vertex or constant.",
+        "Gather", PAINTED, (0.0, 100.0), interpolation="vertex",
+    ),
+    Property(
+        GARMENT_API, "primvars:physgraph:grain", "float[]", 0.0, "degrees", -360.0, 360.0,
+        "Painted turn of the warp, counter-clockwise on the face, from v of the texture coordinates, or from "
+        "downwards where these are no pattern; vertex or constant.",
+        "Grain", PAINTED, (-90.0, 90.0), interpolation="vertex",
+    ),
     _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 where the fine cloth follows the coarse cloth exactly."),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
@@ -220,13 +257,18 @@ COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.sch
 
 
 def fabric_values(fabric: Fabric) -> dict[str, float]:
-    """Values of a fabric by the schema's short names, without a shear stiffness that it has not."""
+    """Values of a fabric by the schema's short names, without those that it has not."""
     values = {
         "stretchStiffness": fabric.stretch,
+        "weftStretchStiffness": fabric.weft_stretch,
         "shearStiffness": fabric.shear,
         "bendStiffness": fabric.bend,
+        "weftBendStiffness": fabric.weft_bend,
         "density": fabric.density,
         "thickness": fabric.thickness,
+        "stretchLimit": None if fabric.stretch_limit is None else 100.0 * fabric.stretch_limit,
+        "rest:warpEase": 100.0 * fabric.warp_ease or None,
+        "rest:weftEase": 100.0 * fabric.weft_ease or None,
     }
     return {name: value for name, value in values.items() if value is not None}
 

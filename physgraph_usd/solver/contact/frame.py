@@ -228,8 +228,9 @@ class FrameContact:
         return self.at(cage).crosses(cage.base.apply(self._coarse)) if known is None else known
 
     def at(self, level: Level) -> LevelContact:
-        """The view of one level, the same at each call."""
+        """The view of one level, the same at each call; what is near goes by its rest shape, without ease."""
         if level.index not in self._views:
+            level = self._levels[level.index]
             finest = level is self._levels[-1]
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)

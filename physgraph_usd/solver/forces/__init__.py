@@ -27,10 +27,11 @@ def elastic_terms(level: Level, fabrics: Sequence[Fabric], *, potential: str) ->
         fabrics: Fabric of each garment.
         potential: "continuum" or "paper".
     """
-    return (
-        *in_plane_terms(level, fabrics, potential=potential),
-        Bending(level, _each(level, [fabric.bend for fabric in fabrics]), potential=potential),
-    )
+    weft = None
+    if any(fabric.weft_bend is not None for fabric in fabrics):
+        weft = [fabric.bend if fabric.weft_bend is None else fabric.weft_bend for fabric in fabrics]
+    bending = Bending(level, _each(level, [fabric.bend for fabric in fabrics]), weft=weft, potential=potential)
+    return (*in_plane_terms(level, fabrics, potential=potential), bending)
 
 
 def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray, potential: str) -> tuple[Force, ...]:

@@ -9,6 +9,7 @@
 | theta | atan2(n1 x n2 . e, n1 . n2) | signed angle between the triangles' normals [rad] |
 | l0^2 / (A1 + A2) | ``level.hinge_shape`` | clamped on slivers |
 | c_h | ``level.hinge_factor`` | 1 on triangles; makes alternately split quads isotropic |
+| | `grain.bending_factor` | where warp and weft differ: D by the direction in which a hinge bends |
 | k_b | 3.46 D | the paper's constant [N m] for the same D on an equilateral lattice (docs/fabrics.md) |
 
 theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is continuous wherever a hinge turns: a hem
@@ -19,6 +20,7 @@ Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and W
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..grain import bending_factor
 from ..level import Level
 from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
@@ -97,16 +100,26 @@ class Bending:
 
     name = "bending"
 
-    def __init__(self, level: Level, rigidity: Float[Tensor, " garments"], *, potential: str = "continuum") -> None:
+    def __init__(
+        self,
+        level: Level,
+        rigidity: Float[Tensor, " garments"],
+        *,
+        weft: Sequence[float] | None = None,
+        potential: str = "continuum",
+    ) -> None:
         """Weigh the hinges of a level.
 
         Args:
             level: The level.
-            rigidity: Bending stiffness D of each garment [N m].
+            rigidity: Bending stiffness D of each garment [N m]; along the warp where the weft's differs.
+            weft: Bending stiffness along the weft [N m]; None where it is the warp's, or no grain is known.
             potential: "continuum" or "paper".
         """
         owner = level.hinge_garment.long()
         scaled = rigidity.to(level.rest)[owner] * level.bend_scale
+        if level.grain is not None and weft is not None:
+            scaled = scaled * bending_factor(level.grain.hinge, rigidity.tolist(), weft, owner)
         if potential == "paper":
             self.weight = PAPER_HINGE * scaled * level.hinge_area / garment_area(level)[owner]
         else:

@@ -1,19 +1,20 @@
-"""Membrane: triangles with a shear stiffness of their own.
+"""Membrane: triangles with warp, weft and a shear stiffness of their own.
 
-    E = sum_t A_t (1/2 C11 (e11^2 + e22^2) + C12 e11 e22 + 1/2 C66 (2 e12)^2),   e = (F^T F - 1) / 2
-
-    C11 = Y / (1 - nu^2),   C12 = nu C11,   C66 = G,   nu = 1/3
+    E = sum_t A_t (1/2 C11 e11^2 + 1/2 C22 e22^2 + C12 e11 e22 + 1/2 C66 (2 e12)^2 + limits),   e = (F^T F - 1) / 2
+    C11 = Y1 / (1 - nu^2),   C22 = Y2 / (1 - nu^2),   C12 = nu sqrt(C11 C22),   C66 = G,   nu = 1/3
+    limits = 1/2 S (C11 max(0, e11 - e)^2 + C22 max(0, e22 - e)^2),   S = `STIFFER`
 
 | symbol | here | meaning |
 |---|---|---|
-| Y | ``youngs`` | 2D Young's modulus along warp and weft [N/m] |
+| Y1, Y2 | ``youngs``, ``weft`` | 2D Young's modulus along warp and weft [N/m] |
 | G | ``shear`` | shear stiffness [N/m] |
-| F | columns ``f1``, ``f2`` | deformation gradient, 3 x 2, in the material's axes |
-| e | Green strain | St. Venant-Kirchhoff |
+| F | columns ``f1``, ``f2`` | deformation gradient, 3 x 2, along warp and weft |
+| e | Green strain | St. Venant-Kirchhoff, orthotropic; nu^2 is the product of the two Poisson's ratios |
+| e (limit) | ``limit`` | strain from which the cloth stiffens |
 | A_t | ``level.triangle_area`` | rest area [m^2] |
 
 With G = 0.375 Y the sheet is isotropic and equals the edge springs of an equilateral mesh for small strains. Otherwise
-the material's axes matter: `triangle_shape` defines them for a triangle. Painted stretch scales multiply all three
+the material's axes matter: `grain.axes` defines them for a triangle. Painted stretch scales multiply all
 constants. The paper has no membrane: with potential="paper" each triangle is weighted by 2 A_t / A, which is what the
 paper's springs are to the continuum's on an equilateral mesh.
 
@@ -43,6 +44,12 @@ wp.set_module_options({"enable_backward": False})
 
 POISSON = 1.0 / 3.0
 """Poisson's ratio between warp and weft; edge springs have the same."""
+ISOTROPIC = 0.375
+"""Shear stiffness of an isotropic sheet with that ratio, in Young's moduli."""
+STIFFER = 20.0
+"""How much stiffer cloth is beyond its limit: the tensile curves of the measured fabrics rise ten- to thirtyfold."""
+NO_LIMIT = 1e9
+"""A strain that nothing reaches."""
 
 
 @wp.kernel
@@ -54,15 +61,17 @@ def _membrane(
     b: wp.array(dtype=Any),
     c: wp.array(dtype=Any),
     d: wp.array(dtype=Any),
-    normal_stiffness: wp.array(dtype=Any),
+    warp_stiffness: wp.array(dtype=Any),
+    weft_stiffness: wp.array(dtype=Any),
+    coupling: wp.array(dtype=Any),
     shear_stiffness: wp.array(dtype=Any),
+    limit: wp.array(dtype=Any),
     energy: wp.array(dtype=Any),
     corner_force: wp.array(dtype=Any),
 ):
     t = first + wp.tid()
-    half = normal_stiffness.dtype(0.5)
-    one = normal_stiffness.dtype(1.0)
-    nu = one / normal_stiffness.dtype(3.0)
+    half = limit.dtype(0.5)
+    one = limit.dtype(1.0)
     x0 = x[corners[t][0]]
     side1 = x[corners[t][1]] - x0
     side2 = x[corners[t][2]] - x0
@@ -72,10 +81,17 @@ def _membrane(
     e22 = half * (wp.dot(f2, f2) - one)
     angle = wp.dot(f1, f2)
     # The stiffnesses carry the rest area: s is stress times area.
-    s11 = normal_stiffness[t] * (e11 + nu * e22)
-    s22 = normal_stiffness[t] * (e22 + nu * e11)
+    s11 = warp_stiffness[t] * e11 + coupling[t] * e22
+    s22 = weft_stiffness[t] * e22 + coupling[t] * e11
     s12 = shear_stiffness[t] * angle
-    energy[t] = half * (s11 * e11 + s22 * e22 + s12 * angle)
+    # Beyond its limit the cloth is stiffer.
+    over1 = wp.max(e11 - limit[t], limit.dtype(0.0))
+    over2 = wp.max(e22 - limit[t], limit.dtype(0.0))
+    more1 = limit.dtype(STIFFER) * warp_stiffness[t] * over1
+    more2 = limit.dtype(STIFFER) * weft_stiffness[t] * over2
+    energy[t] = half * (s11 * e11 + s22 * e22 + s12 * angle + more1 * over1 + more2 * over2)
+    s11 = s11 + more1
+    s22 = s22 + more2
     p1 = f1 * s11 + f2 * s12
     p2 = f1 * s12 + f2 * s22
     at1 = -(p1 * a[t] + p2 * b[t])
@@ -85,14 +101,15 @@ def _membrane(
     corner_force[3 * t + 2] = at2
 
 
-_KERNELS = element_overloads(_membrane, width=3, parameters=6)
+_KERNELS = element_overloads(_membrane, width=3, parameters=9)
 
 
 class Membrane:
     """Triangles of one level.
 
     Attributes:
-        normal_stiffness: C11 times the rest area [N m], shape (T,).
+        warp_stiffness, weft_stiffness: C11 and C22 times the rest area [N m], shape (T,).
+        coupling: C12 times the rest area [N m], shape (T,).
         shear_stiffness: C66 times the rest area [N m], shape (T,).
     """
 
@@ -104,14 +121,18 @@ class Membrane:
         youngs: Float[Tensor, " garments"],
         shear: Float[Tensor, " garments"],
         *,
+        weft: Float[Tensor, " garments"] | None = None,
+        limit: Float[Tensor, " garments"] | None = None,
         potential: str = "continuum",
     ) -> None:
         """Weigh the triangles of a level.
 
         Args:
             level: The level.
-            youngs: 2D Young's modulus of each garment [N/m]; zero for garments of edge springs.
+            youngs: 2D Young's modulus of each garment along the warp [N/m]; zero for garments of edge springs.
             shear: Shear stiffness of each garment [N/m]; zero for garments of edge springs.
+            weft: 2D Young's modulus of each garment along the weft [N/m]; None where it is the warp's.
+            limit: Strain from which each garment's cloth stiffens; None where none does.
             potential: "continuum" or "paper".
         """
         owner = level.triangle_garment.long()
@@ -120,11 +141,16 @@ class Membrane:
             weight = weight * 2.0 * level.triangle_area / garment_area(level)[owner]
         # A triangle without area has no rest shape to strain from.
         weight = weight * level.triangle_inverse.any(dim=1)
-        self.normal_stiffness = weight * youngs.to(level.rest)[owner] / (1.0 - POISSON**2)
+        self.warp_stiffness, self.weft_stiffness = (
+            weight * each.to(level.rest)[owner] / (1.0 - POISSON**2) for each in (youngs, youngs if weft is None else weft)
+        )
+        self.coupling = POISSON * (self.warp_stiffness * self.weft_stiffness).sqrt()
         self.shear_stiffness = weight * shear.to(level.rest)[owner]
+        limits = torch.full_like(youngs, NO_LIMIT) if limit is None else limit
         self._level = level
         parameters = [column.contiguous() for column in level.triangle_inverse.T]
-        parameters += [self.normal_stiffness, self.shear_stiffness]
+        parameters += [self.warp_stiffness, self.weft_stiffness, self.coupling, self.shear_stiffness]
+        parameters.append(limits.to(level.rest)[owner])
         self._elements = Elements(_KERNELS, level.triangles, parameters, level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
@@ -136,10 +162,10 @@ class Membrane:
         return self._elements.energy, self._level.triangle_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
-        """A third of the trace of each corner's block, geometric part only where it stiffens [N/m].
+        """A third of the trace of each corner's block, limits left out, geometric part only where it stiffens [N/m].
 
         With g = (g1, g2) the gradient of the corner's shape function and s the stress:
-        trace = C11 (g1^2 |f1|^2 + g2^2 |f2|^2) + 2 C12 g1 g2 f1.f2 + C66 |g1 f2 + g2 f1|^2 + 3 max(0, g.s g).
+        trace = C11 g1^2 |f1|^2 + C22 g2^2 |f2|^2 + 2 C12 g1 g2 f1.f2 + C66 |g1 f2 + g2 f1|^2 + 3 max(0, g.s g).
         """
         corners = x[self._level.triangles.long()]
         sides = corners[:, 1:] - corners[:, :1]
@@ -147,27 +173,33 @@ class Membrane:
         metric = torch.einsum("tmc,tnc->tmn", f, f)
         m11, m22, m12 = metric[:, 0, 0, None], metric[:, 1, 1, None], metric[:, 0, 1, None]
         e11, e22 = (m11 - 1.0) / 2.0, (m22 - 1.0) / 2.0
-        c11, c66 = self.normal_stiffness[:, None], self.shear_stiffness[:, None]
+        c11, c22, c12, c66 = (each[:, None] for each in self._stiffnesses)
         g1, g2 = self._shape_gradients().unbind(dim=2)
-        material = c11 * (g1**2 * m11 + g2**2 * m22 + 2.0 * POISSON * g1 * g2 * m12)
+        material = c11 * g1**2 * m11 + c22 * g2**2 * m22 + 2.0 * c12 * g1 * g2 * m12
         material = material + c66 * (g1**2 * m22 + g2**2 * m11 + 2.0 * g1 * g2 * m12)
-        geometric = c11 * (g1**2 * (e11 + POISSON * e22) + g2**2 * (e22 + POISSON * e11)) + 2.0 * c66 * m12 * g1 * g2
+        geometric = g1**2 * (c11 * e11 + c12 * e22) + g2**2 * (c22 * e22 + c12 * e11) + 2.0 * c66 * m12 * g1 * g2
         value = material / 3.0 + geometric.clamp_min(0.0)
         total = torch.zeros_like(self._level.spacing)
         return add_at(total, self._level.triangles.long().reshape(-1), value.reshape(-1))
 
     def rest_matrix(self) -> sp.csr_matrix:
-        """The trace of each block of the Hessian at rest: (C11 + C66) times the cotangent Laplacian [N/m].
+        """The trace of each block of the Hessian at rest [N/m]: C11 + C66 along the warp, C22 + C66 along the weft.
 
         On an equilateral mesh with G = 0.375 Y it equals the springs' matrix.
         """
         triangles = self._level.triangles.cpu().numpy()
         gradient = self._shape_gradients().double().cpu().numpy()
-        stiffness = (self.normal_stiffness + self.shear_stiffness).double().cpu().numpy()
-        blocks = stiffness[:, None, None] * np.einsum("tim,tjm->tij", gradient, gradient)
+        c11, c22, _, c66 = (each.double().cpu().numpy() for each in self._stiffnesses)
+        stiffness = np.stack([c11 + c66, c22 + c66], axis=1)
+        blocks = np.einsum("tm,tim,tjm->tij", stiffness, gradient, gradient)
         rows, columns = np.repeat(triangles, 3, axis=1).ravel(), np.tile(triangles, (1, 3)).ravel()
         count = self._level.vertex_count
         return sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
+
+    @property
+    def _stiffnesses(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """C11, C22, C12 and C66 times the rest area [N m], each of shape (T,)."""
+        return self.warp_stiffness, self.weft_stiffness, self.coupling, self.shear_stiffness
 
     def _shape_gradients(self) -> Float[Tensor, "triangles 3 2"]:
         """Gradients of the corners' shape functions in the material's axes [1/m]."""
@@ -176,7 +208,7 @@ class Membrane:
 
 
 def in_plane_terms(level: Level, fabrics: Sequence[Fabric], *, potential: str = "continuum") -> tuple[Force, ...]:
-    """Edge springs for the garments whose fabric has no shear stiffness, the membrane for the others.
+    """Edge springs for the garments whose fabric these can stand for, the membrane for the others.
 
     Args:
         level: The level.
@@ -186,12 +218,27 @@ def in_plane_terms(level: Level, fabrics: Sequence[Fabric], *, potential: str = 
     Returns:
         The terms that some garment needs; each is zero on the other's garments.
     """
-    sheared = torch.tensor([fabric.shear is not None for fabric in fabrics], dtype=torch.bool)
-    youngs = torch.tensor([fabric.stretch for fabric in fabrics], dtype=level.dtype)
-    shear = torch.tensor([fabric.shear or 0.0 for fabric in fabrics], dtype=level.dtype)
+    woven = torch.tensor([fabric.has_membrane for fabric in fabrics], dtype=torch.bool)
+
+    def each(values: Sequence[float]) -> Tensor:
+        return torch.tensor(values, dtype=level.dtype)
+
+    youngs = each([fabric.stretch for fabric in fabrics])
     terms: list[Force] = []
-    if not bool(sheared.all()) or not fabrics:
-        terms.append(Stretch(level, torch.where(sheared, 0.0, youngs), potential=potential))
-    if bool(sheared.any()):
-        terms.append(Membrane(level, torch.where(sheared, youngs, 0.0), shear, potential=potential))
+    if not bool(woven.all()) or not fabrics:
+        terms.append(Stretch(level, torch.where(woven, 0.0, youngs), potential=potential))
+    if bool(woven.any()):
+        weft = each([fabric.stretch if f is None else f for fabric in fabrics for f in (fabric.weft_stretch,)])
+        shear = each([shear_stiffness(fabric) for fabric in fabrics])
+        limit = each([NO_LIMIT if f.stretch_limit is None else f.stretch_limit for f in fabrics])
+        youngs, weft, shear = (torch.where(woven, value, 0.0) for value in (youngs, weft, shear))
+        terms.append(Membrane(level, youngs, shear, weft=weft, limit=limit, potential=potential))
     return tuple(terms)
+
+
+def shear_stiffness(fabric: Fabric) -> float:
+    """Shear stiffness of a fabric [N/m]; where it has none of its own, that of a sheet as stiff both ways."""
+    if fabric.shear is not None:
+        return fabric.shear
+    weft = fabric.stretch if fabric.weft_stretch is None else fabric.weft_stretch
+    return ISOTROPIC * (fabric.stretch * weft) ** 0.5

@@ -29,7 +29,7 @@ class LevelForces:
     """Terms that one level's cloth feels, frame after frame.
 
     Attributes:
-        level: The level.
+        level: The level, its rest lengths those of the cloth.
         terms: Stretch, membrane, bending and gravity.
         guide: The guide, without a target.
         metric: The factorised rest Hessian of all of them.
@@ -124,6 +124,7 @@ def build_forces(
         potential: "continuum" or "paper".
     """
     fabrics = [frame.fabric for frame in frames]
+    level = level.eased(fabrics)
     stiffness = np.concatenate([frame.guide * g.guide_scale for frame, g in zip(frames, garments, strict=True)])
     relative = 1.0
     if potential == "paper":

@@ -72,7 +72,7 @@ def telemetry_of(
         reports: Those of the levels' rounds.
         choice: How it was solved.
     """
-    finest = problem.group.levels[-1]
+    finest = problem.forces[-1].level
     base = finest.base.apply(problem.cage.points)
     return {
         "levels": [asdict(report) for report in reports],

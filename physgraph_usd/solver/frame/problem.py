@@ -214,7 +214,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
     known = None if settings.temporal == "off" else last
-    reset = {"frames": group.moving_frames, "finest": group.levels[-1], "reset": settings.reset}
+    reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved)
     contact = group.contact(frame, cage, target=start.detailed)
     before = None if last is None else last.about(cage.origin)

@@ -20,6 +20,7 @@ from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
 from ..times import garment_times, merge, transform_times, within
 from .cage import PointReader, read_cage
+from .grain import read_grain
 from .materials import Values, find_values
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
 from .rest import AUTO, Rest, checked, read_rest, rests_bent
@@ -121,6 +122,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     values = find_values(prim, request.units, request.overrides)
     self_contact, layer, level = _constants(prim, request)
     order = layer.at(None)
+    painted, cut = _painted(prim, points.count, notices, values=values)
+    grain, lies = read_grain(prim, cage.mesh, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
         path=str(prim.GetPath()),
         mesh=cage.mesh,
@@ -130,10 +133,11 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         bent_rest=bent,
         self_contact=bool(self_contact.at(None)),
         layer=None if order is None else round(order),
-        **_painted(prim, points.count, notices, values=values),
+        grain=grain,
+        **painted,
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
-    sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
+    sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source, "grain": lies}
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times),
         sources | values.sources | {"refine:level": level.source},
@@ -204,17 +208,23 @@ def _rest_on_stage(
     return read_rest(prim, edges, start, place=lambda local: place(local, bound), baked=request.bake.layer)
 
 
-def _painted(prim: Usd.Prim, count: int, notices: list[Notice], *, values: Values) -> dict[str, Any]:
-    """The painted arrays of a garment by field name, times the relative thickness; adds to the notices."""
+def _painted(
+    prim: Usd.Prim, count: int, notices: list[Notice], *, values: Values
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The painted arrays of a garment by field name, times the relative thickness, and the grain's by schema name.
+
+    Adds to the notices.
+    """
     names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
     names |= {"detail_scale": "detailScale", "pin": "pin"}
+    cut = ("easeScale", "gather", "grain")
     arrays = {}
-    for name, short in names.items():
+    for name, short in (names | dict(zip(cut, cut, strict=True))).items():
         arrays[name], odd = read_painted(prim, short, count)
         notices.extend(odd)
     arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
     arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
-    return arrays
+    return {name: arrays[name] for name in names}, {name: arrays[name] for name in cut}
 
 
 def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:

@@ -48,7 +48,12 @@ STIFFNESSES = {
     "bendStiffness": "physics:surfaceBendStiffness",
 }
 """Attributes of the proposal's material by the short names of ours."""
-_FRAME_VALUES = (*STIFFNESSES, "density", "thickness", "guide:stiffness", "refine:detail", "contact:offset")
+_WOVEN = ("weftStretchStiffness", "weftBendStiffness", "stretchLimit")
+_EASE = ("rest:warpEase", "rest:weftEase")
+_FRAME_VALUES = (
+    *(*STIFFNESSES, *_WOVEN, "density", "thickness", *_EASE),
+    *("guide:stiffness", "refine:detail", "contact:offset"),
+)
 DENSITY = "physics:density"
 YOUNGS = "physics:youngsModulus"
 POISSONS = "physics:poissonsRatio"
@@ -95,7 +100,15 @@ class Values:
             self.number(name, time) for name in ("stretchStiffness", "bendStiffness", "thickness", "density")
         )
         density *= thickness if self.volumetric else 1.0
-        return Fabric(stretch, bend, density, thickness, self.found["shearStiffness"].at(time))
+        shear, weft_stretch, weft_bend, limit = (self.found[name].at(time) for name in ("shearStiffness", *_WOVEN))
+        warp_ease, weft_ease = (self.number(name, time) / 100.0 for name in _EASE)
+        limit = None if limit is None else limit / 100.0
+        return Fabric(
+            *(stretch, bend, density, thickness, shear, weft_stretch, weft_bend),
+            stretch_limit=limit,
+            warp_ease=warp_ease,
+            weft_ease=weft_ease,
+        )
 
     def thickness_scale(self, name: str) -> np.ndarray | float:
         """Factor of a stiffness at each point where it follows the thickness there, shape (V,), else 1.

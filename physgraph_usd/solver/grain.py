@@ -1,0 +1,125 @@
+"""The grain of a garment's cloth: which way its warp lies, and where it is longer than the rest shape shows.
+
+Cloth has two directions of its own: the warp, along which a weaver's threads are tight, and the weft, a quarter turn
+from it in the surface. Stiffnesses and lengths may differ between them. `Ease` is length that the cloth has and the
+rest shape does not show, as cutters give it to a garment; gathers are ease along a seam. Folds come from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from .mesh.topology import find_edges
+
+MOST_RATIO = 4.0
+"""Most that one bending stiffness counts as of the other: at five times, hinges of one direction would have no weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grain:
+    """A garment's grain.
+
+    Attributes:
+        warp: Unit direction of the warp on each face of the cage, in the rest shape, shape (F, 3), float64.
+        ease_scale: Painted multiplier of the ease, shape (V,).
+        gather: Painted length more along the weft, as a fraction, shape (V,).
+    """
+
+    warp: np.ndarray
+    ease_scale: np.ndarray
+    gather: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LevelGrain:
+    """The grain of one level's elements; tensors on its device.
+
+    Attributes:
+        edge: Squared cosines of each edge with warp and weft, mean over its triangles, shape (E, 2).
+        hinge: cos 2a of each hinge, a from the warp to the direction in which it bends, shape (H,).
+        edge_scale, triangle_scale: Painted multiplier of the ease, shapes (E,) and (T,).
+        edge_gather, triangle_gather: Painted length more along the weft, as a fraction, shapes (E,) and (T,).
+    """
+
+    edge: Float[Tensor, "edges 2"]
+    hinge: Float[Tensor, " hinges"]
+    edge_scale: Float[Tensor, " edges"]
+    triangle_scale: Float[Tensor, " triangles"]
+    edge_gather: Float[Tensor, " edges"]
+    triangle_gather: Float[Tensor, " triangles"]
+
+    @property
+    def gathers(self) -> bool:
+        """Whether anything is gathered."""
+        return bool((self.triangle_gather != 0).any())
+
+
+def axes(rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit warp and weft of each triangle in its plane.
+
+    Where no warp is known, or it stands across the triangle, the rest frame's axis that lies most nearly in the plane
+    stands for it: a membrane of equal stiffness both ways is the same after a quarter turn, so wherever the cloth is
+    tangent to an axis, neighbours agree whichever they take.
+
+    Args:
+        rest: Rest positions [m], shape (V, 3), float64.
+        triangles: Shape (T, 3).
+        warp: Direction on each triangle, shape (T, 3); 0 where none is known.
+    """
+    corners = rest[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    nearest = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    inside = [each - normal * np.einsum("tc,tc->t", each, normal)[:, None] for each in (warp, nearest)]
+    lengths = [np.linalg.norm(each, axis=1, keepdims=True) for each in inside]
+    chosen = np.where(lengths[0] > 1e-3, inside[0], inside[1])
+    along = chosen / np.where(lengths[0] > 1e-3, lengths[0], lengths[1])
+    return along, np.cross(normal, along)
+
+
+def edge_cosines(rest: np.ndarray, triangles: np.ndarray, edges: np.ndarray, *, warp: np.ndarray) -> np.ndarray:
+    """Squared cosines of each edge with warp and weft, mean over its triangles, shape (E, 2); see `axes`."""
+    both = axes(rest, triangles, warp)
+    total, count = np.zeros((len(edges), 2)), np.zeros(len(edges))
+    for corner in range(3):
+        ends = triangles[:, [corner, (corner + 1) % 3]]
+        span = rest[ends[:, 1]] - rest[ends[:, 0]]
+        square = np.maximum((span**2).sum(axis=1), np.finfo(float).tiny)
+        which = find_edges(edges, ends)
+        for axis in range(2):
+            np.add.at(total[:, axis], which, np.einsum("tc,tc->t", span, both[axis]) ** 2 / square)
+        np.add.at(count, which, 1.0)
+    return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], 0.5)
+
+
+def longer(cosines: np.ndarray | Tensor, warp: np.ndarray | Tensor, weft: np.ndarray | Tensor):  # noqa: ANN201
+    """How many times as long as at rest edges are whose cloth is longer by fractions along warp and weft.
+
+    Args:
+        cosines: Squared cosines with warp and weft, shape (E, 2).
+        warp: Length more along the warp, as a fraction, shape (E,).
+        weft: Along the weft, shape (E,).
+    """
+    return (cosines[:, 0] * (1.0 + warp) ** 2 + cosines[:, 1] * (1.0 + weft) ** 2) ** 0.5
+
+
+def bending_factor(hinge: Tensor, warp: Sequence[float], weft: Sequence[float], owner: Tensor) -> Tensor:
+    """Weight of each hinge over its garment's warp stiffness D1, so that a sheet bends with D1 and D2.
+
+    Hinges in all directions a, weighted w(a), give a sheet bent along the warp 8/3 mean(w cos^4 a). With
+    w = (D1 + D2) / 2 + 3/4 (D1 - D2) cos 2a that is D1, and D2 along the weft.
+
+    Args:
+        hinge: cos 2a of each hinge, shape (H,).
+        warp: Bending stiffness D1 of each garment [N m].
+        weft: D2 of each garment [N m].
+        owner: Garment of each hinge, shape (H,).
+    """
+    ratio = hinge.new_tensor([b / a if a > 0 else 1.0 for a, b in zip(warp, weft, strict=True)])
+    ratio = ratio.clamp(1.0 / MOST_RATIO, MOST_RATIO)[owner.long()]
+    return (1.0 + ratio) / 2.0 + 0.75 * (1.0 - ratio) * hinge

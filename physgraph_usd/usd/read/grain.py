@@ -1,0 +1,120 @@
+"""Which way a garment's warp lies: along v of its texture coordinates where these are a pattern, else downwards.
+
+Texture coordinates are a pattern where they keep the cloth's shape: garments from a cutting program have them, and most
+unwraps come near. Where they do not, or there are none, the warp runs the way a garment is cut: down the cloth of the
+rest shape. ``primvars:physgraph:grain`` turns it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ...solver.grain import Grain
+from ...solver.mesh.topology import PolygonMesh
+
+SKEWED = 1.5
+"""Ratio of the two stretches of a face's texture coordinates from which these do not keep its shape."""
+PATTERN = 0.8
+"""Part of the area on which they must, to be a pattern."""
+_NAMES = ("st", "uv", "UVMap", "map1")
+_FLAT = 1e-12
+
+
+def read_grain(
+    prim: Usd.Prim,
+    mesh: PolygonMesh,
+    rest: np.ndarray,
+    *,
+    kept: np.ndarray,
+    up: np.ndarray,
+    painted: dict[str, np.ndarray],
+) -> tuple[Grain, str]:
+    """The grain of a garment, and where it comes from, in words.
+
+    Args:
+        prim: Mesh prim.
+        mesh: Its kept faces.
+        rest: Rest positions [m], shape (V, 3).
+        kept: Numbers of these among the authored faces, shape (F,).
+        up: The stage's upward direction, shape (3,).
+        painted: Values of ``easeScale``, ``gather`` [%] and ``grain`` [degrees] at each point, each of shape (V,).
+    """
+    coordinates = _texture_coordinates(prim, mesh, kept)
+    found = None if coordinates is None else _along_v(mesh, rest, coordinates[1])
+    source = "the rest shape, downwards"
+    if coordinates is not None and found is not None:
+        source = f"v of primvars:{coordinates[0]}"
+    normal = face_normals(mesh, rest)
+    warp = _down(normal, up) if found is None else found
+    turn = np.radians(np.add.reduceat(painted["grain"][mesh.indices], mesh.starts[: mesh.face_count]) / mesh.counts)
+    warp = np.cos(turn)[:, None] * warp + np.sin(turn)[:, None] * np.cross(normal, warp)
+    if turn.any():
+        source += ", turned by primvars:physgraph:grain"
+    return Grain(warp, painted["easeScale"], painted["gather"] / 100.0), source
+
+
+def face_normals(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
+    """Unit normal of each face by its area vector, shape (F, 3); 0 where it has none."""
+    here, after = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
+    area = np.add.reduceat(np.cross(here, after), mesh.starts[: mesh.face_count])
+    return area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), np.finfo(float).tiny)
+
+
+def _down(normal: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Direction on each face that leads down most steeply, shape (F, 3); 0 where a face lies level."""
+    down = normal * (normal @ up)[:, None] - up
+    length = np.linalg.norm(down, axis=1, keepdims=True)
+    return np.where(length > 1e-3, down / np.maximum(length, 1e-3), 0.0)
+
+
+def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) -> tuple[str, np.ndarray] | None:
+    """Name and value at each corner of the kept faces, shape (C, 2), of the first texture coordinates that fit."""
+    api = UsdGeom.PrimvarsAPI(prim)
+    every = [each.GetPrimvarName() for each in api.GetPrimvars() if "texCoord2" in str(each.GetTypeName())]
+    for name in dict.fromkeys([each for each in _NAMES if each in every] + every):
+        primvar = api.GetPrimvar(name)
+        flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
+        values = np.zeros((0, 2)) if flat is None else np.asarray(flat, np.float64)
+        if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
+            corners = _kept_corners(prim, kept)
+            if len(corners) == len(mesh.indices) and corners.max(initial=-1) < len(values):
+                return name, values[corners]
+        elif len(values) == mesh.vertex_count and primvar.GetInterpolation() != UsdGeom.Tokens.uniform:
+            return name, values[mesh.indices]
+    return None
+
+
+def _kept_corners(prim: Usd.Prim, kept: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Numbers of the kept faces' corners among all of the authored faces'."""
+    counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()), np.int64)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    return np.concatenate([np.arange(starts[face], starts[face + 1]) for face in kept]) if len(kept) else starts[:0]
+
+
+def _along_v(mesh: PolygonMesh, rest: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+    """Direction of v on each face, shape (F, 3), or None where the coordinates are no pattern.
+
+    Over each face positions are fitted by p = u P_u + v P_v; the area weighs which faces keep their shape.
+    """
+    starts, face = mesh.starts[: mesh.face_count], mesh.corner_face
+    def centred(values: np.ndarray) -> np.ndarray:
+        return values - (np.add.reduceat(values, starts) / mesh.counts[:, None])[face]
+
+    point, uv = centred(rest[mesh.indices]), centred(corners)
+    uu, uw, ww = (np.add.reduceat(uv[:, i] * uv[:, j], starts) for i, j in ((0, 0), (0, 1), (1, 1)))
+    pu, pv = (np.add.reduceat(uv[:, k, None] * point, starts) for k in (0, 1))
+    determinant = uu * ww - uw**2
+    sound = determinant > _FLAT * (uu + ww) ** 2
+    inverse = np.where(sound, 1.0 / np.where(sound, determinant, 1.0), 0.0)[:, None]
+    along_u, along_v = inverse * (ww[:, None] * pu - uw[:, None] * pv), inverse * (uu[:, None] * pv - uw[:, None] * pu)
+    a, b, c = (np.einsum("fc,fc->f", x, y) for x, y in ((along_u, along_u), (along_u, along_v), (along_v, along_v)))
+    root = np.sqrt(np.maximum((a - c) ** 2 + 4.0 * b**2, 0.0))
+    low, high = np.maximum(a + c - root, 0.0), a + c + root
+    area = np.linalg.norm(np.add.reduceat(np.cross(rest[mesh.indices], rest[mesh.indices[mesh.next_corner]]), starts), axis=1)
+    keeps = sound & (high < SKEWED**2 * low)
+    if area[keeps].sum() < PATTERN * area.sum():
+        return None
+    return along_v / np.maximum(np.linalg.norm(along_v, axis=1, keepdims=True), np.finfo(float).tiny)
