@@ -88,7 +88,7 @@ def bending_energy(
 
 
 def membrane_energy(rest: Tensor, triangles: np.ndarray, youngs: float, shear: float, *, paper: bool = False) -> Energy:
-    """St. Venant-Kirchhoff triangles; strains as tensors in space, axes by projection."""
+    """Triangles that stretch along two axes and shear by the angle between them; axes by projection."""
     areas = area(rest, triangles)
     a, b, c = (rest[triangles[:, n]] for n in range(3))
     normal = torch.linalg.cross(b - a, c - a)
@@ -101,15 +101,18 @@ def membrane_energy(rest: Tensor, triangles: np.ndarray, youngs: float, shear: f
     frame = torch.stack([axis, other, normal], dim=2)
     inverse = torch.linalg.inv(torch.stack([b - a, c - a, normal], dim=2))
     c11 = youngs / (1 - 1 / 9)
-    weight = areas * (2 * areas / areas.sum() if paper else 1.0)
+    longest = torch.stack([(a - b).norm(dim=1), (b - c).norm(dim=1), (c - a).norm(dim=1)]).amax(dim=0)
+    sound = (4 * areas / longest**2).clamp_max(1.0)
+    weight = areas * sound * (2 * areas / areas.sum() if paper else 1.0)
 
     def energy(x: Tensor) -> Tensor:
         p, q, r = (x[triangles[:, n]] for n in range(3))
-        gradient = torch.stack([q - p, r - p, torch.zeros_like(p)], dim=2) @ inverse
-        green = 0.5 * (gradient.transpose(1, 2) @ gradient)
-        e = frame.transpose(1, 2) @ green @ frame
-        e11, e22, e12 = e[:, 0, 0] - 0.5, e[:, 1, 1] - 0.5, e[:, 0, 1]
-        return (weight * (c11 / 2 * (e11**2 + e22**2 + 2 / 3 * e11 * e22) + shear / 2 * (2 * e12) ** 2)).sum()
+        gradient = torch.stack([q - p, r - p, torch.zeros_like(p)], dim=2) @ inverse @ frame
+        f1, f2 = gradient[:, :, 0], gradient[:, :, 1]
+        e1, e2 = f1.norm(dim=1) - 1, f2.norm(dim=1) - 1
+        n1, n2 = ((f**2).sum(dim=1) + 0.04 for f in (f1, f2))
+        sine = (1 + 0.04) * (f1 * f2).sum(dim=1) / (n1 * n2).sqrt()
+        return (weight * (c11 / 2 * (e1**2 + e2**2 + 2 / 3 * e1 * e2) + shear / 2 * sine**2)).sum()
 
     return energy
 

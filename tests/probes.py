@@ -17,10 +17,10 @@ from scipy.optimize import brentq
 from sheets import level_of_kind
 
 from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces import elastic_terms
 from physgraph_usd.solver.forces.base import Force, ForceModule
 from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.gravity import Gravity
-from physgraph_usd.solver.forces.membrane import in_plane_terms
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.newton import Newton
@@ -215,16 +215,18 @@ def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int 
 def hang(level: Level, start: np.ndarray, fabric: Fabric) -> np.ndarray:
     """Rest positions of a pinned sheet under its own weight, z up."""
     weight = Gravity(level, torch.tensor([fabric.density]), np.array([0.0, 0.0, -G]))
-    forces = (*in_plane_terms(level, [fabric]), Bending(level, torch.tensor([fabric.bend])), weight)
+    forces = (*elastic_terms(level, [fabric], potential="continuum"), weight)
     return relax(level, forces, torch.as_tensor(start)).numpy()
 
 
-def cantilever(kind: str, length: float, fabric: Fabric, *, edges: int = 24) -> float:
+def cantilever(
+    kind: str, length: float, fabric: Fabric, *, edges: int = 24, warp: np.ndarray | None = None
+) -> float:
     """Angle of the chord below the horizontal [rad] of a strip clamped where x <= 0, free at x = length."""
     edge = length / edges
     width = 2 * edge * round(0.35 * edges / 2)
     level = level_of_kind(
-        kind, (length + 2 * edge, width, edge), start=-2 * edge, pinned=lambda p: p[:, 0] < 1e-3 * edge
+        kind, (length + 2 * edge, width, edge), start=-2 * edge, pinned=lambda p: p[:, 0] < 1e-3 * edge, warp=warp
     )
     points = level.rest.numpy()
     start, out = points.copy(), np.maximum(points[:, 0], 0.0)

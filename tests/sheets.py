@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from meshes import grid
 from scipy.spatial import Delaunay
 
+from physgraph_usd.solver.grain import Grain
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.subdivide import subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -38,11 +40,16 @@ def level_of(
     *,
     dtype: torch.dtype = torch.float64,
     bent: bool = False,
+    warp: np.ndarray | None = None,
     **painted: np.ndarray,
 ) -> Level:
-    """The cage level of one garment of triangles."""
+    """The cage level of one garment of triangles; ``warp`` is the direction of its warp."""
     mesh = triangle_mesh(np.asarray(triangles), len(rest))
-    return build_levels([garment_of(mesh, np.asarray(rest), bent=bent, **painted)], [()], dtype=dtype)[0]
+    garment = garment_of(mesh, np.asarray(rest), bent=bent, **painted)
+    if warp is not None:
+        one, along = np.ones(len(rest)), np.broadcast_to(warp, (mesh.face_count, 3))
+        garment = replace(garment, grain=Grain(along, one, 0.0 * one))
+    return build_levels([garment], [()], dtype=dtype)[0]
 
 
 def equilateral(length: float, width: float, edge: float) -> Sheet:
@@ -118,6 +125,7 @@ def level_of_kind(
     *,
     start: float = 0.0,
     pinned: Callable[[np.ndarray], np.ndarray] | None = None,
+    warp: np.ndarray | None = None,
 ) -> Level:
     """A sheet of a mesh kind in float64; quads are refined, so that the level knows them for quads.
 
@@ -126,12 +134,14 @@ def level_of_kind(
         size: Length, width and edge length.
         start: Where x begins.
         pinned: Tells from points which are pinned.
+        warp: Direction of the warp, for triangles.
     """
     shift = np.array([start, 0.0, 0.0])
     if kind != "quads, alternating":
         points, triangles = KINDS[kind](*size)
         points = points + shift
-        return level_of(points, triangles, pin=np.zeros(len(points)) if pinned is None else pinned(points) * 1.0)
+        pin = np.zeros(len(points)) if pinned is None else pinned(points) * 1.0
+        return level_of(points, triangles, pin=pin, warp=warp)
     cage, points = quad_cage(*size)
     points = points + shift
     garment = garment_of(cage, points, pin=np.zeros(len(points)) if pinned is None else pinned(points) * 1.0)

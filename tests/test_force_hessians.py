@@ -91,7 +91,7 @@ def test_spring_diagonal_is_the_trace_of_the_positive_part(length: float):
 
 @pytest.mark.parametrize("name", ["membrane", "bending"])
 def test_diagonal_away_from_rest(name: str):
-    """The stretched membrane's whole block; bending's block without the angle's own curvature."""
+    """The stretched membrane's block without the curvature of its sine; bending's without that of its angle."""
     points, triangles = sheet()
     level = level_of(points, triangles)
     force = force_of(name, level)
@@ -106,7 +106,7 @@ def test_diagonal_away_from_rest(name: str):
         for hinge, rows, weight in zip(level.hinges.tolist(), jacobian.numpy(), force.weight.tolist(), strict=True):
             for vertex, row in zip(hinge, rows, strict=True):
                 expected[vertex] += weight * row @ row / 3
-    assert np.allclose(force.diagonal(x).numpy(), expected, rtol=1e-5)
+    assert np.allclose(force.diagonal(x).numpy(), expected, rtol=5e-3 if name == "membrane" else 1e-5)
 
 
 def test_hinge_jacobian_is_the_derivative_of_the_angle():

@@ -1,25 +1,30 @@
 """Membrane: triangles with warp, weft and a shear stiffness of their own.
 
-    E = sum_t A_t (1/2 C11 e11^2 + 1/2 C22 e22^2 + C12 e11 e22 + 1/2 C66 (2 e12)^2 + limits),   e = (F^T F - 1) / 2
-    C11 = Y1 / (1 - nu^2),   C22 = Y2 / (1 - nu^2),   C12 = nu sqrt(C11 C22),   C66 = G,   nu = 1/3
-    limits = 1/2 S (C11 max(0, e11 - e)^2 + C22 max(0, e22 - e)^2),   S = `STIFFER`
+    E = sum_t A_t (1/2 C11 e1^2 + 1/2 C22 e2^2 + C12 e1 e2 + 1/2 G s^2 + limits),   e_i = |f_i| - 1
+    C11 = Y1 / (1 - nu^2),   C22 = Y2 / (1 - nu^2),   C12 = nu sqrt(C11 C22),   nu = 1/3
+    s = (1 + d^2) f1 . f2 / (n1 n2),   n_i^2 = |f_i|^2 + d^2,   d = `ROUNDING`
+    limits = 1/2 S (C11 max(0, e1 - e)^2 + C22 max(0, e2 - e)^2),   S = `STIFFER`
 
 | symbol | here | meaning |
 |---|---|---|
 | Y1, Y2 | ``youngs``, ``weft`` | 2D Young's modulus along warp and weft [N/m] |
 | G | ``shear`` | shear stiffness [N/m] |
-| F | columns ``f1``, ``f2`` | deformation gradient, 3 x 2, along warp and weft |
-| e | Green strain | St. Venant-Kirchhoff, orthotropic; nu^2 is the product of the two Poisson's ratios |
-| e (limit) | ``limit`` | strain from which the cloth stiffens |
+| f1, f2 | columns of F | where the deformation takes unit vectors along warp and weft |
+| s | | sine of the angle by which they are sheared, rounded off where one vanishes |
+| e | ``limit`` | strain from which the cloth stiffens |
 | A_t | ``level.triangle_area`` | rest area [m^2] |
+
+Warp and weft stretch as springs do, and shear counts by angle, after Baraff and Witkin, "Large Steps in Cloth
+Simulation", 1998; the coupling makes the sheet orthotropic, nu^2 the product of its two Poisson's ratios. For small
+strains that is linear elasticity. For large ones Green's strain would grow with the square of a length, and cages have
+triangles that are stretched threefold: there the cloth would be stiffer than its fabric by as much.
 
 With G = 0.375 Y the sheet is isotropic and equals the edge springs of an equilateral mesh for small strains. Otherwise
 the material's axes matter: `grain.axes` defines them for a triangle. Painted stretch scales multiply all
 constants. The paper has no membrane: with potential="paper" each triangle is weighted by 2 A_t / A, which is what the
 paper's springs are to the continuum's on an equilateral mesh.
 
-St. Venant-Kirchhoff softens under compression and has no barrier against inversion. Cloth buckles long before
-either matters, and a flat collapsed triangle still has the energy C11 / 8 per area and axis to gain from unfolding.
+There is no barrier against inversion: cloth buckles long before it matters.
 """
 
 from __future__ import annotations
@@ -48,6 +53,10 @@ ISOTROPIC = 0.375
 """Shear stiffness of an isotropic sheet with that ratio, in Young's moduli."""
 STIFFER = 20.0
 """How much stiffer cloth is beyond its limit: the tensile curves of the measured fabrics rise ten- to thirtyfold."""
+STIFFEST = 1.0
+"""Most that `sliver_weight` lets A |g|^2 be: a right-angled triangle with equal sides has it."""
+ROUNDING = 0.2
+"""Length of warp or weft, of 1 at rest, under which the direction of shear fades."""
 NO_LIMIT = 1e9
 """A strain that nothing reaches."""
 
@@ -77,23 +86,32 @@ def _membrane(
     side2 = x[corners[t][2]] - x0
     f1 = side1 * a[t] + side2 * c[t]
     f2 = side1 * b[t] + side2 * d[t]
-    e11 = half * (wp.dot(f1, f1) - one)
-    e22 = half * (wp.dot(f2, f2) - one)
-    angle = wp.dot(f1, f2)
+    l1 = wp.length(f1)
+    l2 = wp.length(f2)
+    e1 = l1 - one
+    e2 = l2 - one
     # The stiffnesses carry the rest area: s is stress times area.
-    s11 = warp_stiffness[t] * e11 + coupling[t] * e22
-    s22 = weft_stiffness[t] * e22 + coupling[t] * e11
-    s12 = shear_stiffness[t] * angle
+    s1 = warp_stiffness[t] * e1 + coupling[t] * e2
+    s2 = weft_stiffness[t] * e2 + coupling[t] * e1
     # Beyond its limit the cloth is stiffer.
-    over1 = wp.max(e11 - limit[t], limit.dtype(0.0))
-    over2 = wp.max(e22 - limit[t], limit.dtype(0.0))
+    over1 = wp.max(e1 - limit[t], limit.dtype(0.0))
+    over2 = wp.max(e2 - limit[t], limit.dtype(0.0))
     more1 = limit.dtype(STIFFER) * warp_stiffness[t] * over1
     more2 = limit.dtype(STIFFER) * weft_stiffness[t] * over2
-    energy[t] = half * (s11 * e11 + s22 * e22 + s12 * angle + more1 * over1 + more2 * over2)
-    s11 = s11 + more1
-    s22 = s22 + more2
-    p1 = f1 * s11 + f2 * s12
-    p2 = f1 * s12 + f2 * s22
+    # Shear by the angle between them; directions fade where one vanishes.
+    rounding = limit.dtype(ROUNDING) * limit.dtype(ROUNDING)
+    inverse1 = one / wp.sqrt(l1 * l1 + rounding)
+    inverse2 = one / wp.sqrt(l2 * l2 + rounding)
+    u1 = f1 * inverse1
+    u2 = f2 * inverse2
+    sine = wp.dot(u1, u2)
+    s12 = shear_stiffness[t] * (one + rounding) * (one + rounding) * sine
+    energy[t] = half * (s1 * e1 + s2 * e2 + s12 * sine + more1 * over1 + more2 * over2)
+    tiny = limit.dtype(1.0e-6)
+    turn1 = s12 * inverse1
+    turn2 = s12 * inverse2
+    p1 = f1 * ((s1 + more1) / wp.max(l1, tiny) - sine * inverse1 * turn1) + u2 * turn1
+    p2 = f2 * ((s2 + more2) / wp.max(l2, tiny) - sine * inverse2 * turn2) + u1 * turn2
     at1 = -(p1 * a[t] + p2 * b[t])
     at2 = -(p1 * c[t] + p2 * d[t])
     corner_force[3 * t] = -(at1 + at2)
@@ -139,8 +157,8 @@ class Membrane:
         weight = level.triangle_scale * level.triangle_area
         if potential == "paper":
             weight = weight * 2.0 * level.triangle_area / garment_area(level)[owner]
-        # A triangle without area has no rest shape to strain from.
-        weight = weight * level.triangle_inverse.any(dim=1)
+        # A triangle without area has no rest shape to strain from, and what strains a sliver is its mesh, not its cloth.
+        weight = weight * level.triangle_inverse.any(dim=1) * sliver_weight(level)
         self.warp_stiffness, self.weft_stiffness = (
             weight * each.to(level.rest)[owner] / (1.0 - POISSON**2) for each in (youngs, youngs if weft is None else weft)
         )
@@ -164,21 +182,27 @@ class Membrane:
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each corner's block, limits left out, geometric part only where it stiffens [N/m].
 
-        With g = (g1, g2) the gradient of the corner's shape function and s the stress:
-        trace = C11 g1^2 |f1|^2 + C22 g2^2 |f2|^2 + 2 C12 g1 g2 f1.f2 + C66 |g1 f2 + g2 f1|^2 + 3 max(0, g.s g).
+        With g = (g1, g2) the gradient of the corner's shape function, d_i = f_i / |f_i|, r_i the derivative of the sine
+        by f_i and s_i the stress along f_i: trace = C11 g1^2 + C22 g2^2 + 2 C12 g1 g2 d1.d2 + G |g1 r1 + g2 r2|^2
+        + 2 sum_i max(0, s_i / |f_i|) g_i^2.
         """
         corners = x[self._level.triangles.long()]
         sides = corners[:, 1:] - corners[:, :1]
         f = torch.einsum("tsc,tsm->tmc", sides, self._level.triangle_inverse.reshape(-1, 2, 2))
-        metric = torch.einsum("tmc,tnc->tmn", f, f)
-        m11, m22, m12 = metric[:, 0, 0, None], metric[:, 1, 1, None], metric[:, 0, 1, None]
-        e11, e22 = (m11 - 1.0) / 2.0, (m22 - 1.0) / 2.0
+        length = f.norm(dim=2).clamp_min(1e-6)
+        reach = (length**2 + ROUNDING**2).sqrt().unsqueeze(2)
+        u = f / reach
+        sine = (u[:, 0] * u[:, 1]).sum(dim=1)
+        turn = (1.0 + ROUNDING**2) * (u.flip(1) - u * sine[:, None, None]) / reach
         c11, c22, c12, c66 = (each[:, None] for each in self._stiffnesses)
-        g1, g2 = self._shape_gradients().unbind(dim=2)
-        material = c11 * g1**2 * m11 + c22 * g2**2 * m22 + 2.0 * c12 * g1 * g2 * m12
-        material = material + c66 * (g1**2 * m22 + g2**2 * m11 + 2.0 * g1 * g2 * m12)
-        geometric = g1**2 * (c11 * e11 + c12 * e22) + g2**2 * (c22 * e22 + c12 * e11) + 2.0 * c66 * m12 * g1 * g2
-        value = material / 3.0 + geometric.clamp_min(0.0)
+        cosine = (f[:, 0] * f[:, 1]).sum(dim=1, keepdim=True) / length.prod(dim=1, keepdim=True)
+        g = shape_gradients(self._level)
+        g1, g2 = g.unbind(dim=2)
+        value = c11 * g1**2 + c22 * g2**2 + 2.0 * c12 * g1 * g2 * cosine
+        value = value + c66 * torch.einsum("tim,tmc->tic", g, turn).square().sum(dim=2)
+        e1, e2 = (length - 1.0).split(1, dim=1)
+        stress = torch.cat([c11 * e1 + c12 * e2, c22 * e2 + c12 * e1], dim=1)
+        value = (value + 2.0 * (g**2 * (stress / length).clamp_min(0.0).unsqueeze(1)).sum(dim=2)) / 3.0
         total = torch.zeros_like(self._level.spacing)
         return add_at(total, self._level.triangles.long().reshape(-1), value.reshape(-1))
 
@@ -188,7 +212,7 @@ class Membrane:
         On an equilateral mesh with G = 0.375 Y it equals the springs' matrix.
         """
         triangles = self._level.triangles.cpu().numpy()
-        gradient = self._shape_gradients().double().cpu().numpy()
+        gradient = shape_gradients(self._level).double().cpu().numpy()
         c11, c22, _, c66 = (each.double().cpu().numpy() for each in self._stiffnesses)
         stiffness = np.stack([c11 + c66, c22 + c66], axis=1)
         blocks = np.einsum("tm,tim,tjm->tij", stiffness, gradient, gradient)
@@ -201,10 +225,21 @@ class Membrane:
         """C11, C22, C12 and C66 times the rest area [N m], each of shape (T,)."""
         return self.warp_stiffness, self.weft_stiffness, self.coupling, self.shear_stiffness
 
-    def _shape_gradients(self) -> Float[Tensor, "triangles 3 2"]:
-        """Gradients of the corners' shape functions in the material's axes [1/m]."""
-        others = self._level.triangle_inverse.reshape(-1, 2, 2)
-        return torch.cat([-others.sum(dim=1, keepdim=True), others], dim=1)
+
+def sliver_weight(level: Level) -> Float[Tensor, " triangles"]:
+    """1 for sound triangles; what makes a sliver as stiff for a corner's move as the stiffest sound one, shape (T,).
+
+    A corner's move strains a triangle by the gradient g of its shape function, so it feels A |g|^2 stiffnesses: 0.58 of
+    an equilateral triangle's, without bound of a sliver's.
+    """
+    gradient = shape_gradients(level).square().sum(dim=2).amax(dim=1)
+    return (STIFFEST / (level.triangle_area * gradient).clamp_min(1e-12)).clamp_max(1.0)
+
+
+def shape_gradients(level: Level) -> Float[Tensor, "triangles 3 2"]:
+    """Gradients of the corners' shape functions along warp and weft [1/m]."""
+    others = level.triangle_inverse.reshape(-1, 2, 2)
+    return torch.cat([-others.sum(dim=1, keepdim=True), others], dim=1)
 
 
 def in_plane_terms(level: Level, fabrics: Sequence[Fabric], *, potential: str = "continuum") -> tuple[Force, ...]:

@@ -1,0 +1,187 @@
+"""Grain and ease: where warp lies, cloth longer than its rest shape, and sheets whose warp and weft differ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from pxr import Sdf, Usd, UsdGeom, Vt
+from probes import bending_stiffness, cantilever, plane_stiffness, rigidity_from, tensile_test
+from sheets import equilateral, garment_of, level_of, triangle_mesh
+
+from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces import elastic_terms
+from physgraph_usd.solver.forces.bending import Bending
+from physgraph_usd.solver.forces.membrane import in_plane_terms, shear_stiffness
+from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.grain import Grain
+from physgraph_usd.solver.level import Level, build_levels, refine_garments
+from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
+from physgraph_usd.usd.read.grain import read_grain
+from physgraph_usd.usd.schema import fabric_values
+
+ALONG = np.array([1.0, 0.0, 0.0])
+WOVEN = Fabric(1000.0, 20e-6, 0.3, shear=70.0, weft_stretch=250.0, weft_bend=8e-6)
+
+
+def sheet(warp: np.ndarray = ALONG, *, edge: float = 0.01) -> Level:
+    points, triangles = equilateral(0.16, 0.16, edge)
+    return level_of(points, triangles, warp=warp)
+
+
+def turned(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2])
+def test_a_woven_sheet_has_the_stiffness_matrix_of_an_orthotropic_one(angle: float):
+    """In its own axes C11 = Y1 / (1 - nu^2), C22 = Y2 / (1 - nu^2), C12 = nu sqrt(C11 C22), C66 = G, with nu = 1/3."""
+    found = plane_stiffness(sheet(turned(angle)), in_plane_terms(sheet(turned(angle)), [WOVEN]))
+    c, s = np.cos(angle), np.sin(angle)
+    strain = np.array([[c * c, s * s, -c * s], [s * s, c * c, c * s], [2 * c * s, -2 * c * s, c * c - s * s]])
+    own = strain.T @ found @ strain
+    c11, c22 = 1000.0 * 9 / 8, 250.0 * 9 / 8
+    c12 = np.sqrt(c11 * c22) / 3.0
+    assert own == pytest.approx(np.array([[c11, c12, 0], [c12, c22, 0], [0, 0, 70.0]]), rel=1e-4, abs=1e-3 * c22)
+
+
+def test_strips_cut_along_warp_and_weft_pull_as_asked_for():
+    for warp, expected in ((ALONG, 1000.0), (turned(np.pi / 2), 250.0)):
+        level = sheet(warp)
+        assert tensile_test(level, in_plane_terms(level, [WOVEN]))[0] == pytest.approx(expected, rel=0.01)
+
+
+def test_a_sheet_bends_along_warp_and_weft_as_asked_for():
+    for edge in (0.01, 0.008):
+        level = sheet(edge=edge)
+        ratio = bending_of(level)
+        assert (ratio[0, 0], ratio[1, 1]) == pytest.approx((20e-6, 8e-6), rel=0.05)
+
+
+def bending_of(level: Level) -> np.ndarray:
+    """The stiffness for curvatures of a sheet whose weft is softer."""
+    weighed = Bending(level, torch.tensor([20e-6], dtype=torch.float64), weft=[8e-6]).weight
+    plain = Bending(level, torch.tensor([20e-6], dtype=torch.float64)).weight
+    return bending_stiffness(replace(level, bend_scale=level.bend_scale * weighed / plain), 20e-6)
+
+
+def test_hanging_strips_of_warp_and_weft_bend_as_the_elastica():
+    """A strip with free sides shows D (1 - nu^2), with the ratio of -1/3 that hinges have."""
+    for way, rigidity in ((ALONG, 20e-6), (turned(np.pi / 2), 8e-6)):
+        length = 2 * (rigidity / (0.3 * 9.81)) ** (1 / 3)
+        angle = cantilever("equilateral", length, WOVEN, warp=way)
+        assert rigidity_from(angle, length, 0.3) == pytest.approx(rigidity * 8 / 9, rel=0.12)
+
+
+def test_without_a_shear_stiffness_a_sheet_is_as_stiff_as_an_isotropic_one():
+    assert shear_stiffness(Fabric(100.0)) == pytest.approx(37.5)
+    assert shear_stiffness(Fabric(100.0, weft_stretch=25.0)) == pytest.approx(0.375 * 50.0)
+
+
+@pytest.mark.parametrize("fabric", [Fabric(100.0), WOVEN], ids=["springs", "membrane"])
+def test_eased_cloth_is_at_rest_where_it_is_that_much_longer(fabric: Fabric):
+    eased = replace(fabric, warp_ease=0.04, weft_ease=-0.01)
+    level = sheet(turned(0.3)).eased([eased])
+    terms = elastic_terms(level, [eased], potential="continuum")
+    warp, weft = turned(0.3), turned(0.3 + np.pi / 2)
+    longer = np.eye(3) + 0.04 * np.outer(warp, warp) - 0.01 * np.outer(weft, weft)
+    x = level.rest @ torch.as_tensor(longer)
+    at_rest = sum(float(term.add_force(x, torch.zeros_like(x))) for term in terms)
+    before = sum(float(term.add_force(level.rest, torch.zeros_like(x))) for term in terms)
+    assert at_rest < 1e-12 * before + 1e-15
+
+
+def test_without_ease_a_level_is_itself():
+    level = sheet()
+    assert level.eased([Fabric()]) is level
+
+
+def test_gathers_and_painted_ease_act_where_they_are_painted():
+    points, triangles = equilateral(0.16, 0.16, 0.02)
+    mesh = triangle_mesh(triangles, len(points))
+    half = (points[:, 0] > 0.08).astype(float)
+    grain = Grain(np.broadcast_to(ALONG, (mesh.face_count, 3)), half, 0.5 * (1 - half))
+    garment = replace(garment_of(mesh, points), grain=grain)
+    level = build_levels([garment], refine_garments([garment], [1]), dtype=torch.float64)[-1]
+    ratio = (level.eased([Fabric(warp_ease=0.1)]).rest_length / level.rest_length).numpy()
+    middle = level.rest.numpy()[level.edges.numpy()].mean(axis=1)[:, 0]
+    span = np.diff(level.rest.numpy()[level.edges.numpy()], axis=1)[:, 0]
+    flat = np.abs(span[:, 1]) < 1e-9
+    assert ratio[flat & (middle > 0.11)] == pytest.approx(1.1)
+    assert ratio[flat & (middle < 0.05)] == pytest.approx(1.0)
+    assert (ratio[~flat & (middle < 0.05)] > 1.3).all()
+
+
+def garment_with(values: np.ndarray | None, *, name: str = "st", turn: float = 0.0) -> tuple[Grain, str]:
+    """The grain that is read of an upright sheet with texture coordinates."""
+    points, triangles = equilateral(0.2, 0.2, 0.05)
+    points = points[:, [0, 2, 1]]  # Upright: y of the sheet is z.
+    stage = Usd.Stage.CreateInMemory()
+    usd = UsdGeom.Mesh.Define(stage, "/Cloth")
+    usd.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+    usd.CreateFaceVertexCountsAttr([3] * len(triangles))
+    usd.CreateFaceVertexIndicesAttr(triangles.ravel().tolist())
+    if values is not None:
+        primvar = UsdGeom.PrimvarsAPI(usd).CreatePrimvar(name, Sdf.ValueTypeNames.TexCoord2fArray, "vertex")
+        primvar.Set(Vt.Vec2fArray.FromNumpy(values.astype(np.float32)))
+    mesh, one = triangle_mesh(triangles, len(points)), np.ones(len(points))
+    painted = {"easeScale": one, "gather": 0 * one, "grain": turn * one}
+    kept, up = np.arange(len(triangles)), np.array([0.0, 0.0, 1.0])
+    return read_grain(usd.GetPrim(), mesh, points, kept=kept, up=up, painted=painted)
+
+
+def flat_points() -> np.ndarray:
+    return equilateral(0.2, 0.2, 0.05)[0]
+
+
+def test_warp_lies_along_v_of_a_pattern():
+    angle = 0.5
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    grain, source = garment_with(3.0 * flat_points()[:, :2] @ turn)
+    assert grain.warp == pytest.approx(np.tile([-np.sin(angle), 0.0, np.cos(angle)], (len(grain.warp), 1)), abs=1e-5)
+    assert source == "v of primvars:st"
+
+
+def test_warp_runs_down_the_cloth_where_texture_coordinates_are_no_pattern():
+    squeezed = flat_points()[:, :2] * [1.0, 0.1]
+    for values in (None, squeezed):
+        grain, source = garment_with(values)
+        assert grain.warp == pytest.approx(np.tile([0.0, 0.0, -1.0], (len(grain.warp), 1)), abs=1e-9)
+        assert source == "the rest shape, downwards"
+
+
+def test_the_grain_map_turns_the_warp():
+    grain, source = garment_with(None, turn=90.0)
+    assert np.abs(grain.warp[:, 0]) == pytest.approx(np.ones(len(grain.warp)))
+    assert "turned" in source
+
+
+def test_a_fabric_survives_its_attributes():
+    values = fabric_values(replace(WOVEN, stretch_limit=0.06, weft_ease=0.02))
+    assert (values["weftStretchStiffness"], values["stretchLimit"], values["rest:weftEase"]) == (250.0, 6.0, 2.0)
+    assert "rest:warpEase" not in values
+
+
+def test_ease_folds_cloth_whose_cage_is_at_rest():
+    """Without ease a flat cage at its rest shape has nothing to fold; with it, folds run across the longer way."""
+    points, triangles = equilateral(0.3, 0.3, 0.03)
+    mesh, one = triangle_mesh(triangles, len(points)), np.ones(len(points))
+    grain = Grain(np.broadcast_to(ALONG, (mesh.face_count, 3)), one, 0 * one)
+    garment = replace(garment_of(mesh, points), grain=grain, level=2)
+    refiner = Refiner(Scene((garment,), np.zeros(3)), SolveSettings())
+    bumps = {}
+    for ease in (0.0, 0.04):
+        fine = refiner.solve(Frame(None, (GarmentFrame(points, Fabric(warp_ease=ease)),))).points[0]
+        assert fine is not None
+        bumps[ease] = np.abs(fine[:, 2]).max()
+        height = fine[:, 2]
+    level = build_levels([garment], refine_garments([garment], [2]), dtype=torch.float64)[-1]
+    ends = level.edges.numpy()
+    span, rise = np.diff(level.rest.numpy()[ends], axis=1)[:, 0], np.diff(height[ends], axis=1)[:, 0]
+    slope = (rise / np.linalg.norm(span, axis=1)) ** 2
+    along = np.abs(span[:, 0]) > 0.9 * np.linalg.norm(span, axis=1)
+    assert bumps[0.0] < 1e-5 < 1e-3 < bumps[0.04]
+    assert slope[along].mean() > 1.5 * slope[~along].mean()
