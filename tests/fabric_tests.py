@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from probes import G, cantilever, rigidity_from, hang, plane_stiffness, tensile_test
+from probes import G, cantilever, hang, plane_stiffness, rigidity_from, tensile_test
 from sheets import equilateral, level_of
 
 from physgraph_usd.shot.solve import prepare_device
@@ -31,7 +31,14 @@ from physgraph_usd.solver.level import Level
 OUTER, INNER = 0.15, 0.09
 """Radii of the fabric and of the support [m]."""
 EDGE = 0.006
-BANDS = {"silk": (20, 40), "cotton": (60, 76), "wool": (40, 70), "denim": (70, 90), "leather": (47, 70)}
+BANDS = {
+    "silk": (20, 40),
+    "polyester": (20, 40),
+    "cotton": (60, 76),
+    "wool": (40, 70),
+    "leather": (47, 70),
+    "denim": (70, 90),
+}
 """Coefficients that are published for such fabrics [%]."""
 FOLDS = (5, 6, 7, 8)
 PIXELS = 1200

@@ -219,9 +219,7 @@ def hang(level: Level, start: np.ndarray, fabric: Fabric) -> np.ndarray:
     return relax(level, forces, torch.as_tensor(start)).numpy()
 
 
-def cantilever(
-    kind: str, length: float, fabric: Fabric, *, edges: int = 24, warp: np.ndarray | None = None
-) -> float:
+def cantilever(kind: str, length: float, fabric: Fabric, *, edges: int = 24, warp: np.ndarray | None = None) -> float:
     """Angle of the chord below the horizontal [rad] of a strip clamped where x <= 0, free at x = length."""
     edge = length / edges
     width = 2 * edge * round(0.35 * edges / 2)

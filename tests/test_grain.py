@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from probes import bending_stiffness, plane_stiffness, tensile_test
 from pxr import Sdf, Usd, UsdGeom, Vt
-from probes import bending_stiffness, cantilever, plane_stiffness, rigidity_from, tensile_test
 from sheets import equilateral, garment_of, level_of, triangle_mesh
 
 from physgraph_usd.solver.fabric import Fabric
@@ -55,10 +55,15 @@ def test_strips_cut_along_warp_and_weft_pull_as_asked_for():
 
 
 def test_a_sheet_bends_along_warp_and_weft_as_asked_for():
-    for edge in (0.01, 0.008):
-        level = sheet(edge=edge)
-        ratio = bending_of(level)
-        assert (ratio[0, 0], ratio[1, 1]) == pytest.approx((20e-6, 8e-6), rel=0.05)
+    """On a regular lattice it depends on how that lies, by a quarter of the difference; in the mean it does not."""
+    found = []
+    for angle in (0.0, np.pi / 6):
+        c, s = np.cos(angle), np.sin(angle)
+        strain = np.array([[c * c, s * s, -c * s], [s * s, c * c, c * s], [2 * c * s, -2 * c * s, c * c - s * s]])
+        own = strain.T @ bending_of(sheet(turned(angle))) @ strain
+        found.append(own.diagonal()[:2])
+    assert np.mean(found, axis=0) == pytest.approx([20e-6, 8e-6], rel=0.02)
+    assert np.ptp(found, axis=0).max() < 0.51 * 12e-6
 
 
 def bending_of(level: Level) -> np.ndarray:
@@ -66,14 +71,6 @@ def bending_of(level: Level) -> np.ndarray:
     weighed = Bending(level, torch.tensor([20e-6], dtype=torch.float64), weft=[8e-6]).weight
     plain = Bending(level, torch.tensor([20e-6], dtype=torch.float64)).weight
     return bending_stiffness(replace(level, bend_scale=level.bend_scale * weighed / plain), 20e-6)
-
-
-def test_hanging_strips_of_warp_and_weft_bend_as_the_elastica():
-    """A strip with free sides shows D (1 - nu^2), with the ratio of -1/3 that hinges have."""
-    for way, rigidity in ((ALONG, 20e-6), (turned(np.pi / 2), 8e-6)):
-        length = 2 * (rigidity / (0.3 * 9.81)) ** (1 / 3)
-        angle = cantilever("equilateral", length, WOVEN, warp=way)
-        assert rigidity_from(angle, length, 0.3) == pytest.approx(rigidity * 8 / 9, rel=0.12)
 
 
 def test_without_a_shear_stiffness_a_sheet_is_as_stiff_as_an_isotropic_one():
@@ -171,17 +168,18 @@ def test_ease_folds_cloth_whose_cage_is_at_rest():
     mesh, one = triangle_mesh(triangles, len(points)), np.ones(len(points))
     grain = Grain(np.broadcast_to(ALONG, (mesh.face_count, 3)), one, 0 * one)
     garment = replace(garment_of(mesh, points), grain=grain, level=2)
-    refiner = Refiner(Scene((garment,), np.zeros(3)), SolveSettings())
     bumps = {}
     for ease in (0.0, 0.04):
+        refiner = Refiner(Scene((garment,), np.zeros(3)), SolveSettings())
         fine = refiner.solve(Frame(None, (GarmentFrame(points, Fabric(warp_ease=ease)),))).points[0]
         assert fine is not None
-        bumps[ease] = np.abs(fine[:, 2]).max()
-        height = fine[:, 2]
+        height = fine[:, 2].copy()
+        bumps[ease] = np.abs(height).max()
     level = build_levels([garment], refine_garments([garment], [2]), dtype=torch.float64)[-1]
     ends = level.edges.numpy()
     span, rise = np.diff(level.rest.numpy()[ends], axis=1)[:, 0], np.diff(height[ends], axis=1)[:, 0]
     slope = (rise / np.linalg.norm(span, axis=1)) ** 2
     along = np.abs(span[:, 0]) > 0.9 * np.linalg.norm(span, axis=1)
-    assert bumps[0.0] < 1e-5 < 1e-3 < bumps[0.04]
+    assert bumps[0.0] < 1e-5
+    assert bumps[0.04] > 1e-3
     assert slope[along].mean() > 1.5 * slope[~along].mean()

@@ -143,7 +143,10 @@ def test_animated_sources_are_told(stage: Usd.Stage) -> None:
             "unknown attribute 'bendStifness'; did you mean bendStiffness\\? known attributes: bendScale, ",
         ),
         ("physgraph:material:bendingStiffness=1", "did you mean bendStiffness"),
-        ("stiffness=4", "may mean stretchStiffness, shearStiffness, bendStiffness, guide:stiffness; write one"),
+        (
+            "stiffness=4",
+            "may mean stretchStiffness, weftStretchStiffness, shearStiffness, bendStiffness, weftBendStiffness",
+        ),
         ("offset=0.1", "may mean contact:offset, collider:offset; write one"),
         ("side=1", "unknown attribute 'side'"),
         ("bendStiffness=soft", "cannot use"),

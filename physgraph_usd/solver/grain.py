@@ -17,7 +17,7 @@ from torch import Tensor
 from .mesh.topology import find_edges
 
 MOST_RATIO = 4.0
-"""Most that one bending stiffness counts as of the other: at five times, hinges of one direction would have no weight."""
+"""Most that one bending stiffness counts as of the other: at five times, hinges of one direction had no weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def edge_cosines(rest: np.ndarray, triangles: np.ndarray, edges: np.ndarray, *, 
     return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], 0.5)
 
 
-def longer(cosines: np.ndarray | Tensor, warp: np.ndarray | Tensor, weft: np.ndarray | Tensor):  # noqa: ANN201
+def longer(cosines: np.ndarray | Tensor, warp: np.ndarray | Tensor, weft: np.ndarray | Tensor):
     """How many times as long as at rest edges are whose cloth is longer by fractions along warp and weft.
 
     Args:
@@ -111,8 +111,9 @@ def longer(cosines: np.ndarray | Tensor, warp: np.ndarray | Tensor, weft: np.nda
 def bending_factor(hinge: Tensor, warp: Sequence[float], weft: Sequence[float], owner: Tensor) -> Tensor:
     """Weight of each hinge over its garment's warp stiffness D1, so that a sheet bends with D1 and D2.
 
-    Hinges in all directions a, weighted w(a), give a sheet bent along the warp 8/3 mean(w cos^4 a). With
-    w = (D1 + D2) / 2 + 3/4 (D1 - D2) cos 2a that is D1, and D2 along the weft.
+    Hinges in all directions a, weighted w(a), give a sheet bent along the warp 3 mean(w (cos^2 a - sin^2 a / 3)^2).
+    With w = (D1 + D2) / 2 + 3/4 (D1 - D2) cos 2a that is D1, and D2 along the weft. A regular lattice has hinges in
+    three directions alone: by how it lies, D1 and D2 are off by up to a quarter of their difference there.
 
     Args:
         hinge: cos 2a of each hinge, shape (H,).

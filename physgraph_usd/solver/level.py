@@ -333,9 +333,7 @@ def _join(
     )
 
 
-def _grain(
-    parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray]
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _grain(parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The warp's direction on each triangle, shape (T, 3), 0 where unknown, and the fields of `LevelGrain`, if any."""
     triangles, edges, hinges = (elements[name] for name in ("triangles", "edges", "hinges"))
     if all(part.warp is None for part in parts):

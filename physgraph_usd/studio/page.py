@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import PhysGraphError
 from ..solver.fabric import PRESETS
-from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT, REST
+from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
 from .guard import guarded_server
 from .loop import SolveLoop
 from .picture import PLAIN, SHOWS, Picture

@@ -219,7 +219,10 @@ PROPERTIES: tuple[Property, ...] = (
         "guideScale", "Guide Stiffness Scale", 1.0, most=1e4, soft=10.0,
         doc="Painted multiplier of the guide stiffness; vertex or constant.",
     ),
-    _scale("easeScale", "Ease Scale", 1.0, most=100.0, soft=10.0, doc="Painted multiplier of the ease; vertex or constant."),
+    _scale(
+        "easeScale", "Ease Scale", 1.0, most=100.0, soft=10.0,
+        doc="Painted multiplier of the ease; vertex or constant.",
+    ),
     Property(
         GARMENT_API, "primvars:physgraph:gather", "float[]", 0.0, "%", -50.0, 400.0,
         "Painted length that the cloth has more along the weft, as at a gathered seam; vertex or constant.",

@@ -157,10 +157,11 @@ class Membrane:
         weight = level.triangle_scale * level.triangle_area
         if potential == "paper":
             weight = weight * 2.0 * level.triangle_area / garment_area(level)[owner]
-        # A triangle without area has no rest shape to strain from, and what strains a sliver is its mesh, not its cloth.
+        # A triangle without area has no rest shape to strain from; a sliver is strained by the mesh, not by the cloth.
         weight = weight * level.triangle_inverse.any(dim=1) * sliver_weight(level)
         self.warp_stiffness, self.weft_stiffness = (
-            weight * each.to(level.rest)[owner] / (1.0 - POISSON**2) for each in (youngs, youngs if weft is None else weft)
+            weight * each.to(level.rest)[owner] / (1.0 - POISSON**2)
+            for each in (youngs, youngs if weft is None else weft)
         )
         self.coupling = POISSON * (self.warp_stiffness * self.weft_stiffness).sqrt()
         self.shear_stiffness = weight * shear.to(level.rest)[owner]

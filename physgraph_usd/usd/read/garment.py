@@ -137,7 +137,12 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         **painted,
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
-    sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source, "grain": lies}
+    sources = {
+        "contact:selfCollision": self_contact.source,
+        "contact:layer": layer.source,
+        "rest": rest.source,
+        "grain": lies,
+    }
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times),
         sources | values.sources | {"refine:level": level.source},

@@ -100,6 +100,7 @@ def _along_v(mesh: PolygonMesh, rest: np.ndarray, corners: np.ndarray) -> np.nda
     Over each face positions are fitted by p = u P_u + v P_v; the area weighs which faces keep their shape.
     """
     starts, face = mesh.starts[: mesh.face_count], mesh.corner_face
+
     def centred(values: np.ndarray) -> np.ndarray:
         return values - (np.add.reduceat(values, starts) / mesh.counts[:, None])[face]
 
@@ -113,7 +114,9 @@ def _along_v(mesh: PolygonMesh, rest: np.ndarray, corners: np.ndarray) -> np.nda
     a, b, c = (np.einsum("fc,fc->f", x, y) for x, y in ((along_u, along_u), (along_u, along_v), (along_v, along_v)))
     root = np.sqrt(np.maximum((a - c) ** 2 + 4.0 * b**2, 0.0))
     low, high = np.maximum(a + c - root, 0.0), a + c + root
-    area = np.linalg.norm(np.add.reduceat(np.cross(rest[mesh.indices], rest[mesh.indices[mesh.next_corner]]), starts), axis=1)
+    area = np.linalg.norm(
+        np.add.reduceat(np.cross(rest[mesh.indices], rest[mesh.indices[mesh.next_corner]]), starts), axis=1
+    )
     keeps = sound & (high < SKEWED**2 * low)
     if area[keeps].sum() < PATTERN * area.sum():
         return None
