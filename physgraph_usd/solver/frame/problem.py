@@ -29,8 +29,8 @@ LONGER, LONGER_CUDA = 4, 8
 CROWDED = 0.1
 """Fraction of the vertices with cloth near them from which a cold frame goes through the levels."""
 FEWER = 1.0 / 3.0
-"""Part of the steps that the network makes of a warm frame where something touches: one round. Skirts on bodies end lower
-so than with all of quasi-Newton's, in two thirds to nine tenths of the time."""
+"""Part of the steps that the network makes of a warm frame where something touches: one round. Skirts on bodies end
+lower so than with all of quasi-Newton's, in two thirds to nine tenths of the time."""
 FAR = 0.4
 """Remaining move of the cage, in its edge lengths, from which it is far from rest; under it CUDA solves cold frames at
 the finest level."""
