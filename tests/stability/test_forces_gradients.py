@@ -31,9 +31,9 @@ def test_s40_springs_near_collapse_and_on_either_side_of_rest(length: float):
     assert apart(evaluate(force, x)[1], difference_force(force, x, 0.01 * min(length, 1e-2))) < 1e-6
 
 
-@pytest.mark.parametrize("squeeze", [0.0, 0.3, -0.5])
+@pytest.mark.parametrize("squeeze", [0.01, 0.3, -0.5])
 def test_s40_membrane_collapsed_and_turned_inside_out(squeeze: float):
-    """St. Venant-Kirchhoff is smooth through collapse."""
+    """Smooth but where warp or weft vanishes, and there no more than a spring does."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0.6, 0.9, 0]])
     force = force_of("membrane", level_of(points, np.array([[0, 1, 2]])))
     x = torch.as_tensor(points * [1.1, squeeze, 1.0])

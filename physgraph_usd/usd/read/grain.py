@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom
 
 from ...solver.grain import Grain
 from ...solver.mesh.topology import PolygonMesh
@@ -76,7 +76,10 @@ def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) ->
     every = [each.GetPrimvarName() for each in api.GetPrimvars() if "texCoord2" in str(each.GetTypeName())]
     for name in dict.fromkeys([each for each in _NAMES if each in every] + every):
         primvar = api.GetPrimvar(name)
-        flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
+        try:
+            flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
+        except Tf.ErrorException:  # Indices of another type: what writes the layer names them.
+            continue
         values = np.zeros((0, 2)) if flat is None else np.asarray(flat, np.float64)
         if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
             corners = _kept_corners(prim, kept)
