@@ -5,14 +5,13 @@ from __future__ import annotations
 import gc
 import weakref
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.frame.problem import LevelProblem, Problem
+from physgraph_usd.solver.frame.problem import Choice, LevelProblem, Problem
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.base import System
@@ -147,11 +146,11 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
     frames = [[GarmentFrame(wave(rest, phase=phase), fabric, GUIDE)] for phase, fabric in shown]
     fresh = Problem.level
 
-    def lasting(problem: Problem, index: int, **options: Any) -> LevelProblem:
+    def lasting(problem: Problem, index: int, choice: Choice) -> LevelProblem:
         detailed, stiffness = problem.start.detailed, problem.tether
         tie = None if detailed is None or stiffness is None else (stiffness, detailed)
         system = problem.forces[index].lasting_system(problem.aim, tie)
-        return replace(fresh(problem, index, **options), alone=system)
+        return replace(fresh(problem, index, choice), alone=system)
 
     results = []
     for level in (fresh, lasting):
