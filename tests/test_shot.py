@@ -60,7 +60,8 @@ class TestDone:
         assert data["garments"][0]["sources"]
         assert data["seconds"]["total"] >= data["seconds"]["frames"] > 0
         assert data["peak_memory_mb"] > 10
-        assert {"contact", "self contact", "network"} <= set(data["left_out"])
+        assert {"contact", "self contact"} <= set(data["left_out"])
+        assert "network" in data["modelled"]
         assert not (tmp_path / "fine.json.part").exists()
 
     def test_the_report_says_who_integrated(self, shot: Path, tmp_path: Path):

@@ -78,6 +78,7 @@ class Fold:
             integrator=QuasiNewton(),
             untangler=QuasiNewton(),
             budget=Budget(steps, tolerance=1e-6),
+            touching=Budget(steps, tolerance=1e-6),
             outward=torch.ones(1),
         )
         smoothing = None if warm else torch.zeros_like(x)

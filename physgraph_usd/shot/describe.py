@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import GarmentError, StageError
 from ..solver.contact.crowding import Crowding, CrowdingMeter
+from ..solver.fabric import Fabric
 from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects
 from ..solver.resolution import LevelChoice, choose_levels, sample_frames
@@ -271,11 +272,19 @@ def _pull(gravity: np.ndarray) -> str:
 
 
 def _in_plane(report: RefineReport) -> dict[str, str]:
-    """Which garments are sheets of edge springs, and which of triangles because shear stiffness is authored."""
-    springs = [g["path"] for g in report.garments if g["fabric"]["shear"] is None]
-    triangles = [g["path"] for g in report.garments if g["fabric"]["shear"] is not None]
+    """Which garments are sheets of edge springs, which of triangles, and whose cloth is longer than its rest shape."""
+    known = {each.name for each in dataclasses.fields(Fabric)}
+    woven = {g["path"]: Fabric(**{k: v for k, v in g["fabric"].items() if k in known}) for g in report.garments}
+    springs = [path for path, fabric in woven.items() if not fabric.has_membrane]
+    triangles = [path for path, fabric in woven.items() if fabric.has_membrane]
     modelled = {"stretch": "edge springs" + (f" for {', '.join(springs)}" if triangles else "")} if springs else {}
-    return modelled | ({"membrane": f"triangle membrane for {', '.join(triangles)}"} if triangles else {})
+    modelled |= {"membrane": f"triangle membrane for {', '.join(triangles)}"} if triangles else {}
+    eased = [
+        f"{path} by {100.0 * fabric.warp_ease:g}% along the warp and {100.0 * fabric.weft_ease:g}% along the weft"
+        for path, fabric in woven.items()
+        if fabric.is_eased
+    ]
+    return modelled | ({"ease": f"cloth longer than the rest shape: {'; '.join(eased)}"} if eased else {})
 
 
 def _touching(opened: Shot) -> list[str]:
@@ -313,5 +322,7 @@ def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     if "contact" not in report.modelled:
         left_out["contact"] = _why_no_contact(opened)
     if "membrane" not in report.modelled:
-        left_out["triangle membrane"] = "no garment authors shear stiffness: edge springs have G = 0.375 Y"
+        left_out["triangle membrane"] = (
+            "no garment has a shear stiffness, weft or limit of its own: edge springs have G = 0.375 Y"
+        )
     return left_out

@@ -89,57 +89,57 @@ def _short(name: str) -> str:
     return name.removeprefix("primvars:").removeprefix(MATERIAL).removeprefix(NAMESPACE)
 
 
+_PULL, _BEND = ("N/m", (1e-3, 1e9), (1.0, 1e4)), ("N m", (0.0, 1e5), (1e-7, 1e-2))
+_FABRIC_ROWS = (
+    (
+        "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, *_PULL,
+        "In-plane stiffness E h: Young's modulus of the sheet; along the warp where the weft's is given.",
+    ),
+    (
+        "weftStretchStiffness", "Weft Stretch Stiffness", None, *_PULL,
+        "Stretch stiffness along the weft, where it is not the warp's.",
+    ),
+    (
+        "shearStiffness", "Shear Stiffness", None, "N/m", (0.0, 1e9), (0.1, 1e4),
+        "Shear stiffness G h; without one it is 0.375 times the stretch stiffness.",
+    ),
+    (
+        "bendStiffness", "Bending Stiffness", _JERSEY.bend, *_BEND,
+        "Bending stiffness E h^3 / 12 (1 - nu^2); along the warp where the weft's is given.",
+    ),
+    (
+        "weftBendStiffness", "Weft Bending Stiffness", None, *_BEND,
+        "Bending stiffness along the weft, where it is not the warp's; a quarter to four times that.",
+    ),
+    ("density", "Density", _JERSEY.density, "kg/m^2", (1e-4, 1e5), (0.01, 2.0), "Mass per area."),
+    ("thickness", "Thickness", _JERSEY.thickness, "m", (1e-6, 1.0), (1e-4, 1e-2), "Thickness of the cloth."),
+)  # fmt: skip
+"""Fabric values in the order in which they are documented: name, label, fallback, unit, limits, soft limits, doc."""
+
+
 def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     """Rows of the fabric values; what a material leaves out is the garment's to take from elsewhere."""
-
-    def row(
-        name: str,
-        label: str,
-        fallback: float | None,
-        *,
-        unit: str,
-        ends: tuple[float, float],
-        soft: tuple[float, float],
-        doc: str,
-    ) -> Property:
-        taken = fallback if fallbacks else None
-        return Property(schema, MATERIAL + name, "float", taken, unit, *ends, doc + SI, label, FABRIC, soft)
-
-    return (
-        row(
-            "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, unit="N/m", ends=(1e-3, 1e9), soft=(1.0, 1e4),
-            doc="In-plane stiffness E h: Young's modulus of the sheet; along the warp where the weft's is given.",
-        ),
-        row(
-            "weftStretchStiffness", "Weft Stretch Stiffness", None, unit="N/m", ends=(1e-3, 1e9), soft=(1.0, 1e4),
-            doc="Stretch stiffness along the weft, where it is not the warp's.",
-        ),
-        row(
-            "shearStiffness", "Shear Stiffness", None, unit="N/m", ends=(0.0, 1e9), soft=(0.1, 1e4),
-            doc="Shear stiffness G h; without one it is 0.375 times the stretch stiffness.",
-        ),
-        row(
-            "bendStiffness", "Bending Stiffness", _JERSEY.bend, unit="N m", ends=(0.0, 1e5), soft=(1e-7, 1e-2),
-            doc="Bending stiffness E h^3 / 12 (1 - nu^2); along the warp where the weft's is given.",
-        ),
-        row(
-            "weftBendStiffness", "Weft Bending Stiffness", None, unit="N m", ends=(0.0, 1e5), soft=(1e-7, 1e-2),
-            doc="Bending stiffness along the weft, where it is not the warp's; a quarter to four times that.",
-        ),
-        row(
-            "density", "Density", _JERSEY.density, unit="kg/m^2", ends=(1e-4, 1e5), soft=(0.01, 2.0),
-            doc="Mass per area.",
-        ),
-        row(
-            "thickness", "Thickness", _JERSEY.thickness, unit="m", ends=(1e-6, 1.0), soft=(1e-4, 1e-2),
-            doc="Thickness of the cloth.",
-        ),
-        Property(
-            schema, MATERIAL + "stretchLimit", "float", None, "%", 0.0, 1000.0,
-            "Strain along warp or weft from which the cloth is twenty times as stiff; without one it never is.",
-            "Stretch Limit", FABRIC, (1.0, 50.0),
-        ),
+    limit = Property(
+        schema, MATERIAL + "stretchLimit", "float", None, "%", 0.0, 1000.0,
+        "Strain along warp or weft from which the cloth is twenty times as stiff; without one it never is.",
+        "Stretch Limit", FABRIC, (1.0, 50.0),
     )  # fmt: skip
+    rows = (
+        Property(
+            schema,
+            MATERIAL + name,
+            "float",
+            fallback if fallbacks else None,
+            unit,
+            *ends,
+            doc + SI,
+            label,
+            FABRIC,
+            soft,
+        )
+        for name, label, fallback, unit, ends, soft, doc in _FABRIC_ROWS
+    )
+    return (*rows, limit)
 
 
 def _ease(way: str) -> Property:

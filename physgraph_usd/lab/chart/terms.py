@@ -87,7 +87,7 @@ class TermBench:
     @property
     def terms(self) -> tuple[Without, ...]:
         """Those that the scene has."""
-        sheared = any(garment.fabric.shear is not None for garment in self.frames[0].garments)
+        sheared = any(garment.fabric.has_membrane for garment in self.frames[0].garments)
         absent = {"membrane": not sheared, "contact": not self.timed.has_bodies}
         absent["gravity"] = not self.scene.gravity.any()
         return tuple(each for each in TERMS if not absent.get(each.term))

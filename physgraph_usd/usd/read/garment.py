@@ -121,31 +121,21 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     notices = [*cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     self_contact, layer, level = _constants(prim, request)
-    order = layer.at(None)
     painted, cut = _painted(prim, points.count, notices, values=values)
     grain, lies = read_grain(prim, cage.mesh, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
+    order, subdivisions = layer.at(None), round(level.at(None) or 0.0)
     garment = Garment(
-        path=str(prim.GetPath()),
-        mesh=cage.mesh,
-        rest=rest.points,
-        level=round(level.at(None) or 0.0),
-        flipped=is_flipped(prim, matrix),
-        bent_rest=bent,
+        *(str(prim.GetPath()), cage.mesh, rest.points, subdivisions, is_flipped(prim, matrix), bent),
         self_contact=bool(self_contact.at(None)),
         layer=None if order is None else round(order),
         grain=grain,
         **painted,
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
-    sources = {
-        "contact:selfCollision": self_contact.source,
-        "contact:layer": layer.source,
-        "rest": rest.source,
-        "grain": lies,
-    }
+    sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times),
-        sources | values.sources | {"refine:level": level.source},
+        sources | {"grain": lies} | values.sources | {"refine:level": level.source},
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
