@@ -31,13 +31,12 @@ from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.forces.tether import Tether
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.grain import Grain
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
-from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
+from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Grain, Scene
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 RATE, INCREMENTS = 24.0, 2

@@ -11,11 +11,10 @@ import torch
 from meshes import grid
 from scipy.spatial import Delaunay
 
-from physgraph_usd.solver.grain import Grain
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.subdivide import subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
-from physgraph_usd.solver.scene import Garment
+from physgraph_usd.solver.scene import Garment, Grain
 
 Sheet = tuple[np.ndarray, np.ndarray]
 """Points in the xy plane, shape (V, 3), and counter-clockwise triangles, shape (T, 3)."""

@@ -17,9 +17,8 @@ from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.membrane import in_plane_terms, shear_stiffness
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.grain import Grain
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
-from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
+from physgraph_usd.solver.scene import Frame, GarmentFrame, Grain, Scene
 from physgraph_usd.usd.read.grain import read_grain
 from physgraph_usd.usd.schema import fabric_values
 

@@ -1,7 +1,7 @@
-"""The grain of a garment's cloth: which way its warp lies, and where it is longer than the rest shape shows.
+"""The grain of a level's elements: which way warp and weft lie there, and where cloth is longer than its rest shape.
 
 Cloth has two directions of its own: the warp, along which a weaver's threads are tight, and the weft, a quarter turn
-from it in the surface. Stiffnesses and lengths may differ between them. `Ease` is length that the cloth has and the
+from it in the surface. Stiffnesses and lengths may differ between them. Ease is length that the cloth has and the
 rest shape does not show, as cutters give it to a garment; gathers are ease along a seam. Folds come from it.
 """
 
@@ -18,21 +18,6 @@ from .mesh.topology import find_edges
 
 MOST_RATIO = 4.0
 """Most that one bending stiffness counts as of the other: at five times, hinges of one direction had no weight."""
-
-
-@dataclass(frozen=True, eq=False)
-class Grain:
-    """A garment's grain.
-
-    Attributes:
-        warp: Unit direction of the warp on each face of the cage, in the rest shape, shape (F, 3), float64.
-        ease_scale: Painted multiplier of the ease, shape (V,).
-        gather: Painted length more along the weft, as a fraction, shape (V,).
-    """
-
-    warp: np.ndarray
-    ease_scale: np.ndarray
-    gather: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

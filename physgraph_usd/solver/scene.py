@@ -12,7 +12,6 @@ import numpy as np
 from ..errors import GarmentError
 from .colliders.pose import Collider, Pose
 from .fabric import Fabric
-from .grain import Grain
 from .mesh.topology import PolygonMesh
 
 FARTHEST = 1e9
@@ -31,6 +30,21 @@ _REMEDY = (
     "check metersPerUnit, the rest shape (--rest) and the transforms above it, cache that frame again, or leave it out "
     "with --frames"
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Grain:
+    """A garment's grain.
+
+    Attributes:
+        warp: Unit direction of the warp on each face of the cage, in the rest shape, shape (F, 3), float64.
+        ease_scale: Painted multiplier of the ease, shape (V,).
+        gather: Painted length more along the weft, as a fraction, shape (V,).
+    """
+
+    warp: np.ndarray
+    ease_scale: np.ndarray
+    gather: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

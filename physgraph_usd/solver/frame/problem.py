@@ -242,7 +242,8 @@ class Choice:
     The network makes the steps, in cold frames and in warm ones, where cloth touches and where it does not: on the CPU
     it is within 1.1 of the best method's time to its energy more often than quasi-Newton is, in each of these
     (`python -m benchmarks.choice`; docs/notes/chart.md has the table). Quasi-Newton draws apart what crosses, and
-    solves cages that are not subdivided.
+    solves cages that cross themselves, where the network leaves more jumps and vertices in bodies, and those that are
+    not subdivided.
 
     Coarse levels are cheap and carry folds far, but each has a start of its own. Under one subdivision lies one
     coarse level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where cloth
@@ -278,7 +279,7 @@ def choose(problem: Problem, nested: bool | None) -> Choice:
     warm, subdivisions = problem.warm, problem.finest
     if nested is not None:
         return Choice(nested and not warm)
-    learned = subdivisions > 0
+    learned = subdivisions > 0 and not problem.crossed
     if warm:
         return Choice(False, learned=learned, touching=FEWER if learned else 1.0)
     cuda = problem.device != "cpu"

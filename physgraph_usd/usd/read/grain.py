@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
-from ...solver.grain import Grain
 from ...solver.mesh.topology import PolygonMesh
+from ...solver.scene import Grain
 
 SKEWED = 1.5
 """Ratio of the two stretches of a face's texture coordinates from which these do not keep its shape."""
