@@ -90,6 +90,12 @@ def test_eased_cloth_is_at_rest_where_it_is_that_much_longer(fabric: Fabric):
     assert at_rest < 1e-12 * before + 1e-15
 
 
+def test_cloth_that_is_drawn_in_without_end_keeps_a_quarter_of_its_length():
+    level = sheet().eased([Fabric(warp_ease=-1.0, weft_ease=-3.0)])
+    assert level.triangle_inverse.isfinite().all()
+    assert (level.rest_length / sheet().rest_length).numpy() == pytest.approx(0.25)
+
+
 def test_without_ease_a_level_is_itself():
     level = sheet()
     assert level.eased([Fabric()]) is level

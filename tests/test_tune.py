@@ -147,6 +147,16 @@ def test_a_settling_that_is_cancelled_leaves_the_cloth(session: TuneSession):
     assert np.abs(refined(session, settled) - points(settled)).max() < 1e-7
 
 
+def test_a_preset_takes_the_place_of_the_last_ones_values(session: TuneSession):
+    session.set_value(CLOTH, "rest:weftEase", 2.0)
+    session.set_preset(CLOTH, "denim")
+    assert session.value(CLOTH, "weftStretchStiffness") == 226.0
+    session.set_preset(CLOTH, "jersey")
+    assert session.value(CLOTH, "weftStretchStiffness") is None
+    assert session.value(CLOTH, "shearStiffness") is None
+    assert session.value(CLOTH, "rest:weftEase") == pytest.approx(2.0)
+
+
 def test_save_writes_what_tag_writes(session: TuneSession, shot: Path, tmp_path: Path):
     before = shot.read_bytes()
     session.set_preset(CLOTH, "silk")

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from .mesh.topology import find_edges
 
+SHORTEST = 0.25
+"""Least length of cloth over its rest shape's: ease, its painted multiplier and gathers may be negative together."""
 MOST_RATIO = 4.0
 """Most that one bending stiffness counts as of the other: at five times, hinges of one direction had no weight."""
 
@@ -80,17 +82,6 @@ def edge_cosines(rest: np.ndarray, triangles: np.ndarray, edges: np.ndarray, *, 
             np.add.at(total[:, axis], which, np.einsum("tc,tc->t", span, both[axis]) ** 2 / square)
         np.add.at(count, which, 1.0)
     return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], 0.5)
-
-
-def longer(cosines: np.ndarray | Tensor, warp: np.ndarray | Tensor, weft: np.ndarray | Tensor):
-    """How many times as long as at rest edges are whose cloth is longer by fractions along warp and weft.
-
-    Args:
-        cosines: Squared cosines with warp and weft, shape (E, 2).
-        warp: Length more along the warp, as a fraction, shape (E,).
-        weft: Along the weft, shape (E,).
-    """
-    return (cosines[:, 0] * (1.0 + warp) ** 2 + cosines[:, 1] * (1.0 + weft) ** 2) ** 0.5
 
 
 def bending_factor(hinge: Tensor, warp: Sequence[float], weft: Sequence[float], owner: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .fabric import Fabric
-from .grain import LevelGrain, axes, edge_cosines, longer
+from .grain import SHORTEST, LevelGrain, axes, edge_cosines
 from .mesh.defects import FLAT
 from .mesh.lengths import LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
@@ -121,16 +121,21 @@ class Level:
         if self.grain is None or not (self.grain.gathers or any(each.is_eased for each in fabrics)):
             return self
         ease = self.rest.new_tensor([[each.warp_ease, each.weft_ease] for each in fabrics])
-        warp, weft = (self.grain.edge_scale.unsqueeze(1) * ease[self.edge_garment.long()]).unbind(dim=1)
-        length, more = longer(self.grain.edge, warp, weft + self.grain.edge_gather), weft + self.grain.edge_gather
-        along, across = (self.grain.triangle_scale.unsqueeze(1) * ease[self.triangle_garment.long()]).unbind(dim=1)
-        sides = 1.0 + torch.stack([along, across + self.grain.triangle_gather], dim=1)
+        at_edges, at_triangles = (
+            (1.0 + scale.unsqueeze(1) * ease[owner.long()] + torch.stack([0.0 * gather, gather], dim=1)).clamp_min(
+                SHORTEST
+            )
+            for scale, gather, owner in (
+                (self.grain.edge_scale, self.grain.edge_gather, self.edge_garment),
+                (self.grain.triangle_scale, self.grain.triangle_gather, self.triangle_garment),
+            )
+        )
         return replace(
             self,
-            rest_length=self.rest_length * length,
-            edge_area=self.edge_area * (1.0 + warp) * (1.0 + more),
-            triangle_area=self.triangle_area * sides.prod(dim=1),
-            triangle_inverse=self.triangle_inverse / sides.repeat(1, 2),
+            rest_length=self.rest_length * (self.grain.edge * at_edges**2).sum(dim=1).sqrt(),
+            edge_area=self.edge_area * at_edges.prod(dim=1),
+            triangle_area=self.triangle_area * at_triangles.prod(dim=1),
+            triangle_inverse=self.triangle_inverse / at_triangles.repeat(1, 2),
         )
 
     @property

@@ -26,7 +26,7 @@ from ..solver.fabric import PRESETS
 from ..solver.mesh.subdivide import Refinement
 from ..solver.resolution import choose_levels, sample_frames
 from ..solver.scene import Frame, State
-from ..usd.schema import AUTO_LEVEL, GARMENT, fabric_values
+from ..usd.schema import AUTO_LEVEL, FABRIC, GARMENT, fabric_values
 from ..usd.write.tag import tag
 from .solver import FrameSolver
 from .values import TUNABLES
@@ -136,14 +136,16 @@ class TuneSession:
         self._try(garment, {name: value})
 
     def set_preset(self, garment: str, preset: str) -> None:
-        """Try a fabric's values.
+        """Try a fabric's values in place of those that were tried.
 
         Raises:
             UsageError: The garment or the fabric is unknown.
         """
         if preset not in PRESETS:
             raise UsageError(f"unknown preset '{preset}'; known presets: {', '.join(sorted(PRESETS))}")
-        self._try(garment, fabric_values(PRESETS[preset]))
+        tried = self.values.get(garment, {})
+        kept = {name: value for name, value in tried.items() if GARMENT[name].group != FABRIC}
+        self._read_with(garment, kept | _rounded(fabric_values(PRESETS[preset])))
 
     def set_as_authored(self, garment: str) -> None:
         """Take a garment's values from the shot again; its level stays.
@@ -239,8 +241,7 @@ class TuneSession:
 
     def _try(self, garment: str, values: Mapping[str, float]) -> None:
         """Read the shot with values more, rounded to floats that a layer can hold."""
-        rounded = {name: float(np.float32(value)) for name, value in values.items()}
-        self._read_with(garment, self.values.get(garment, {}) | rounded)
+        self._read_with(garment, self.values.get(garment, {}) | _rounded(values))
 
     def _read_with(self, garment: str, values: dict[str, float]) -> None:
         """Read the shot with a garment's values; values that cannot be used change nothing."""
@@ -250,6 +251,11 @@ class TuneSession:
             f"{path}.{GARMENT[name].name}={value!r}" for path, each in tried.items() for name, value in each.items()
         ]
         self.shot, self.values, self._shown = self._opened.with_values(texts), tried, None
+
+
+def _rounded(values: Mapping[str, float]) -> dict[str, float]:
+    """Values as floats that a layer can hold."""
+    return {name: float(np.float32(value)) for name, value in values.items()}
 
 
 def _command(

@@ -29,7 +29,6 @@ def _push_apart(
     first: wp.int32,
     corners: wp.array(dtype=wp.vec4i),
     weight: wp.array(dtype=wp.vec4d),
-    gives: wp.array(dtype=wp.vec4d),
     normal: wp.array(dtype=wp.vec3d),
     may: wp.array(dtype=wp.float64),
     stiffness: wp.array(dtype=wp.float64),
@@ -101,7 +100,7 @@ def along(
     pairs += [argument(normal.contiguous(), wp.vec3d)]
     moved = way.clone(memory_format=torch.contiguous_format)
     push, wanted, out = argument(torch.zeros_like(distance)), _vectors(way), _vectors(moved)
-    push_apart = [*pairs, argument(COMES * distance), argument(stiffness), out, push]
+    push_apart = [*pairs[:2], pairs[3], argument(COMES * distance), argument(stiffness), out, push]
     add_pushes = [argument(starts), argument(slots), pairs[2], pairs[3], push, wanted, out]
     launched = {"device": str(x.device), "threads": threads}
     launches = [
