@@ -49,11 +49,11 @@ class Preconditioner(Protocol):
 
 
 @runtime_checkable
-class Layered(Preconditioner, Protocol):
-    """A preconditioner that answers smooth and rough forces by different parts."""
+class Shortened(Preconditioner, Protocol):
+    """A preconditioner that has a shorter answer, for steps that are made without a line search."""
 
-    def smooth(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The part that is an inverse of its ``diagonal``'s matrix [m]."""
+    def short(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The shorter answer [m]."""
         ...
 
 
@@ -119,18 +119,19 @@ class System:
         move = self.metric.solve(force) if solver is None else solver(force)
         return move if self._all_free else move * self._mask
 
-    def apply_smooth_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 F [m] by the smooth part alone of a metric that has two."""
-        smooth = self._smooth
-        if smooth is None:
+    def apply_short_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m] for a step without a line search: shorter where the metric has a shorter answer."""
+        short = self._short
+        if short is None:
             return self.apply_metric_inverse(force)
         self.metric_solves += 1
-        return smooth(force) * self._mask
+        move = short(force)
+        return move if self._all_free else move * self._mask
 
     @cached_property
-    def _smooth(self) -> Callable[[Tensor], Tensor] | None:
-        """The smooth part of a metric that has two; found once, since testing for a protocol reads all properties."""
-        return self.metric.smooth if isinstance(self.metric, Layered) else None
+    def _short(self) -> Callable[[Tensor], Tensor] | None:
+        """The shorter answer, if any; found once, since testing for a protocol reads all properties."""
+        return self.metric.short if isinstance(self.metric, Shortened) else None
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each vertex's Hessian block [N/m], positive."""

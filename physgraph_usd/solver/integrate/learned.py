@@ -66,12 +66,12 @@ class LearnedMetric:
         self._network = placed(self._network, system, x.dtype)
         energy, force = system.energy_and_force(x)
         none = torch.zeros_like(x)
-        return Carry(x, energy, force, system.apply_smooth_inverse(force), self.name, Memory(none, (none, none)))
+        return Carry(x, energy, force, system.apply_short_inverse(force), self.name, Memory(none, (none, none)))
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions under forces that changed a little; the memory is kept."""
         energy, force = system.energy_and_force(carry.x)
-        return Carry(carry.x, energy, force, system.apply_smooth_inverse(force), self.name, carry.memory)
+        return Carry(carry.x, energy, force, system.apply_short_inverse(force), self.name, carry.memory)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
@@ -87,7 +87,7 @@ class LearnedMetric:
     def _reached(self, system: System, carry: Carry, x: Tensor, move: Tensor) -> Carry:
         """The carry at x [m], a displacement away from the last one's."""
         energy, force = system.energy_and_force(x)
-        image = system.apply_smooth_inverse(force)
+        image = system.apply_short_inverse(force)
         memory = carry.memory.after(carry, move, force, image, dot=self._dot(system))
         return Carry(x, energy, force, image, self.name, memory)
 

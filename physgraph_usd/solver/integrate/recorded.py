@@ -191,7 +191,7 @@ class Recording:
 
     def _image(self, force: Tensor) -> Tensor:
         """H0^-1 F [m]."""
-        return self._system.apply_smooth_inverse(force)
+        return self._system.apply_short_inverse(force)
 
 
 RecordingT = TypeVar("RecordingT", bound=Recording)
