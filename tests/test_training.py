@@ -16,7 +16,8 @@ from physgraph_usd.cli import main
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.train import loop, record
 from physgraph_usd.lab.train.bundle import Bundle, JointSystem, Twin, deal, detached, unrolled
-from physgraph_usd.lab.train.loop import TrainConfig, Trainer, loss_of, nested_gap
+from physgraph_usd.lab.train.held_out import nested_gap
+from physgraph_usd.lab.train.loop import TrainConfig, Trainer, loss_of
 from physgraph_usd.lab.train.patches import Patch, PatchConfig, describe, make_patches
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.forces.contact import Contact

@@ -19,9 +19,10 @@ from ...solver.forces.base import ForceModule
 from ...solver.frame.group import Group
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS
-from ...solver.integrate.base import Carry, Integrator, Solver, System
+from ...solver.integrate.base import Carry, Integrator, Shortened, Solver, System
 from ...solver.level import refine_garments
 from .patches import Patch, with_bodies
+from .rounds import Round, system_of
 
 NOISE = 1e-3
 """Root mean square of what a twin's start differs by, in local edge lengths: well above float32's rounding."""
@@ -72,7 +73,11 @@ class JointSystem(System):
         """H0^-1 F [m], with gradients; without them where another solver is to be used in place of H0^-1."""
         if solver is not None:
             return super().apply_metric_inverse(force, solver)
-        return cast(Tensor, _MetricSolve.apply(force, self))
+        return cast(Tensor, _MetricSolve.apply(force, self, False))
+
+    def apply_short_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """H0^-1 F [m], shorter where the metric has a shorter answer, with gradients."""
+        return cast(Tensor, _MetricSolve.apply(force, self, True))
 
 
 class _EnergyForce(torch.autograd.Function):
@@ -102,16 +107,23 @@ class _EnergyForce(torch.autograd.Function):
 
 
 class _MetricSolve(torch.autograd.Function):
-    """H0^-1 F; H0 is symmetric, so it is its own transpose."""
+    """H0^-1 F, or its shorter answer; both are symmetric, so each is its own transpose."""
 
     @staticmethod
-    def forward(ctx: Any, force: Tensor, system: JointSystem) -> Tensor:
-        ctx.system = system
-        return System.apply_metric_inverse(system, force)
+    def forward(ctx: Any, force: Tensor, system: JointSystem, short: bool) -> Tensor:
+        ctx.system, ctx.short = system, short
+        return _solved(system, force, short=short)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:  # type: ignore[override]
-        return System.apply_metric_inverse(ctx.system, gradients[0].contiguous()), None
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        return _solved(ctx.system, gradients[0].contiguous(), short=ctx.short), None, None
+
+
+def _solved(system: JointSystem, force: Tensor, *, short: bool) -> Tensor:
+    if short and isinstance(system.metric, Shortened):
+        system.metric_solves += 1
+        return system.metric.short(force) * system.free
+    return System.apply_metric_inverse(system, force)
 
 
 def unrolled(integrator: Integrator, system: System, carry: Carry, steps: int) -> Carry:
@@ -174,7 +186,7 @@ class Bundle:
 
     def __init__(self, patches: Sequence[Patch], *, device: str, through_forces: bool) -> None:
         """Build the group of patches that have the same number of levels and the same gravity."""
-        self.patches = tuple(patches)
+        self.patches: tuple[Patch | Round, ...] = tuple(patches)
         garments, count = [patch.garment for patch in patches], patches[0].garment.level
         settings = SolveSettings(METHODS["quasi-newton"])
         chains = refine_garments(garments, [count] * len(garments))
@@ -232,6 +244,29 @@ class Bundle:
     def restore(self, state: dict[str, Any]) -> None:
         """Take back what `state` gave."""
         self._ends, self._known, self.least = state["kept"], state["known"], state["least"]
+
+
+class RoundBundle(Bundle):
+    """Rounds of equally many levels under the same gravity, on one device: one level, the finest."""
+
+    def __init__(self, rounds: Sequence[Round], *, device: str, through_forces: bool) -> None:
+        """Build the system of all rounds."""
+        self.patches = tuple(rounds)
+        self.systems = [JointSystem(system_of(rounds, device=device), through_forces=through_forces)]
+        self.levels, self._from_below = 1, [None]
+        self._raw = [torch.as_tensor(np.concatenate([each.x for each in rounds]), device=device)]
+        self._solved = self._raw
+        self.least = torch.tensor([[each.least for each in rounds]], dtype=torch.float64, device=device)
+        self._ends = [x.clone() for x in self._raw]
+        self._known = torch.zeros((1, len(rounds)), dtype=torch.bool, device=device)
+
+
+def deal_rounds(rounds: Sequence[Round], size: int) -> list[list[Round]]:
+    """Batches of at most so many rounds that can be one `RoundBundle`, in their order."""
+    piles: dict[tuple[int, bool, int], list[Round]] = {}
+    for each in rounds:
+        piles.setdefault((each.garments[0].level, bool(each.gravity.any()), len(each.bodies)), []).append(each)
+    return [pile[k : k + size] for pile in piles.values() for k in range(0, len(pile), size)]
 
 
 def deal(patches: Sequence[Patch], size: int) -> list[list[Patch]]:

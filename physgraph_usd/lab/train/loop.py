@@ -7,7 +7,6 @@ import os
 import pickle
 import time
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,14 @@ from torch import Tensor
 
 from ...errors import UsageError
 from ...shot.plain_json import to_json
-from ...solver.integrate.base import Integrator
 from ...solver.integrate.learned import integrator_of
 from ...solver.integrate.network import Physgraph, PhysgraphConfig
 from ...solver.integrate.paper_network import PaperConfig, PaperNetwork
-from ...solver.integrate.quasi_newton import QuasiNewton
-from ...solver.integrate.weights import make_network
-from .bundle import Bundle, Twin, deal, detached, unrolled
+from ...solver.integrate.weights import FOLDER, load_network, make_network
+from .bundle import Bundle, RoundBundle, Twin, deal, deal_rounds, detached, unrolled
+from .held_out import HeldOut
 from .patches import Patch, PatchConfig, make_patches
+from .rounds import Round, RoundConfig, make_rounds
 
 HARMLESS = 0.02
 """Fraction of the energy at the start below which the logarithm of the gap stops to reward."""
@@ -34,8 +33,6 @@ TWINS = 1 / 3
 """Fraction of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
 EVERY = 60.0
 """Seconds between measurements on held-out patches."""
-SCHEDULES = ((5, 5, 5), (10, 10, 5))
-"""Steps a level at which held-out patches are measured."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +62,8 @@ class TrainConfig:
         clip: Largest norm of the gradient.
         average: Decay of the weights' running mean, which is the result.
         held_out: Patches to measure on, of another seed.
+        rounds: Rounds of moving scenes with contact that it is trained on, beside the patches.
+        start: Weights to begin with: "" none, "shipped" those that ship, or a file; a larger network begins as they do.
     """
 
     kind: str = "physgraph"
@@ -88,6 +87,8 @@ class TrainConfig:
     clip: float = 1.0
     average: float = 0.99
     held_out: int = 8
+    rounds: RoundConfig = field(default_factory=RoundConfig)
+    start: str = ""
 
 
 class Trainer:
@@ -101,20 +102,23 @@ class Trainer:
         curve: Measurements on the way.
     """
 
-    def __init__(self, config: TrainConfig, *, device: str = "cpu") -> None:
-        """Make patches and an untrained network on "cpu" or a CUDA device."""
+    def __init__(self, config: TrainConfig, *, device: str = "cpu", data: Data | None = None) -> None:
+        """Make patches, rounds and a network on "cpu" or a CUDA device; data that `data_of` gave are not made anew."""
         self.config, self.device = config, device
         torch.manual_seed(config.seed)
-        self.network = make_network(config.network).to(device)
+        self.network = _begun(config).to(device)
         self._mean = torch.optim.swa_utils.AveragedModel(
             self.network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
         )
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
-        self.patches = _made(config.patches, config.seed)
-        self._held_out: list[Patch] | None = None
-        self._bundles = [
-            Bundle(batch, device=device, through_forces=config.through_forces)
-            for batch in deal(self.patches, config.batch)
+        self.patches, rounds, rest, few = data or data_of(config)
+        self._held_out = HeldOut(rest, few)
+        through = config.through_forces
+        self._bundles: list[Bundle] = [
+            Bundle(batch, device=device, through_forces=through) for batch in deal(self.patches, config.batch)
+        ]
+        self._round_bundles = [
+            RoundBundle(batch, device=device, through_forces=through) for batch in deal_rounds(rounds, config.batch)
         ]
         self._rng = np.random.default_rng(config.seed + 1)
         self.iteration, self.seconds = 0, 0.0
@@ -172,7 +176,9 @@ class Trainer:
     def _descend(self, steps: int) -> float:
         """Unroll a batch, segment after segment; gradients add up. Returns the mean loss."""
         config = self.config
-        bundle = self._bundles[int(self._rng.integers(len(self._bundles)))]
+        touching = bool(self._round_bundles) and self._rng.random() < config.rounds.share
+        bundles = self._round_bundles if touching else self._bundles
+        bundle = bundles[int(self._rng.integers(len(bundles)))]
         index = int(self._rng.integers(bundle.levels))
         system = bundle.systems[index]
         system.energies.clear()
@@ -216,18 +222,8 @@ class Trainer:
         return network.requires_grad_(False).eval()
 
     def held_out_ratios(self) -> dict[str, float]:
-        """Gap over that of quasi-Newton at the same steps, geometric mean over held-out patches."""
-        if self._held_out is None:
-            self._held_out = _made(replace(self.config.patches, count=self.config.held_out), 10_000 + self.config.seed)
-        ours = integrator_of(self.averaged().to("cpu"))
-        table = {}
-        for schedule in SCHEDULES:
-            ratios = []
-            for patch in self._held_out:
-                mine, theirs = (nested_gap(patch, integrator, schedule) for integrator in (ours, QuasiNewton()))
-                ratios.append(math.log(max(mine, 1e-3) / max(theirs, 1e-3)))
-            table[str(schedule)] = round(math.exp(float(np.mean(ratios))), 4)
-        return table
+        """`HeldOut.ratios` of the running mean."""
+        return self._held_out.ratios(integrator_of(self.averaged().to("cpu")))
 
     def save(self, file: Path) -> None:
         """Write a checkpoint from which the run can go on."""
@@ -240,7 +236,7 @@ class Trainer:
             "iteration": self.iteration,
             "seconds": self.seconds,
             "curve": self.curve,
-            "bundles": [bundle.state() for bundle in self._bundles],
+            "bundles": [bundle.state() for bundle in (*self._bundles, *self._round_bundles)],
         }
         part = file.with_suffix(".part")
         torch.save(state, part)
@@ -271,12 +267,38 @@ class Trainer:
         self._rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch"].cpu())
         self.iteration, self.seconds, self.curve = state["iteration"], state["seconds"], state["curve"]
-        for bundle, values in zip(self._bundles, state["bundles"], strict=True):
+        for bundle, values in zip((*self._bundles, *self._round_bundles), state["bundles"], strict=True):
             bundle.restore(values)
 
 
-def _made(config: PatchConfig, seed: int) -> list[Patch]:
-    return make_patches(config, seed=seed, workers=min(os.cpu_count() or 1, config.count // 8))
+Data = tuple[list[Patch], list[Round], list[Patch], list[Round]]
+"""Patches and rounds to train on, and those to measure on."""
+
+
+def data_of(config: TrainConfig, *, workers: int | None = None) -> Data:
+    """What a configuration trains and is measured on, the same for a seed with any number of processes."""
+    workers = os.cpu_count() or 1 if workers is None else workers
+    held, other = config.held_out, 10_000 + config.seed
+    patches = make_patches(config.patches, seed=config.seed, workers=min(workers, config.patches.count // 8))
+    rest = make_patches(replace(config.patches, count=held), seed=other, workers=min(workers, held // 4))
+    own = make_rounds(config.rounds, seed=config.seed, workers=workers) if config.rounds.scenes else []
+    few = replace(config.rounds, scenes=min(held, config.rounds.scenes))
+    return patches, own, rest, make_rounds(few, seed=other, workers=workers) if few.scenes else []
+
+
+def _begun(config: TrainConfig) -> Physgraph | PaperNetwork:
+    """The network that training begins with."""
+    network = make_network(config.network)
+    if not config.start:
+        return network
+    file = FOLDER / f"{config.kind}.safetensors" if config.start == "shipped" else Path(config.start)
+    known, own = load_network(file, kind=config.kind).state_dict(), network.state_dict()
+    for name, value in known.items():
+        if name.removesuffix(".weight").removesuffix(".bias").split(".")[0] in ("hidden", "decode", "messages"):
+            own[name].zero_() if name.startswith("decode") else own[name][: len(value)].zero_()
+        own[name][tuple(slice(0, size) for size in value.shape)] = value
+    network.load_state_dict(own)
+    return network
 
 
 def loss_of(
@@ -305,18 +327,3 @@ def loss_of(
         loss = (gap.clamp_min(0.0) + HARMLESS).log()
     weight = torch.arange(1, len(gap) + 1, dtype=gap.dtype, device=gap.device) ** late  # K
     return (weight / weight.sum()) @ loss.mean(dim=1)
-
-
-def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> float:
-    """Gap at the finest level after so many steps a level, the last entries for the finest levels."""
-    x = patch.begin(0)
-    energy = math.inf
-    counts = steps[-len(patch.systems) :] if len(patch.systems) <= len(steps) else (steps[0], *steps)
-    with torch.no_grad():
-        for index, count in enumerate(counts):
-            level, system = patch.group.levels[index], patch.systems[index]
-            x = x if level.from_below is None else level.from_below.apply(x)
-            carry = unrolled(integrator, system, integrator.start(system, x), count)
-            x, energy = carry.x, carry.energy
-    gap = (energy - patch.least[-1]) / (patch.start[-1] - patch.least[-1])
-    return gap if math.isfinite(gap) else 1e6

@@ -213,7 +213,7 @@ def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
     """The patch of a number, the same in every process."""
     rng = np.random.default_rng([seed, number])
     while True:
-        patch = _patch(config, rng)
+        patch = patch_of(config, rng)
         measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
         drop = [a - b for a, b in zip(patch.start, patch.least, strict=True)]
         if all(np.isfinite(drop)) and min(drop) > 1e-3 * abs(patch.start[-1]) + 1e-12:
@@ -226,7 +226,8 @@ def _group(garment: Garment, gravity: np.ndarray, level: int) -> Group:
     return Group.of([garment], chains, gravity, settings, dtype=torch.float32, device="cpu")
 
 
-def _patch(config: PatchConfig, rng: np.random.Generator) -> Patch:
+def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
+    """A patch in a random pose, its energies not yet measured."""
     mesh, flat, closed = _mesh(config, rng)
     shape = "tube" if closed else str(rng.choice([s for s in SHAPES if s != "tube"]))
     edge = 10 ** rng.uniform(-2.3, -1.3)
@@ -239,7 +240,7 @@ def _patch(config: PatchConfig, rng: np.random.Generator) -> Patch:
     while levels > 1 and len(rest) * 4**levels > config.most_vertices:
         levels -= 1
     garment = Garment("/Patch", mesh, rest, levels, False, bool(rng.random() < 0.3), one, one, one, one, pin)
-    points = _posed(rest, rng, config)
+    points = posed(rest, rng, config)
     if rng.random() < 0.5 and pin.any():
         points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)
     frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
@@ -300,7 +301,7 @@ def _rolled(flat: np.ndarray, shape: str, rng: np.random.Generator) -> np.ndarra
     return np.stack([u, v, -height * square / size], axis=1)
 
 
-def _posed(rest: np.ndarray, rng: np.random.Generator, config: PatchConfig) -> np.ndarray:
+def posed(rest: np.ndarray, rng: np.random.Generator, config: PatchConfig) -> np.ndarray:
     """Squeezed or pulled, sheared, twisted, bent, waved and skinned at random, then turned anywhere."""
     centre, size = rest.mean(axis=0), float(np.ptp(rest, axis=0).max())
     frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]

@@ -21,6 +21,7 @@ from ...solver.integrate.weights import save_network
 from ...version import __version__
 from .loop import TrainConfig, Trainer
 from .patches import PatchConfig, describe
+from .rounds import RoundConfig
 
 T = TypeVar("T")
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
@@ -42,7 +43,7 @@ def run_training(
     """Train a network and write its weights and card.
 
     Args:
-        config_file: TOML whose keys are those of `TrainConfig`, with tables ``network`` and ``patches``.
+        config_file: TOML whose keys are those of `TrainConfig`, with tables ``network``, ``patches`` and ``rounds``.
         out: Folder for the log, the checkpoint, the weights and the card; created when missing.
         device: "cpu" or a CUDA device.
         resume: Go on from the folder's checkpoint.
@@ -99,10 +100,11 @@ def read_config(file: Path) -> TrainConfig:
         raise UsageError(f"{file}: unknown kind '{kind}'; known: {', '.join(NETWORKS)}")
     network = _filled(NETWORKS[kind], values.pop("network", {}), where=f"{file}, [network]")
     patches = _filled(PatchConfig, values.pop("patches", {}), where=f"{file}, [patches]")
+    rounds = _filled(RoundConfig, values.pop("rounds", {}), where=f"{file}, [rounds]")
     unknown = [name for name in getattr(network, "vectors", ()) if name not in VECTORS]
     if unknown:
         raise UsageError(f"{file}: unknown vectors {', '.join(unknown)}; known: {', '.join(VECTORS)}")
-    return _filled(TrainConfig, values | {"network": network, "patches": patches}, where=str(file))
+    return _filled(TrainConfig, values | {"network": network, "patches": patches, "rounds": rounds}, where=str(file))
 
 
 def card_of(trainer: Trainer, digest: str, *, config_file: Path, out: Path) -> dict[str, Any]:
@@ -116,13 +118,13 @@ def card_of(trainer: Trainer, digest: str, *, config_file: Path, out: Path) -> d
         "package": __version__,
         "command": shlex.join(command),
         "config": asdict(config),
-        "data": "procedural patches (lab/train/patches.py); no assets",
+        "data": "procedural patches and moving scenes (lab/train/patches.py, scenes.py); no assets",
         "patches": describe(trainer.patches),
         "weights": sum(parameter.numel() for parameter in trainer.network.parameters()),
         "hardware": torch.cuda.get_device_name() if cuda else f"CPU, one thread, {platform.machine()}",
         "minutes": round(trainer.seconds / 60.0, 2),
         "iterations": trainer.iteration,
-        "held_out": "gap over that of nested quasi-Newton at the same steps a level, geometric mean over patches",
+        "held_out": "gap over quasi-Newton's at as many evaluations, geometric mean over patches and rounds",
         "curve": trainer.curve,
     }
 

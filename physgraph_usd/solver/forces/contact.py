@@ -74,23 +74,25 @@ class Contact:
 
     Attributes:
         planes: What the vertices see, one entry a body.
+        stiffness: k_c [N/m^3].
     """
 
     name = "contact"
 
-    def __init__(self, level: Level, planes: Sequence[Planes], stiffness: float) -> None:
+    def __init__(self, level: Level, planes: Sequence[Planes], stiffness: float | Float[Tensor, " vertices"]) -> None:
         """Weigh the planes.
 
         Args:
             level: The level.
             planes: One entry a body.
-            stiffness: k_c.
+            stiffness: k_c, one for all or one a vertex.
         """
+        self.stiffness = stiffness
         self.planes = tuple(each for each in planes if len(each.vertex))
         self._level = level
-        self._areas = [level.vertex_area[each.vertex.long()] for each in self.planes]
-        self._buffers = [torch.zeros_like(each) for each in self._areas]
-        self._weights = [stiffness * area for area in self._areas]
+        weight = stiffness * level.vertex_area
+        self._weights = [weight[each.vertex.long()] for each in self.planes]
+        self._buffers = [torch.zeros_like(each) for each in self._weights]
         self._launches = [
             self._prepare(level, *parts) for parts in zip(self.planes, self._weights, self._buffers, strict=True)
         ]

@@ -55,7 +55,11 @@ class GuideMap:
 
 
 class Guide:
-    """The guide of one level: weights that last, a target for each frame."""
+    """The guide of one level: weights that last, a target for each frame.
+
+    Attributes:
+        coarse: The cage that it was aimed at when it was made [m].
+    """
 
     name = "guide"
 
@@ -86,11 +90,12 @@ class Guide:
         self._has_soft_pins = bool(soft.any())
         self._target = torch.zeros((len(per_area), 3), dtype=level.dtype, device=level.device)
         self._base = torch.zeros_like(level.rest)
+        self.coarse = torch.zeros_like(self._target)
 
     def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
         """These ties, to the coarse positions of one frame [m]."""
         guide = copy.copy(self)
-        guide._base = self._level.base.apply(coarse)
+        guide.coarse, guide._base = coarse, self._level.base.apply(coarse)
         guide._target = self._map.average.apply(guide._base)
         return guide
 

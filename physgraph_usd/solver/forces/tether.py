@@ -13,14 +13,19 @@ from __future__ import annotations
 
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
 
 
 class Tether:
-    """Springs to predicted positions."""
+    """Springs to predicted positions.
+
+    Attributes:
+        stiffness: k_t [1/s^2].
+        predicted: p [m].
+    """
 
     name = "tether"
 
@@ -39,21 +44,27 @@ class Tether:
             stiffness: k_t [1/s^2].
             predicted: Positions [m].
         """
+        self._level = level
         self._density, self._area = density.to(level.rest)[level.vertex_garment.long()], level.vertex_area
         self._weight = stiffness * self._density * self._area
-        self._predicted = predicted
+        self.predicted, self.stiffness = predicted, stiffness
 
     def aim(self, predicted: Float[Tensor, "vertices 3"], stiffness: float) -> None:
         """Tie to other positions [m], with another stiffness [1/s^2], in place."""
-        self._predicted.copy_(predicted)
+        self.predicted.copy_(predicted)
+        self.stiffness = stiffness
         self._weight.copy_(stiffness * self._density * self._area)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        stray = x - self._predicted
+        stray = x - self.predicted
         pull = self._weight.unsqueeze(1) * stray
         force -= pull
         return 0.5 * (pull * stray).sum(dtype=torch.float64)
+
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each vertex's spring [J] at positions x [m], and its garment."""
+        return 0.5 * self._weight * (x - self.predicted).square().sum(dim=1), self._level.vertex_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """k_t m_v [N/m]."""

@@ -1,0 +1,250 @@
+"""What an integrator sees of contact: starts of rounds, noted while our own solver refines moving scenes.
+
+A round is a level's system with what is near as it was found there (planes of bodies, pairs of cloth), tied to the last
+frame's detail where it is warm, and the positions that its steps begin at. All of it is plain arrays: rounds are made
+in many processes and built again, many as one system, where they are needed.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...errors import PhysGraphError
+from ...shot.solve import prepare_device
+from ...solver.contact.metric import HeldMetric
+from ...solver.forces.base import Force, ForceModule
+from ...solver.forces.contact import Contact, Planes
+from ...solver.forces.guide import Guide
+from ...solver.forces.self_contact import PairConstraints, SelfContact
+from ...solver.forces.tether import Tether
+from ...solver.frame.group import Group
+from ...solver.frame.refiner import Refiner
+from ...solver.frame.settings import SolveSettings
+from ...solver.integrate import METHODS, Method
+from ...solver.integrate.base import Carry, Integrator, System, resumed
+from ...solver.integrate.metric import Metric
+from ...solver.integrate.quasi_newton import QuasiNewton
+from ...solver.integrate.solve import Budget, solve_level
+from ...solver.level import Level, refine_garments
+from ...solver.scene import Frame, Garment, GarmentFrame, Scene
+from .scenes import KINDS, moving_scene
+
+
+@dataclass(frozen=True)
+class RoundConfig:
+    """How rounds are made.
+
+    Attributes:
+        scenes: Number of scenes; none are made at 0.
+        share: Part of the iterations that descend rounds.
+        reference_steps: Quasi-Newton steps behind the least energies known.
+        most_vertices: Fine vertices beyond which a scene has one subdivision, not two.
+    """
+
+    scenes: int = 0
+    share: float = 0.5
+    reference_steps: int = 80
+    most_vertices: int = 4000
+
+
+Arrays = tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One round of the finest level of garments that are solved together, as its integrator sees it.
+
+    Attributes:
+        words: Which.
+        garments: Their cages.
+        frames: Their materials.
+        gravity: [m/s^2], shape (3,).
+        aim: The cage that the cloth follows, recentred [m], shape (C, 3).
+        bodies: Vertex, normal and height of the planes of each body [m].
+        stiffness: k_c of those [N/m^3].
+        pairs: The fields of `PairConstraints`; empty without pairs.
+        tie: Stiffness [1/s^2] of the tether; 0 without one.
+        predicted: Where it ties [m], shape (V, 3); the start without one.
+        stiff: K of the metric [N/m], shape (V,).
+        x: Where the steps begin [m], shape (V, 3).
+        start: Energy there [J].
+        least: Least energy known [J].
+    """
+
+    words: str
+    garments: tuple[Garment, ...]
+    frames: tuple[GarmentFrame, ...]
+    gravity: np.ndarray
+    aim: np.ndarray
+    bodies: tuple[Arrays, ...]
+    stiffness: float
+    pairs: Arrays
+    tie: float
+    predicted: np.ndarray
+    stiff: np.ndarray
+    x: np.ndarray
+    start: float = 0.0
+    least: float = 0.0
+
+    @property
+    def touches(self) -> bool:
+        """Whether something is near."""
+        return bool(self.bodies) or bool(self.pairs)
+
+
+class Watch:
+    """An integrator that notes where its rounds begin at the finest level, under which system."""
+
+    def __init__(self, inner: Integrator) -> None:
+        """Watch an integrator."""
+        self.name, self._inner = inner.name, inner
+        self.seen: list[tuple[System, Tensor]] = []
+
+    def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
+        """Note, and start."""
+        self.seen.append((system, x.clone()))
+        return self._inner.start(system, x)
+
+    def resume(self, system: System, carry: Carry) -> Carry:
+        """Note, and go on."""
+        self.seen.append((system, carry.x.clone()))
+        return resumed(self._inner, system, carry)
+
+    def step(self, system: System, carry: Carry) -> Carry:
+        """One step of the integrator's."""
+        return self._inner.step(system, carry)
+
+
+def rounds_of(
+    scene: Scene, frames: Iterable[Frame], *, levels: Sequence[int], method: str, words: str, steps: int = 12
+) -> list[Round]:
+    """The rounds of some frames in order, solved by a method; only of levels that are the garments' finest."""
+    watch = Watch(METHODS[method].build())
+    settings = SolveSettings(Method(lambda: watch, nested=True), steps=steps)
+    refiner = Refiner(scene, settings, levels=list(levels))
+    rounds = []
+    for number, frame in enumerate(frames):
+        watch.seen.clear()
+        refiner.solve(frame)
+        for part in refiner.parts_of(frame):
+            group = refiner.group_of(part)
+            own = [(system, x) for system, x in watch.seen if _is_of(system, group.levels[-1])]
+            for place, (system, x) in enumerate(own):
+                label = f"{words}, frame {number}, round {place}"
+                rounds.append(_noted(label, group, [frame.garments[index] for index in part], system, x))
+    return rounds
+
+
+def _is_of(system: System, level: Level) -> bool:
+    return system.level is not None and system.level.index == level.index and len(system.spacing) == level.vertex_count
+
+
+def _noted(words: str, group: Group, frames: Sequence[GarmentFrame], system: System, x: Tensor) -> Round:
+    """A system and a start as plain arrays."""
+    field = system.field
+    assert isinstance(field, ForceModule)
+    bodies, pairs, stiffness, tie, predicted = (), (), 0.0, 0.0, x
+    aim = None
+    for term in field.forces:
+        if isinstance(term, Contact):
+            bodies = tuple((p.vertex.numpy(), p.normal.numpy(), p.height.numpy()) for p in term.planes)
+            stiffness = float(term.stiffness)
+        elif isinstance(term, SelfContact):
+            pairs = tuple(getattr(term.gaps, each.name).numpy() for each in fields(term.gaps))
+        elif isinstance(term, Tether):
+            tie, predicted = term.stiffness, term.predicted
+        elif isinstance(term, Guide):
+            aim = term.coarse
+    assert aim is not None
+    stiff = system.metric.stiff if isinstance(system.metric, HeldMetric) else torch.zeros_like(x[:, 0])
+    plain = [replace(garment, level=len(group.levels) - 1) for garment in group.garments]
+    predicted, stiff, x = (each.clone() for each in (predicted, stiff, x))
+    about = (words, tuple(plain), tuple(frames), group.gravity, aim.clone().numpy())
+    return Round(*about, bodies, stiffness, pairs, float(tie), predicted.numpy(), stiff.numpy(), x.numpy())
+
+
+def system_of(rounds: Sequence[Round], *, device: str) -> System:
+    """One system of rounds of equally many levels under the same gravity."""
+    garments = [garment for each in rounds for garment in each.garments]
+    frames = [frame for each in rounds for frame in each.frames]
+    count = rounds[0].garments[0].level
+    chains = refine_garments(garments, [count] * len(garments))
+    settings = SolveSettings(METHODS["quasi-newton"])
+    group = Group.of(garments, chains, rounds[0].gravity, settings, dtype=torch.float32, device=device)
+    lasting, level = group.forces_for(frames)[-1], group.levels[-1]
+
+    def joined(arrays: Sequence[np.ndarray]) -> Tensor:
+        return torch.as_tensor(np.concatenate(arrays), device=device)
+
+    starts = np.cumsum([0, *(len(each.x) for each in rounds)])[:-1].astype(np.int32)
+    forces: list[Force] = [*lasting.terms, lasting.guide.retarget(joined([each.aim for each in rounds]))]
+    if any(each.tie for each in rounds):
+        ties = torch.tensor([each.tie for each in rounds for _ in each.garments], device=device)
+        forces.append(Tether(level, lasting.density * ties, 1.0, joined([each.predicted for each in rounds])))
+    planes = [_planes(rounds, starts, place, joined) for place in range(max(len(each.bodies) for each in rounds))]
+    if planes:
+        own = [np.full(len(each.x), each.stiffness, np.float32) for each in rounds]
+        forces.append(Contact(level, planes, joined(own)))
+    paired = [(each, start) for each, start in zip(rounds, starts, strict=True) if each.pairs]
+    if paired:
+        shifted = [(each.pairs[0] + start, *each.pairs[1:]) for each, start in paired]
+        forces.append(SelfContact(level, PairConstraints(*map(joined, zip(*shifted, strict=True)))))
+    stiff, metric = joined([each.stiff for each in rounds]), lasting.metric
+    assert isinstance(metric, Metric)
+    held = HeldMetric(metric, stiff) if bool((stiff > 0).any()) else metric
+    return System(ForceModule(forces), held, free=level.free, spacing=level.spacing, level=level)
+
+
+def _planes(rounds: Sequence[Round], starts: np.ndarray, place: int, joined: Any) -> Planes:
+    """The planes of the bodies that come at one place in each round."""
+    there = [
+        (each.bodies[place], start) for each, start in zip(rounds, starts, strict=True) if len(each.bodies) > place
+    ]
+    vertex = joined([body[0] + start for body, start in there])
+    return Planes(vertex, *(joined([body[k] for body, _ in there]) for k in (1, 2)))
+
+
+def measured(each: Round, steps: int) -> Round | None:
+    """The round with the energies between which it moves, by so many quasi-Newton steps; None where it is at rest."""
+    system, x = system_of([each], device="cpu"), torch.as_tensor(each.x)
+    _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(steps))
+    drop = report.energy_before - report.energy_after
+    if not (np.isfinite(drop) and drop > 1e-4 * abs(report.energy_after) + 1e-12):
+        return None
+    return replace(each, start=report.energy_before, least=report.energy_after)
+
+
+def make_rounds(config: RoundConfig, *, seed: int, workers: int = 1) -> list[Round]:
+    """Rounds of scenes out of `scenes`, a few of each; the same for a seed with any number of processes."""
+    jobs = [(config, seed, number) for number in range(config.scenes)]
+    if workers <= 1 or len(jobs) < 2 * workers:
+        found = [_scene_rounds(*job) for job in jobs]
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_device, initargs=("cpu",)) as pool:
+            found = list(pool.map(_scene_rounds, *zip(*jobs, strict=True)))
+    return [each for rounds in found for each in rounds]
+
+
+def _scene_rounds(config: RoundConfig, seed: int, number: int) -> list[Round]:
+    """Some rounds of the scene of a number: of its first frame and of warm ones."""
+    rng = np.random.default_rng([seed, number])
+    kind = KINDS[number % len(KINDS)]
+    moving = moving_scene(rng, kind=kind, frames=3, most_vertices=config.most_vertices)
+    method = "quasi-newton" if rng.random() < 0.5 else "physgraph"
+    levels = [garment.level for garment in moving.scene.garments]
+    try:
+        rounds = rounds_of(moving.scene, moving.frames, levels=levels, method=method, words=moving.words)
+    except PhysGraphError:  # Cloth that starts wholly in a body.
+        return []
+    chosen = sorted(rng.permutation(len(rounds))[:4]) if len(rounds) > 4 else range(len(rounds))
+    return [each for place in chosen if (each := measured(rounds[place], config.reference_steps)) is not None]

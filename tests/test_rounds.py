@@ -1,0 +1,108 @@
+"""What training sees of contact: rounds of moving scenes, stepped alone and together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from physgraph_usd.lab.train.bundle import RoundBundle, deal_rounds
+from physgraph_usd.lab.train.held_out import round_gap
+from physgraph_usd.lab.train.loop import TrainConfig, Trainer
+from physgraph_usd.lab.train.patches import PatchConfig
+from physgraph_usd.lab.train.rounds import Round, RoundConfig, make_rounds, system_of
+from physgraph_usd.solver.contact.metric import HeldMetric
+from physgraph_usd.solver.integrate.learned import integrator_of
+from physgraph_usd.solver.integrate.network import PhysgraphConfig
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.weights import random_network, shipped_network
+
+FEW = RoundConfig(scenes=3, reference_steps=15, most_vertices=1)
+
+
+@pytest.fixture(scope="module")
+def rounds() -> list[Round]:
+    return make_rounds(FEW, seed=5)
+
+
+def touching(rounds: list[Round]) -> list[Round]:
+    return max(deal_rounds([each for each in rounds if each.touches], 8), key=len)
+
+
+def test_the_same_seed_makes_the_same_rounds(rounds: list[Round]):
+    again = make_rounds(replace(FEW, scenes=1), seed=5)
+    assert [each.words for each in again] == [each.words for each in rounds[: len(again)]]
+    for one, other in zip(again, rounds, strict=False):
+        assert np.array_equal(one.x, other.x)
+        assert one.least == other.least
+
+
+def test_they_hold_bodies_cloth_near_cloth_and_ties_to_the_last_frame(rounds: list[Round]):
+    assert any(each.bodies for each in rounds)
+    assert any(each.pairs for each in rounds)
+    assert any(each.tie for each in rounds)
+    assert any(each.stiff.any() for each in rounds)
+    assert all(each.least < each.start for each in rounds)
+
+
+def test_rounds_side_by_side_move_as_they_do_alone(rounds: list[Round]):
+    some = touching(rounds)
+    assert len(some) > 1
+    bundle = RoundBundle(some, device="cpu", through_forces=True)
+    system, level = bundle.systems[0], bundle.systems[0].level
+    assert isinstance(system.metric, HeldMetric)
+    assert level is not None
+    integrator = integrator_of(random_network(PhysgraphConfig(width=8), seed=1, scale=0.1))
+    together = integrator.start(system, torch.cat([torch.as_tensor(each.x) for each in some]))
+    start = system.energies[-1].clone()
+    together = integrator.step(system, together)
+    for number, (each, span) in enumerate(zip(some, level.spans, strict=True)):
+        alone = system_of([each], device="cpu")
+        carry = integrator.start(alone, torch.as_tensor(each.x))
+        assert carry.energy == pytest.approx(each.start, rel=1e-4)
+        assert float(start[number]) == pytest.approx(each.start, rel=1e-4)
+        carry = integrator.step(alone, carry)
+        apart = float((carry.x - together.x[span]).abs().max())
+        assert apart < 1e-3 * float(alone.spacing.mean())
+
+
+def test_the_energys_gradient_is_minus_the_force(rounds: list[Round]):
+    some = touching(rounds)
+    system = RoundBundle(some, device="cpu", through_forces=True).systems[0]
+    x = torch.cat([torch.as_tensor(each.x) for each in some]).requires_grad_()
+    system.energy_and_force(x)
+    (gradient,) = torch.autograd.grad(system.energies[-1].sum(), x)
+    force = system.energy_and_force(x.detach())[1]
+    assert torch.allclose(gradient * system.free, -force, rtol=1e-5, atol=1e-7 * float(force.abs().max()))
+
+
+def test_gaps_of_rounds_fall_with_evaluations(rounds: list[Round]):
+    each = touching(rounds)[0]
+    system = system_of([each], device="cpu")
+    few, more = (round_gap(each, system, QuasiNewton(), count) for count in (2, 8))
+    assert 0.0 <= more < few < 1.0
+
+
+def test_training_begins_with_the_weights_that_ship_and_a_wider_network_does_as_they_do(rounds: list[Round]):
+    shipped = shipped_network("physgraph")
+    config = shipped.config
+    assert isinstance(config, PhysgraphConfig)
+    vectors = torch.randn((50, len(config.vectors), 3), generator=torch.Generator().manual_seed(1))
+    none = PatchConfig(count=0)
+    for width in (config.width, 2 * config.width):
+        run = TrainConfig(network=replace(config, width=width), patches=none, held_out=0, start="shipped")
+        network = Trainer(run, data=([], rounds, [], [])).network
+        torch.testing.assert_close(network(vectors, 3), shipped(vectors, 3))
+
+
+def test_iterations_on_rounds_change_the_weights(rounds: list[Round]):
+    run = TrainConfig(
+        network=PhysgraphConfig(width=8), held_out=0, iterations=2, unroll=2, segments=1, rounds=replace(FEW, share=1.0)
+    )
+    trainer = Trainer(run, data=([], rounds, [], rounds[:2]))
+    before = [each.detach().clone() for each in trainer.network.parameters()]
+    trainer.train()
+    assert any(not torch.equal(a, b) for a, b in zip(before, trainer.network.parameters(), strict=True))
+    assert all(value > 0.0 for value in trainer.held_out_ratios().values())
