@@ -1,4 +1,4 @@
-"""What an integrator sees of contact: starts of rounds, noted while our own solver refines moving scenes.
+"""Rounds with contact to train on: where they begin, noted while our own solver refines moving scenes.
 
 A round is a level's system with what is near as it was found there (planes of bodies, pairs of cloth), tied to the last
 frame's detail where it is warm, and the positions that its steps begin at. All of it is plain arrays: rounds are made
