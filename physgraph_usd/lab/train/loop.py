@@ -276,7 +276,7 @@ Data = tuple[list[Patch], list[Round], list[Patch], list[Round]]
 
 
 def data_of(config: TrainConfig, *, workers: int | None = None) -> Data:
-    """Patches and rounds of a configuration, to train and to measure on, the same for a seed with any number of processes."""
+    """Patches and rounds of a configuration, the same for a seed with any number of processes."""
     workers = os.cpu_count() or 1 if workers is None else workers
     held, other = config.held_out, 10_000 + config.seed
     patches = make_patches(config.patches, seed=config.seed, workers=min(workers, config.patches.count // 8))
