@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from cloth import frame_of, refiner_of, sheet, solved, wave
 from folds import frame_with, named, refiner_with, square
 from sheets import garment_of
+from shots import refine
 
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.frame.problem import LONGER, LONGER_CUDA, Choice, Problem, choose
@@ -26,6 +29,7 @@ class Cold:
     remaining: float = 0.3
     warm: bool = False
     device: str = "cpu"
+    misled: bool = False
 
 
 def chosen(nested: bool | None, *given: Any, **options: Any) -> Choice:
@@ -63,6 +67,24 @@ def test_the_network_makes_the_steps_unless_the_cage_is_not_subdivided_or_crosse
         assert found.learned == (subdivisions > 0 and not touch.get("crossed", False))
         assert (found.touching < 1.0) == (found.learned and warm)
         assert not chosen(True, subdivisions, **options, **touch).learned
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_what_misled_the_network_is_quasi_newtons_while_it_stays_warm(*, warm: bool):
+    found = chosen(None, 2, misled=True, warm=warm)
+    assert found.learned != warm
+    assert found.touching == 1.0
+
+
+@pytest.mark.slow
+def test_layers_that_are_shaken_end_about_as_low_as_by_quasi_newton(sample: Callable[[str], Path], tmp_path: Path):
+    """The network, whose steps are nearly all corrected there, ended at three to ten times the energy."""
+    ends = []
+    for who in ("auto", "quasi-newton"):
+        report = refine(sample("layers"), tmp_path / f"{who}.usdc", integrator=who, level=2, frames=(6.0, 9.0))
+        garments = report.frames[-1]["garments"]
+        ends.append(sum(sum(each["energy_joules"]["output"].values()) for each in garments))
+    assert ends[0] < 1.3 * ends[1]
 
 
 @pytest.mark.parametrize("move", [0.02, 0.3])

@@ -109,6 +109,7 @@ class Problem:
         walked: Where the cages walked to from an earlier frame [m], for a cold start; or None.
         before: Where it was [m], float64; None where there is no last frame.
         tether: How stiffly it is tied to its start [1/s^2]; None where it is not.
+        misled: As in the `State` that it starts from.
     """
 
     began: float
@@ -122,6 +123,7 @@ class Problem:
     walked: Float[Tensor, "coarse 3"] | None
     before: Placed | None
     tether: float | None
+    misled: bool
 
     @property
     def warm(self) -> bool:
@@ -232,6 +234,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
         before=before,
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
+        misled=last is not None and last.misled,
     )
 
 
@@ -243,7 +246,8 @@ class Choice:
     it is within 1.1 of the best method's time to its energy more often than quasi-Newton is, in each of these
     (`python -m benchmarks.choice`; docs/notes/chart.md has the table). Quasi-Newton draws apart what crosses, and
     solves cages that cross themselves, where the network leaves more jumps and vertices in bodies, and those that are
-    not subdivided.
+    not subdivided. A frame in which most of the network's steps raised the energy, and which ended far from rest, hands
+    over to it too, until cloth is near rest again: three layers that are shaken ended at ten times the energy so.
 
     Coarse levels are cheap and carry folds far, but each has a start of its own. Under one subdivision lies one
     coarse level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where cloth
@@ -279,7 +283,7 @@ def choose(problem: Problem, nested: bool | None) -> Choice:
     warm, subdivisions = problem.warm, problem.finest
     if nested is not None:
         return Choice(nested and not warm)
-    learned = subdivisions > 0 and not problem.crossed
+    learned = subdivisions > 0 and not problem.crossed and not (warm and problem.misled)
     if warm:
         return Choice(False, learned=learned, touching=FEWER if learned else 1.0)
     cuda = problem.device != "cpu"

@@ -20,6 +20,7 @@ from ..contact.metric import SMOOTH, HeldMetric
 from ..deadline import is_over
 from ..forces.base import ForceModule
 from ..integrate.base import Carry, System
+from ..integrate.guard import PATIENCE
 from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, descend, solve_level
 from ..level import Placed, unhindered
@@ -68,7 +69,8 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
         raise SolveError(broken) from error
     assert x is not None
-    shown, left, finish = scaled(problem, x), state_left(problem, x), dict[str, object]()
+    left = state_left(problem, x, reports, learned=choice.learned)
+    shown, finish = scaled(problem, x), dict[str, object]()
     if problem.contact is not None:
         shown, finish = problem.contact.finish(shown)
     solved = time.perf_counter()
@@ -105,7 +107,7 @@ def solve_one_level(
         x = view.moved(x, x + smoothing) if level.index else x
         view, terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
-    carry, last, terms, made, touched = None, None, (), 0, False
+    carry, last, terms, made, touched, integrator = None, None, (), 0, False, problem.integrator
     while not made or made < _most_steps(budget, reports[-1], touched=touched):
         view, terms = view.terms(x)
         if terms and not touched:
@@ -113,7 +115,7 @@ def solve_one_level(
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
         of_round = _round_budget(budget, system, first=not made, steps=STEPS if terms else LONGEST)
-        carry, report = descend(system, problem.integrator, x, level=level.index, budget=of_round, resume=resume)
+        carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)
         reports.append(report)
         made += report.steps
@@ -122,7 +124,9 @@ def solve_one_level(
         blocked = x is not wanted
         if _is_last(report, blocked=blocked) or (smoothing is None and _is_near(report, budget, made)):
             break
-        if blocked:  # Corrections of the guard were made for other positions.
+        if carry.setbacks >= PATIENCE:
+            integrator, budget, carry = problem.untangler, problem.budget, None
+        elif blocked:  # Corrections of the guard were made for other positions.
             carry = None if carry.setbacks else replace(carry, x=x)
     return x, reports, ForceModule((*problem.module.forces, *terms))
 

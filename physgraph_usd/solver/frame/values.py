@@ -62,6 +62,7 @@ class State:
         held: For how many frames the pose had been held.
         fine: Fine positions [m], world space, float64, from which cloth walks on; None before it was solved.
         clean: Whether nothing of what was solved together crosses there.
+        misled: Whether the network's steps raised the energy while the cloth was far from rest.
     """
 
     coarse: Float[Tensor, "coarse 3"]
@@ -70,6 +71,7 @@ class State:
     held: int = 0
     fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
+    misled: bool = False
 
     def about(self, origin: np.ndarray) -> Placed | None:
         """Fine positions about an origin [m], float64, where cloth walks; else None."""
@@ -99,7 +101,8 @@ def join(parts: Sequence[State]) -> State:
     fine = [part.fine for part in parts if part.fine is not None]
     walked = torch.cat(fine) if len(fine) == len(parts) else None
     clean = all(part.clean for part in parts)
-    return State(*whole, held=min(part.held for part in parts), fine=walked, clean=clean)
+    misled = any(part.misled for part in parts)
+    return State(*whole, held=min(part.held for part in parts), fine=walked, clean=clean, misled=misled)
 
 
 def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
