@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..mesh.stencil import add_at
+from ..mesh.stencil import Stencil, add_at
 from .base import Solver
 from .multifrontal import DissectedSolver, Elimination
 
@@ -141,7 +141,7 @@ class MergedMetric(Metric):
         device, moves = free.device, (representative == np.arange(count)) & ~held
         self.label = label
         self._representative = torch.as_tensor(representative, device=device)
-        self._several = torch.as_tensor(np.flatnonzero(members[group] > 1), device=device)
+        self._sum = Stencil(joined, dtype=dtype, device=str(device))
         self._members = torch.as_tensor(members[group], device=device).double()
         super().__init__(
             sp.csr_matrix(joined @ matrix @ joined.T),
@@ -151,21 +151,15 @@ class MergedMetric(Metric):
 
     def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
         """The metric held by springs [N/m]; what holds one vertex of a label holds all."""
-        return super().plus(self._gathered(springs))
+        return super().plus(add_at(torch.zeros_like(springs), self._representative, springs))
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 of each label's force together [m], the same move for all of it."""
-        return super().solve(self._gathered(force))[self._representative]
+        return super().solve(self._sum.apply(force))[self._representative]
 
     def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
         """The solve of R H0^-1 R F [m], each label's force together."""
         return lambda force: self.solve(force * factor).mul_(factor)
-
-    def _gathered(self, values: Tensor) -> Tensor:
-        """The sum of each label's values at its first vertex."""
-        out, each = values.clone(), self._several
-        out[each] = 0.0
-        return add_at(out, self._representative[each], values[each])
 
     def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
         """Factorise with a diagonal [N/m], of which each vertex has its part."""
