@@ -32,6 +32,7 @@ class Motion:
     asked: wp.array(dtype=wp.bool)
     tangle: wp.array(dtype=wp.int32)
     share: wp.float64
+    most: wp.float64
     floor: wp.float64
     is_still: wp.bool
     radius: wp.array(dtype=wp.float64)
@@ -98,10 +99,26 @@ def highest_of(v: wp.vec3d):
 
 
 @wp.func
-def reach_of(boxes: Boxes, i: wp.int32, j: wp.int32):
-    """How much nearer parts of two clusters can come, or the distance asked for."""
-    move = wp.length(boxes.mean[i] - boxes.mean[j]) + boxes.spread[i] + boxes.spread[j]
-    return move + boxes.radius[i] + boxes.radius[j]
+def room_of(boxes: Boxes, motion: Motion, i: wp.int32, j: wp.int32):
+    """Distance of parts of two clusters that is asked for at least, on their way or where nothing moves."""
+    return boxes.radius[i] + boxes.radius[j] + motion.most
+
+
+@wp.func
+def pass_by(boxes: Boxes, i: wp.int32, j: wp.int32, room: wp.float64):
+    """Whether two clusters keep a distance on their way: the box that one sweeps, seen from the other, does."""
+    way = boxes.mean[i] - boxes.mean[j]
+    reach = room + boxes.spread[i] + boxes.spread[j]
+    low, high = boxes.low[i] + wp.min(way, wp.vec3d()), boxes.high[i] + wp.max(way, wp.vec3d())
+    if outside(low, high, boxes.low[j], boxes.high[j], reach):
+        return True
+    # Their middles on the segment that one goes, seen from the other, against the balls round them.
+    between = wp.float64(0.5) * (boxes.low[j] + boxes.high[j] - boxes.low[i] - boxes.high[i])
+    part = wp.clamp(
+        wp.dot(between, way) / wp.max(wp.dot(way, way), wp.float64(1.0e-300)), wp.float64(0.0), wp.float64(1.0)
+    )
+    sizes = wp.length(boxes.high[i] - boxes.low[i]) + wp.length(boxes.high[j] - boxes.low[j])
+    return wp.length(between - part * way) > wp.float64(0.5) * sizes + reach
 
 
 @wp.kernel

@@ -118,9 +118,7 @@ def find_crossings(
     """The edges of either of two clusters that pass through faces of the other, so far as there is room."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
-    if not found.asked[n] or found.begin[n + 1] == found.begin[n]:
-        return
-    if outside(boxes.low[i], boxes.high[i], boxes.low[j], boxes.high[j], wp.float64(0.0)):
+    if found.begin[n + 1] == found.begin[n]:
         return
     count = edges_through(parts, motion, boxes, found, n, i, j, 0)
     if i != j:

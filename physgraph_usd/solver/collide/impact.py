@@ -39,15 +39,15 @@ def motion_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
 
 
 @wp.func
-def kept_of(distance: wp.float64, share: wp.float64, floor: wp.float64):
-    """What is kept of a distance: a share, and all but a tenth of what is under a floor."""
-    return wp.max(share * distance, wp.min(wp.float64(0.9) * distance, floor))
+def kept_of(distance: wp.float64, share: wp.float64, most: wp.float64, floor: wp.float64):
+    """What is kept of a distance: a share, up to so much, and all but a tenth of what is under a floor."""
+    return wp.max(wp.min(share * distance, most), wp.min(wp.float64(0.9) * distance, floor))
 
 
 @wp.func
-def can_meet(distance: wp.float64, bound: wp.float64, share: wp.float64, floor: wp.float64):
+def can_meet(distance: wp.float64, bound: wp.float64, share: wp.float64, most: wp.float64, floor: wp.float64):
     """Whether parts at least a distance apart that come nearer by at most a bound may come nearer than they may."""
-    return distance - kept_of(distance, share, floor) < bound
+    return distance - kept_of(distance, share, most, floor) < bound
 
 
 @wp.func
@@ -62,6 +62,7 @@ def impact_of(
     p: wp.vec3d,
     q: wp.vec3d,
     share: wp.float64,
+    most: wp.float64,
     floor: wp.float64,
 ):
     """Part of their ways u, v, p, q that the corners a, b, c, d can go, in (0, 1]; 1 where the parts touch already."""
@@ -73,7 +74,7 @@ def impact_of(
     mean = wp.float64(0.25) * (u + v + p + q)
     u, v, p, q = u - mean, v - mean, p - mean, q - mean
     distance = distance_of(face, zero, b, c, d)
-    keep = kept_of(distance, share, floor)
+    keep = kept_of(distance, share, most, floor)
     if distance <= wp.float64(0.0) or distance - keep >= bound:
         return one
     time = wp.float64(0.0)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.threads import LEAST_QUERIES, argument, run
-from .boxes import Boxes, Motion, highest_of, lowest_of, outside, overlap, reach_of
+from .boxes import Boxes, Motion, highest_of, lowest_of, outside, overlap, pass_by, room_of
 from .broad_phase import launch
 from .impact import can_meet, distance_of, impact_of, motion_of
 from .parts import Parts
@@ -24,10 +24,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Found:
-    """Which pairs of clusters are asked, where each writes its pairs of parts, how many it has, and what `Pairs`
-    holds."""
+    """Where each pair of clusters writes its pairs of parts, how many it has, and what `Pairs` holds."""
 
-    asked: wp.array(dtype=wp.bool)
     begin: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
     corners: wp.array(dtype=wp.vec4i)
@@ -181,9 +179,10 @@ def value_of(
     if motion.is_still:
         return nearness(face, a, b, c, d, parts, motion)
     u, v, p, q = motion.path[a], motion.path[b], motion.path[c], motion.path[d]
-    if not can_meet(box_gap(face, x, y, z, w), motion_of(face, u, v, p, q), motion.share, motion.floor):
+    share, most, floor = motion.share, motion.most, motion.floor
+    if not can_meet(box_gap(face, x, y, z, w), motion_of(face, u, v, p, q), share, most, floor):
         return none
-    return impact_of(face, x, y, z, w, u, v, p, q, motion.share, motion.floor)
+    return impact_of(face, x, y, z, w, u, v, p, q, share, most, floor)
 
 
 @wp.func
@@ -198,13 +197,16 @@ def faces_met(
     count: wp.int32,
 ):
     """Write the pairs of a cluster's vertices and another's faces; the number of pairs so far."""
-    reach = reach_of(boxes, i, j)
+    reach = room_of(boxes, motion, i, j)
     for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
         v = parts.vertices[k]
         at = motion.start[v]
-        if outside(at, at, boxes.low[j], boxes.high[j], reach):
+        way = motion.path[v] - boxes.mean[j]
+        lowest = at + wp.min(way, wp.vec3d()) - wp.vec3d(reach + boxes.spread[j])
+        highest = at + wp.max(way, wp.vec3d()) + wp.vec3d(reach + boxes.spread[j])
+        if outside(lowest, highest, boxes.low[j], boxes.high[j], wp.float64(0.0)):
             continue
-        low, high = lowest_of(at - wp.vec3d(reach)), highest_of(at + wp.vec3d(reach))
+        low, high = lowest_of(lowest), highest_of(highest)
         for m in range(parts.first_face[j], parts.first_face[j + 1]):
             if not overlap(low, high, boxes.face_low[m], boxes.face_high[m]):
                 continue
@@ -230,14 +232,18 @@ def edges_met(
     count: wp.int32,
 ):
     """Write the pairs of the edges of two clusters, each once; the number of pairs so far."""
-    reach = reach_of(boxes, i, j)
+    reach = room_of(boxes, motion, i, j)
     for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
         e = parts.edges[k]
         near, far = motion.start[e[0]], motion.start[e[1]]
-        if outside(wp.min(near, far), wp.max(near, far), boxes.low[j], boxes.high[j], reach):
+        end, other = motion.path[e[0]] - boxes.mean[j], motion.path[e[1]] - boxes.mean[j]
+        lowest = wp.min(near + wp.min(end, wp.vec3d()), far + wp.min(other, wp.vec3d()))
+        highest = wp.max(near + wp.max(end, wp.vec3d()), far + wp.max(other, wp.vec3d()))
+        lowest -= wp.vec3d(reach + boxes.spread[j])
+        highest += wp.vec3d(reach + boxes.spread[j])
+        if outside(lowest, highest, boxes.low[j], boxes.high[j], wp.float64(0.0)):
             continue
-        low = lowest_of(wp.min(near, far) - wp.vec3d(reach))
-        high = highest_of(wp.max(near, far) + wp.vec3d(reach))
+        low, high = lowest_of(lowest), highest_of(highest)
         for m in range(wp.where(i == j, k + 1, parts.first_edge[j]), parts.first_edge[j + 1]):
             if not overlap(low, high, boxes.edge_low[m], boxes.edge_high[m]):
                 continue
@@ -252,17 +258,33 @@ def edges_met(
 
 
 @wp.kernel
+def choose_clusters(
+    first: wp.int32,
+    parts: Topology,
+    clusters: wp.array(dtype=wp.vec2i),
+    motion: Motion,
+    boxes: Boxes,
+    asked: wp.array(dtype=wp.bool),
+):
+    """Of pairs of clusters that are asked, leave those in which a vertex is, and which do not pass one another by."""
+    n = first + wp.tid()
+    i, j = clusters[n][0], clusters[n][1]
+    if not asked[n]:
+        return
+    if boxes.asked[i] == 0 and boxes.asked[j] == 0:
+        asked[n] = False
+    elif pass_by(boxes, i, j, room_of(boxes, motion, i, j)):
+        asked[n] = False
+
+
+@wp.kernel
 def find_pairs(
     first: wp.int32, parts: Topology, clusters: wp.array(dtype=wp.vec2i), motion: Motion, boxes: Boxes, found: Found
 ):
     """The pairs of each two clusters' vertices with faces and of edges with edges, so far as there is room."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
-    if not found.asked[n] or found.begin[n + 1] == found.begin[n]:
-        return
-    if boxes.asked[i] == 0 and boxes.asked[j] == 0:
-        return
-    if outside(boxes.low[i], boxes.high[i], boxes.low[j], boxes.high[j], reach_of(boxes, i, j)):
+    if found.begin[n + 1] == found.begin[n]:
         return
     count = faces_met(parts, motion, boxes, found, n, i, j, 0)
     if i != j:
@@ -333,11 +355,15 @@ def find(
     Returns:
         The pairs, and which pair of clusters each is of.
     """
-    size, device = len(clusters), clusters.device
+    device = clusters.device
+    asked = torch.ones(len(clusters), dtype=torch.bool, device=device) if asked is None else asked.clone()
+    chosen = [argument(clusters, wp.vec2i), motion, boxes, argument(asked)]
+    launch(parts, choose_clusters, len(clusters), *chosen)
+    which = torch.nonzero(asked).squeeze(1)
+    clusters, size = clusters[which], len(which)
     if not size:
-        return _room(0, device), torch.zeros(0, dtype=torch.int64, device=device)
-    asked = torch.ones(size, dtype=torch.bool, device=device) if asked is None else asked
-    inputs = (parts, clusters, kernel, motion, boxes, asked)
+        return _room(0, device), which
+    inputs = (parts, clusters, kernel, motion, boxes)
     begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
     count = torch.zeros_like(begin[:size])
     found = _write(*inputs, begin=begin, count=count, out=_room(room * size, device))
@@ -346,13 +372,13 @@ def find(
     total, most = torch.stack([ends[-1], count.amax()]).tolist()
     first, owner = _packed(parts, found, ends, size=size, room=room, total=total)
     if most <= room:
-        return first, owner
+        return first, which[owner]
     begin[0] = 0  # Those without room are written again, now that they are counted.
     begin[1:] = (count * over).cumsum(dim=0)
     rest = _room(int(begin[-1]), device)
     _write(*inputs, begin=begin, count=count, out=rest)
     more = torch.arange(size, device=device).repeat_interleave(count * over)
-    return first.joined(rest), torch.cat([owner, more])
+    return first.joined(rest), which[torch.cat([owner, more])]
 
 
 def _packed(
@@ -373,7 +399,6 @@ def _write(
     kernel: wp.Kernel,
     motion: Any,
     boxes: Any,
-    asked: Tensor,
     *,
     begin: Tensor,
     count: Tensor,
@@ -381,7 +406,7 @@ def _write(
 ) -> Any:
     """Count the pairs of each two clusters, and write those that there is room for; where that is."""
     found = Found()
-    found.asked, found.begin, found.count = (wp.from_torch(each) for each in (asked, begin, count))
+    found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
     found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
     pairs = argument(clusters, wp.vec2i)

@@ -4,6 +4,8 @@
 # pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -18,8 +20,8 @@ from ..mesh.threads import Launch, argument
 
 wp.set_module_options({"enable_backward": False})
 
-COMES = 0.5
-"""Part of its distance by which a pair may come nearer: the promise lets it come by four fifths."""
+COMES = 0.6
+"""Part by which a pair may come nearer of what the promise lets it: what it goes besides turns it a little."""
 PASSES = 16
 """Passes over the pairs: what is left is cut back by the promise."""
 
@@ -64,56 +66,97 @@ def _add_pushes(
     way[v] = total
 
 
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """What pairs must not pass on their ways: a linear inequality each.
+
+    Attributes:
+        corners: Of each pair, shape (N, 4), int32.
+        weight: Of its corners in the way between its parts, shape (N, 4).
+        normal: Along that way, shape (N, 3).
+        may: How much nearer the parts may come along it [m], shape (N,).
+    """
+
+    corners: Int[Tensor, "pairs 4"]
+    weight: Float[Tensor, "pairs 4"]
+    normal: Float[Tensor, "pairs 3"]
+    may: Float[Tensor, " pairs"]
+
+    @staticmethod
+    def of(x: Tensor, way: Tensor | None, met: Pairs, keeps: Callable[[Tensor], Tensor]) -> Planes:
+        """Planes between the parts of pairs: where they are, or where they came too near on a way.
+
+        Args:
+            x: Positions [m], float64, shape (V, 3).
+            way: The way on which they came too near [m], float64, shape (V, 3); None where they are.
+            met: The pairs.
+            keeps: What pairs keep of their distances [m].
+        """
+        met = met.where(_distinct(met, len(x)))
+        places, face = met.corners.long(), met.face.bool()
+        at = x[places]
+        there = at if way is None else at + met.value.reshape(-1, 1, 1) * way[places]
+        own = torch.arange(4 * len(places), dtype=torch.int32, device=x.device).reshape(-1, 4)
+        weight = weights(there.reshape(-1, 3), own, face)
+        apart = (weight.unsqueeze(2) * there).sum(dim=1)
+        normal = apart / apart.norm(dim=1, keepdim=True).clamp_min(1e-300)
+        distance = _between(at, met) if way is not None else apart.norm(dim=1)
+        need = distance if way is not None else distance - COMES * (distance - keeps(distance))
+        return Planes(met.corners, weight, normal, (weight * (at @ normal.unsqueeze(2)).squeeze(2)).sum(dim=1) - need)
+
+    def joined(self, other: Planes) -> Planes:
+        """These planes and others."""
+        pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
+        return Planes(*(torch.cat(pair) for pair in pairs))
+
+
 def along(
-    x: Float[Tensor, "vertices 3"],
-    way: Float[Tensor, "vertices 3"],
-    met: Pairs,
-    *,
-    free: Bool[Tensor, "vertices 1"],
-    threads: int = 1,
+    way: Float[Tensor, "vertices 3"], planes: Planes, *, free: Bool[Tensor, "vertices 1"], threads: int = 1
 ) -> Float[Tensor, "vertices 3"]:
-    """The ways nearest to those wanted [m] on which no pair comes nearer than it may.
+    """The ways nearest to those wanted [m] on which no pair passes a plane.
 
     What counts is how the two parts of a pair move against each other: layers that move together go on together. The
     least squares under one linear inequality a pair are solved by Jacobi's method on the multipliers, each vertex
     split among its pairs (Tonge et al. 2012).
 
     Args:
-        x: Positions [m], float64.
         way: How far each vertex wants to go [m], float64.
-        met: The pairs.
+        planes: The planes of what is in the way.
         free: Which vertices may go another way than they want.
         threads: Most threads on the CPU.
     """
-    if not len(met.value):
+    if not len(planes.may):
         return way
-    corners, face = _distinct(met, len(x))
-    weight, places = weights(x, corners, face), corners.long()
-    apart = (weight.unsqueeze(2) * x[places]).sum(dim=1)
-    distance = apart.norm(dim=1)
-    normal = apart / distance.clamp_min(1e-300).unsqueeze(1)
-    starts, slots = incidence(places, len(x))
+    places, weight = planes.corners.long(), planes.weight.contiguous()
+    starts, slots = incidence(places, len(way))
     gives = (weight * free[places].squeeze(2)).contiguous()
-    count = starts.diff().to(x)
+    count = starts.diff().to(way)
     stiffness = (gives.square() * count[places]).sum(dim=1).clamp_min(1e-300)
-    pairs = [argument(corners, wp.vec4i), *(argument(each, wp.vec4d) for each in (weight, gives))]
-    pairs += [argument(normal.contiguous(), wp.vec3d)]
+    pairs = [argument(planes.corners.contiguous(), wp.vec4i), *(argument(each, wp.vec4d) for each in (weight, gives))]
+    pairs += [_vectors(planes.normal)]
     moved = way.clone(memory_format=torch.contiguous_format)
-    push, wanted, out = argument(torch.zeros_like(distance)), _vectors(way), _vectors(moved)
-    push_apart = [*pairs[:2], pairs[3], argument(COMES * distance), argument(stiffness), out, push]
+    push, wanted, out = argument(torch.zeros_like(planes.may)), _vectors(way), _vectors(moved)
+    push_apart = [*pairs[:2], pairs[3], argument(planes.may), argument(stiffness), out, push]
     add_pushes = [argument(starts), argument(slots), pairs[2], pairs[3], push, wanted, out]
-    launched = {"device": str(x.device), "threads": threads}
+    launched = {"device": str(way.device), "threads": threads}
     launches = [
-        Launch(_push_apart, len(corners), push_apart, **launched),
-        Launch(_add_pushes, len(x), add_pushes, **launched),
+        Launch(_push_apart, len(places), push_apart, **launched),
+        Launch(_add_pushes, len(way), add_pushes, **launched),
     ]
     for launch in launches * PASSES:
         launch({})
     return moved
 
 
-def _distinct(met: Pairs, count: int) -> tuple[Int[Tensor, "pairs 4"], Bool[Tensor, " pairs"]]:
-    """Corners of each pair once, in their order, and whether it is of a vertex and a face.
+def _between(at: Float[Tensor, "pairs 4 3"], met: Pairs) -> Float[Tensor, " pairs"]:
+    """Distance of each pair's parts, whose corners are there [m]."""
+    own = torch.arange(4 * len(at), dtype=torch.int32, device=at.device).reshape(-1, 4)
+    weight = weights(at.reshape(-1, 3), own, met.face.bool())
+    return (weight.unsqueeze(2) * at).sum(dim=1).norm(dim=1)
+
+
+def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:
+    """Numbers of pairs, each once, in the order of their corners.
 
     Two sorts of whole numbers: `torch.unique` of rows compares them number by number, some ten times as slowly.
 
@@ -128,8 +171,7 @@ def _distinct(met: Pairs, count: int) -> tuple[Int[Tensor, "pairs 4"], Bool[Tens
     first, second = first[order], second[order]
     kept = torch.ones_like(first, dtype=torch.bool)
     kept[1:] = (first[1:] != first[:-1]) | (second[1:] != second[:-1])
-    order = order[torch.nonzero(kept).squeeze(1)]
-    return met.corners[order], met.face[order].bool()
+    return order[torch.nonzero(kept).squeeze(1)]
 
 
 def _vectors(x: Tensor) -> Any:

@@ -2,29 +2,38 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
+from functools import partial
+from typing import TypedDict
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..collide.detector import Detector
 from ..collide.narrow_phase import Pairs
 from ..deadline import is_over
 from ..level import Placed
-from ..mesh.stencil import add_at
-from .along import along
+from .along import Planes, along
 from .cloth import ClothView
-from .safe_move import in_the_way, safe_move
+from .safe_move import in_the_way, kept, safe_move
 
-WIDTHS = (16.0, 8.0, 4.0, 2.0)
-"""Cells in which cloth is carried together where something is in the way of its own ways, in edge lengths."""
 LONG = 1.0
-"""Mean edges beyond which a move is carried together: what a shorter one loses comes in the next round."""
+"""Mean edges by which cloth may be cut short: what a move loses comes in the next round."""
+ROUNDS = 4
+"""How often it is found what else is in the way of vertices that go along what was, before they are cut short."""
 GOES = 3
-"""How often what is then left of each way is gone: what was in the way may have gone too."""
+"""How often what is left of each way is gone: what was in the way may have gone too."""
 TRIES = 4
 """How often tangles in which more crosses are held to the promise, before all are."""
+
+
+class _Given(TypedDict):
+    """What `safe_move` takes besides positions and parts."""
+
+    floor: float
+    tangle: Int[Tensor, " vertices"] | None
+    detector: Detector
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,54 +77,49 @@ class Promise:
     def _go(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None) -> Placed:
         """The same, with nothing promised to what is in a tangle against what is in the same.
 
-        First goes what cloth in a place has in common of its ways, in ever smaller places: layers that move together
-        hold nothing up. Then each vertex goes what is left of its own way, along what was in it.
+        Where something is in the way each vertex goes along it; what was cut short goes on from where it came to.
         """
-        given = {"floor": self.floor, "tangle": tangle, "detector": self.view.detector}
-        parts, moves = self.view.parts, (aim != start).any(dim=1, keepdim=True)
+        parts = self.view.parts
+        given = _Given(floor=self.floor, tangle=tangle, detector=self.view.detector)
         met = in_the_way(start, aim, parts, **given)
         if not len(met.value):
             return Placed(aim)
-        is_long = float((aim - start).norm(dim=1).max()) > LONG * parts.spacing
-        x, met = start, Pairs.none(start.device) if is_long else met
-        for width in (*(WIDTHS if is_long else ()), *(0.0,) * GOES):
-            at, rest = x.double(), aim.double() - x.double()
-            if width:
-                way = moves * carried(at, rest, width=width * parts.spacing)
-            else:
-                way = along(at, rest, met, free=moves & parts.level.free, threads=parts.level.threads)
-            moved = safe_move(x, self.view.closed((at + way).to(aim)), parts, **given)
-            x, met = moved.x, met.joined(moved.met)
-            if is_over() or (not width and not bool(moved.short.any())):
+        x = start
+        for _ in range(GOES):
+            x, late = self._along(x, aim, met, given)
+            if late <= LONG * parts.spacing or is_over():
                 break
-        return Placed(aim) if torch.equal(x, aim) else x
+            met = in_the_way(x, aim, parts, **given)
+        return x
+
+    def _along(self, start: Placed, aim: Tensor, met: Pairs, given: _Given) -> tuple[Placed, float]:
+        """Where cloth comes that goes along what is in its way, and by how much it was cut short at most [m].
+
+        What has changed since it was asked last is asked again, and nothing else.
+
+        Args:
+            start: Where it is [m].
+            aim: Where it is to go [m].
+            met: The pairs in the way.
+            given: As `safe_move` takes it.
+        """
+        parts, at, ends = self.view.parts, start.double(), aim
+        wanted, free = aim.double() - at, (aim != start).any(dim=1, keepdim=True) & parts.level.free
+        keeps = partial(kept, spacing=parts.spacing, floor=self.floor)
+        way, planes = wanted, Planes.of(at, None, met, keeps)
+        for _ in range(ROUNDS):
+            if not len(met.value):
+                return Placed(aim if torch.equal(ends, aim) else ends), 0.0
+            last, way = ends, along(wanted, planes, free=free, threads=parts.level.threads)
+            ends = self.view.closed((at + way).to(aim))
+            met = in_the_way(start, ends, parts, **given, asked=_corners(met, (ends != last).any(dim=1)))
+            planes = planes.joined(Planes.of(at, ends.double() - at, met, keeps))
+        moved = safe_move(start, ends, parts, **given, asked=_corners(met, torch.zeros_like(free[:, 0])))
+        return moved.x, float(((1.0 - moved.share) * way.norm(dim=1)).max())
 
 
-def carried(
-    x: Float[Tensor, "vertices 3"], way: Float[Tensor, "vertices 3"], *, width: float
-) -> Float[Tensor, "vertices 3"]:
-    """The part of each vertex's way that cloth round it shares, as a smooth field of space (Harlow 1964).
-
-    Ways are averaged in the cells of a grid and read back linearly between their centres, so that two layers which are
-    near each other go nearly the same way: such a move brings nothing together, however far it goes.
-
-    Args:
-        x: Positions [m], float64.
-        way: How far each vertex is to go [m], float64.
-        width: Width of the cells [m].
-    """
-    place = (x - x.amin(dim=0)) / width
-    cell = place.floor()
-    part, size = place - cell, cell.amax(dim=0).long() + 2
-    weights, nodes = [], []
-    for corner in itertools.product((0.0, 1.0), repeat=3):
-        at = torch.tensor(corner, dtype=torch.float64, device=x.device)
-        weights.append((at * part + (1.0 - at) * (1.0 - part)).prod(dim=1))
-        index = (cell + at).long()
-        nodes.append((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2])
-    weight, node = torch.stack(weights), torch.unique(torch.stack(nodes), return_inverse=True)[1]
-    total = way.new_zeros((int(node.max()) + 1, 4))
-    share = torch.cat([weight.unsqueeze(2) * way, weight.unsqueeze(2)], dim=2)
-    total = add_at(total, node.reshape(-1), share.reshape(-1, 4))
-    mean = total[:, :3] / total[:, 3:].clamp_min(1e-300)
-    return (weight.unsqueeze(2) * mean[node]).sum(dim=0)
+def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:
+    """The corners of pairs, and other vertices."""
+    asked = others.clone()
+    asked[met.corners.long().reshape(-1)] = True
+    return asked

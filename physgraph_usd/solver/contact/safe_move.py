@@ -25,7 +25,10 @@ from ..deadline import is_over
 from ..level import Placed
 
 KEPT = 0.2
-"""Part of its distance that a pair keeps in one move: it may come as near as it likes in several."""
+"""Part of its distance that a pair keeps in one move, of more than a mean edge that of an edge: it may come as near as
+it likes in several."""
+TIGHT = 0.9
+"""The same under the floor."""
 BACK = 0.9
 """Part of the way to an impact that its vertices go: others, cut in turn, may come nearer than they were to."""
 STRAINS, LEAST = 0.5, 0.01
@@ -63,6 +66,7 @@ def safe_move(
     floor: float,
     tangle: Int[Tensor, " vertices"] | None = None,
     detector: Detector | None = None,
+    asked: Bool[Tensor, " vertices"] | None = None,
 ) -> Moved:
     """Move vertices as far towards wanted positions as no pair of parts comes too near.
 
@@ -78,6 +82,8 @@ def safe_move(
         tangle: The tangle that each vertex is in, int32, -1 where in none: to what is in one nothing is promised
             against what is in the same; or None.
         detector: What has detected before with the same parts, or None.
+        asked: Vertices in all of whose pairs nothing is known of the way; pairs of others are known not to come too
+            near on it. None where nothing is known.
 
     Returns:
         Positions, ``wanted`` itself where nothing is in the way, and how far vertices have come.
@@ -85,7 +91,7 @@ def safe_move(
     at = start.double()
     way = wanted.double() - at
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
-    x, asked = wanted, (way != 0).any(dim=1)
+    x, asked = wanted, (way != 0).any(dim=1) if asked is None else asked
     detector = detector or Detector.once(parts)
     met = Pairs.none(way.device)
     for attempt in range(len(way) + SHORTENINGS):
@@ -111,11 +117,23 @@ def in_the_way(
     floor: float,
     tangle: Int[Tensor, " vertices"] | None = None,
     detector: Detector | None = None,
+    asked: Bool[Tensor, " vertices"] | None = None,
 ) -> Pairs:
     """The pairs that would come too near on the straight way to what is wanted, all as for `safe_move`."""
     detector = detector or Detector.once(parts)
-    asked = (wanted.double() != start.double()).any(dim=1)
+    asked = (wanted.double() != start.double()).any(dim=1) if asked is None else asked
     return detector.impacts(start, wanted, share=KEPT, floor=floor, asked=asked, tangle=tangle)
+
+
+def kept(distance: Float[Tensor, " pairs"], *, spacing: float, floor: float) -> Float[Tensor, " pairs"]:
+    """What pairs keep of their distances in one move [m].
+
+    Args:
+        distance: Their distances [m].
+        spacing: Mean edge at rest [m]: of more than that they keep no more than of that.
+        floor: As for `safe_move` [m].
+    """
+    return torch.maximum(KEPT * distance.clamp_max(spacing), (TIGHT * distance).clamp_max(floor))
 
 
 def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
