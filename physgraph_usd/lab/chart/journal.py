@@ -10,7 +10,7 @@ from typing import Any
 from ...errors import UsageError
 
 NAME = "chart.rows.jsonl"
-KINDS = ("problem", "plan", "reference", "point", "failed", "term")
+KINDS = ("problem", "plan", "reference", "point", "warm", "failed", "term")
 """Kinds of rows."""
 REMEDY = "take that line out, or measure anew with --overwrite"
 

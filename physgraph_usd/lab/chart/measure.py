@@ -110,6 +110,7 @@ class CurveBench:
     def measure(self, curves: Sequence[Curve]) -> None:
         """Measure every curve."""
         plan, clock = self.plan, self.clock
+        clock.enter("curves")
         self._without_physics()
         first_above = next(steps for steps in budgets_of(plan.growth) if steps >= COLD.steps)
         for repeat in range(plan.repeats):

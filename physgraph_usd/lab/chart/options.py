@@ -9,14 +9,19 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ...errors import UsageError
+from ...solver.integrate import METHODS
 
-SHORT_MINUTES = 9.0
-"""Time that the short form plans with: on a busy machine a plan takes a third longer."""
+SHORT_MINUTES = 3.5
+"""Time that the short form plans with: on a busy machine a plan takes a third longer, and pictures are drawn."""
 LONGEST_SHORT = 15.0
 """Minutes up to which a chart has the short form's size."""
 CLOCKS = ("wall", "cpu")
-FOR_REFERENCE, FOR_CURVES, FOR_TERMS = 0.25, 0.55, 0.15
+SLOW = ("physgraph-paper",)
+"""Integrators of which one step takes longer on the CPU than a frame of any other: 4 s at 26,000 vertices."""
+FOR_REFERENCE, FOR_CURVES, FOR_WARM, FOR_TERMS = 0.25, 0.5, 0.1, 0.15
 """Fractions of the time."""
+PARTS = {"reference": (0.0, 0.25), "curves": (0.25, 0.75), "warm": (0.75, 0.85), "terms": (0.85, 1.0)}
+"""Parts of a chart, in their order, and between which fractions of the time each lies."""
 LATEST = 1.1
 """Fraction of the time after which nothing more is begun; a rerun goes on."""
 LEAST_REACH = 2.5
@@ -51,6 +56,11 @@ class Size:
     reach: float
     frames: int
 
+    @property
+    def is_short(self) -> bool:
+        """Whether it is the short form."""
+        return self.reach == SHORT.reach
+
 
 SHORT = Size(SHORT_MINUTES, repeats=3, more=6, growth=2.0, reach=6.25, frames=2)
 LONG = Size(None, repeats=5, more=5, growth=1.5, reach=8.0, frames=3)
@@ -69,7 +79,7 @@ class ChartOptions:
         rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
         device: "cpu" or "cuda".
         clock: "wall", or "cpu" to count one core's own time, which other programs do not change.
-        methods: Names of `integrate.METHODS` to measure; empty takes all.
+        methods: Names of `integrate.METHODS` to measure; empty takes all, on the CPU's short form but `SLOW`.
         peers: "NAME=PYTHON" for each solver outside to measure; see `peers.run.PEERS`.
         count: Frames to measure, or None for the size's own number.
         short: Take the short size.
@@ -122,6 +132,12 @@ class ChartOptions:
             more=chosen.more if self.repeats is None else self.repeats,
             frames=self.count or chosen.frames,
         )
+
+    def names(self) -> tuple[str, ...]:
+        """Integrators to measure; empty for all."""
+        if self.methods or self.device != "cpu" or self.size().minutes is None or not self.size().is_short:
+            return tuple(self.methods)
+        return tuple(name for name, method in METHODS.items() if method.nested is not None and name not in SLOW)
 
     def plain(self) -> dict[str, Any]:
         """Settings of the problem that is measured, ready for JSON."""
@@ -186,12 +202,17 @@ def make_plan(
 
 
 class Clock:
-    """How far a chart is, and when its time is spent."""
+    """How far a chart is, and when its time is spent.
+
+    A chart is done in the parts of `PARTS`, one after another. Within a part that says how much of it is done the bar
+    goes by that, else by the time it should take; a part that takes longer slows the bar down and never stops it.
+    """
 
     def __init__(self, minutes: float | None, progress: Callable[[float, float, str], None] | None) -> None:
         """Start with the minutes that there are, or None; ``progress`` is that of `ChartOptions`."""
-        self._began = time.perf_counter()
+        self._began = self._entered = time.perf_counter()
         self._minutes, self._progress = minutes, progress
+        self._part, self._done, self._shown = next(iter(PARTS)), 0.0, 0.0
         self.expected = 60.0 * (minutes or 0.0)
 
     @property
@@ -201,8 +222,8 @@ class Clock:
 
     @property
     def late(self) -> bool:
-        """Whether the curves have to end."""
-        return self._minutes is not None and self.spent > 60.0 * (1.0 - FOR_TERMS) * self._minutes
+        """Whether the present part has to end."""
+        return self._minutes is not None and self.spent > 60.0 * PARTS[self._part][1] * self._minutes
 
     @property
     def over(self) -> bool:
@@ -213,8 +234,22 @@ class Clock:
         """Correct the time that all of it will take."""
         self.expected = seconds if self._minutes is None else min(seconds, 60.0 * self._minutes)
 
+    def enter(self, part: str) -> None:
+        """Begin a part out of `PARTS`."""
+        self._part, self._done, self._entered = part, 0.0, time.perf_counter()
+
+    def part(self, done: float) -> None:
+        """Say what fraction of the present part is done."""
+        self._done = done
+
     def say(self, what: str) -> None:
         """Report what is being measured."""
-        if self._progress:
-            left = max(self.expected - self.spent, 0.0)
-            self._progress(min(self.spent / max(self.expected, 1e-9), 0.99), left, what)
+        if not self._progress:
+            return
+        low, high = PARTS[self._part]
+        planned = max((high - low) * self.expected, 1e-9)
+        by_time = 1.0 - math.exp(-(time.perf_counter() - self._entered) / planned)
+        self._shown = max(self._shown, low + (high - low) * max(self._done, by_time))
+        rest = self.spent * (1.0 - self._shown) / max(self._shown, 1e-9)
+        left = max(self.expected - self.spent, 0.0) if self._shown < PARTS["reference"][1] else rest
+        self._progress(self._shown, left, what)

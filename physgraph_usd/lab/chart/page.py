@@ -2,21 +2,63 @@
 
 from __future__ import annotations
 
+import base64
 import html
+from collections.abc import Sequence
 from pathlib import Path
 
 import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.subplots import make_subplots
 
+from ...errors import counted
 from ...shot.page.document import document, table
+from .looks import caption, looks_of
 from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
-from .table import Chart
-from .words import FAR, Style, changes, figures, percent, settings, styles, title
+from .table import Chart, Point, WarmPoint
+from .words import (
+    BASELINE,
+    FAR,
+    FRONT,
+    Style,
+    advice,
+    changes,
+    figures,
+    label,
+    percent,
+    settings,
+    styles,
+    title,
+    warm_advice,
+)
 
 FLOOR = 1e-5
 TICKS = [1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001]
 SIGNS = {DEFAULT: "star", UPSAMPLED: "square", SMOOTH: "diamond"}
+READING = (
+    "Lower is nearer to rest: 100% is the input, plainly subdivided, 0% the least energy that anybody found. Left is "
+    "faster. The broad line is the front: nothing that was measured is lower in less time than what lies on it."
+)
+OWN = """
+#methods { display: flex; flex-wrap: wrap; gap: .3rem .5rem }
+#methods button { font: inherit; font-size: .85rem; border: 1px solid var(--line); border-radius: 4px; background: none;
+padding: .1rem .5rem; cursor: pointer; color: var(--ink) }
+#methods button[aria-pressed=false] { opacity: .4 }
+#methods i { display: inline-block; width: 1.4em; margin-right: .4em;
+vertical-align: middle }
+.looks { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: .6rem }
+.looks figure { margin: 0 }
+"""
+SCRIPT = """
+const plot = document.getElementById('curves');
+document.querySelectorAll('#methods button').forEach(button => button.addEventListener('click', () => {
+  const shown = button.getAttribute('aria-pressed') !== 'true';
+  button.setAttribute('aria-pressed', String(shown));
+  const own = [];
+  plot.data.forEach((trace, index) => { if (trace.legendgroup === button.dataset.method) own.push(index); });
+  Plotly.restyle(plot, { visible: shown }, own);
+}));
+"""
 HOW = (
     "Every frame starts cold. Times are of preparing and solving a frame, the median of the faster half of {repeats} "
     "turns, in which all methods take one budget before any takes the next: what else a machine does only ever adds to "
@@ -35,77 +77,158 @@ def write_page(chart: Chart, file: Path) -> None:
         div_id="curves",
         config={"displaylogo": False, "responsive": True},
     )
-    body = "\n".join([f"<h1>{html.escape(title(chart))}</h1>", _lead(chart), figure, _terms(chart), _notes(chart)])
-    file.write_text(document(title(chart), body), encoding="utf-8")
+    head = f"<style>{OWN}</style><h1>{html.escape(title(chart))}</h1>"
+    parts = [head, _lead(chart), _legend(chart), figure, _looks(chart, file.parent), _terms(chart), _notes(chart)]
+    body = "\n".join(parts)
+    file.write_text(document(title(chart), body, script=SCRIPT), encoding="utf-8")
 
 
 def _figure(chart: Chart) -> go.Figure:
-    """Gap, penetrations and crossings against time, with one legend."""
-    panels = {"gap": "energy gap (Phi - Phi*) / (Phi0 - Phi*)", **chart.panels, **chart.likeness}
+    """Gap of cold and of warm frames, penetrations and crossings against time."""
+    panels = {"gap": "energy above<br>the best known", **chart.panels, **chart.likeness}
+    warm = 1 if chart.warm else 0
     figure = make_subplots(
-        rows=len(panels),
+        rows=len(panels) + warm,
         cols=1,
-        shared_xaxes=True,
-        vertical_spacing=0.05,
-        row_heights=[2.0, *[1.0] * (len(panels) - 1)],
+        vertical_spacing=0.2 / (len(panels) + warm),
+        row_heights=[2.2, *[1.5] * warm, *[1.0] * (len(panels) - 1)],
+        subplot_titles=["Cold frames, contact on", *["Warm frames, each begun where the last one ended"] * warm],
     )
     style = styles(chart)
-    for row, (field, words) in enumerate(panels.items(), start=1):
+    _add_front(figure, chart)
+    for place, (field, words) in enumerate(panels.items(), start=1):
+        row = place + (warm if place > 1 else 0)
         for name in chart.methods:
-            figure.add_trace(_trace(chart, name, style[name], field=field, first=row == 1), row=row, col=1)
+            figure.add_trace(_trace(chart, name, style[name], field=field), row=row, col=1)
         figure.update_yaxes(title_text=words, row=row, col=1)
+    for name in dict.fromkeys(each.method for each in chart.warm):
+        own = style.get(name, Style(BASELINE, dashed=False))
+        figure.add_trace(_warm(chart, name, own), row=2, col=1)
+        figure.update_yaxes(title_text=panels["gap"], row=2, col=1)
     figure.update_xaxes(type="log", dtick=1, minor={"dtick": "D1", "showgrid": True})
-    figure.update_xaxes(title_text="milliseconds a frame", row=len(panels), col=1)
-    figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=1, col=1)
+    figure.update_xaxes(title_text="milliseconds a frame", row=1, col=1)
+    figure.update_xaxes(title_text="milliseconds a frame", row=len(panels) + warm, col=1)
+    for row in range(1, 2 + warm):
+        figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=row, col=1)
     figure.update_layout(
-        height=480 + 240 * (len(panels) - 1),
+        height=520 + 330 * warm + 220 * (len(panels) - 1),
         template="plotly_white",
-        margin={"l": 70, "r": 20, "t": 20, "b": 50},
+        margin={"l": 70, "r": 12, "t": 36, "b": 50},
         hoverlabel={"align": "left"},
-        legend={"title": {"text": "click hides, double click isolates"}},
+        showlegend=False,
+    )
+    for annotation in figure.layout.annotations:  # pyright: ignore[reportAttributeAccessIssue]
+        annotation.update(x=0.0, xanchor="left", font={"size": 14})
+    figure.add_annotation(
+        x=0.02, y=0.04, ax=70, ay=-42, xref="x domain", yref="y domain", text="better", showarrow=True, arrowhead=2
     )
     return figure
 
 
-def _trace(chart: Chart, name: str, style: Style, *, field: str, first: bool) -> go.Scatter:
+def _add_front(figure: go.Figure, chart: Chart) -> None:
+    """The broad line behind all others: of no point on it another is both faster and lower."""
+    front = chart.front
+    figure.add_trace(
+        go.Scatter(
+            x=[max(p.ms, 1e-2) for p in front],
+            y=[max(p.gap, FLOOR) for p in front],
+            mode="lines",
+            line={"color": FRONT, "width": 9, "shape": "hv"},
+            hoverinfo="skip",
+            name="the front",
+        ),
+        row=1,
+        col=1,
+    )
+
+
+def _trace(chart: Chart, name: str, style: Style, *, field: str) -> go.Scatter:
     points = chart.curve(name)
     labels = ["<br>".join([settings(p), *figures(p, touches=bool(chart.panels))]) for p in points]
     values = [max(p.gap, FLOOR) if field == "gap" else getattr(p, field) for p in points]
+    return _scatter(label(chart, name), points, values, style, labels=labels, sign=name, spread=field == "gap")
+
+
+def _warm(chart: Chart, name: str, style: Style) -> go.Scatter:
+    points = [each for each in chart.warm if each.method == name]
+    labels = [
+        f"at most {counted(p.steps, 'step')}<br>gap {percent(p.gap)}<br>{p.ms:.1f} ms a frame (least {p.ms_least:.1f}, "
+        f"most {p.ms_most:.1f})<br>{p.inside} vertices inside, {p.tangles} edges through cloth"
+        for p in points
+    ]
+    heights = [max(p.gap, FLOOR) for p in points]
+    return _scatter(label(chart, name), points, heights, style, labels=labels, sign=name, spread=True)
+
+
+def _scatter(
+    name: str,
+    points: Sequence[Point | WarmPoint],
+    heights: Sequence[float],
+    style: Style,
+    *,
+    labels: Sequence[str],
+    sign: str,
+    spread: bool,
+) -> go.Scatter:
+    """One line; what a click on the method's name hides has its name for a group."""
+    ms = [max(p.ms, 1e-2) for p in points]
+    most = [max(p.ms_most, own) - own for p, own in zip(points, ms, strict=True)]
+    least = [own - min(max(p.ms_least, 1e-2), own) for p, own in zip(points, ms, strict=True)]
+    bars = {"type": "data", "symmetric": False, "array": most, "arrayminus": least, "thickness": 1.5, "width": 3}
     return go.Scatter(
-        x=[max(p.ms, 1e-2) for p in points],
-        y=values,
+        x=ms,
+        y=list(heights),
         name=name,
         legendgroup=name,
-        showlegend=first,
-        mode="markers" if name in SIGNS else "lines+markers",
+        mode="markers" if sign in SIGNS else "lines+markers",
         line={"color": style.colour, "dash": "dash" if style.dashed else "solid", "width": 2},
         marker={
-            "symbol": SIGNS.get(name, "triangle-up" if style.outside else "circle"),
-            "size": 16 if name == DEFAULT else 8,
+            "symbol": SIGNS.get(sign, "triangle-up" if style.outside else "circle"),
+            "size": 16 if sign == DEFAULT else 8,
             "color": style.colour,
         },
-        customdata=labels,
+        error_x=bars if spread else None,
+        customdata=list(labels),
         hovertemplate=f"<b>{html.escape(name)}</b><br>%{{customdata}}<extra></extra>",
     )
 
 
+def _legend(chart: Chart) -> str:
+    """A button for each method, which hides and shows its lines in every plot."""
+    style = styles(chart)
+    buttons = []
+    for name in chart.methods:
+        own, shown = style[name], html.escape(label(chart, name))
+        look = f"border-top:3px {'dashed' if own.dashed else 'solid'} {own.colour}"
+        drawn = f"<i style='{look}'></i>{shown}"
+        buttons.append(f"<button type=button aria-pressed=true data-method='{shown}'>{drawn}</button>")
+    words = "A click hides a method, another shows it again. Bars reach from the fastest turn to the slowest."
+    return f"<div id='methods'>{''.join(buttons)}</div><p class='note'>{words}</p>"
+
+
+def _looks(chart: Chart, folder: Path) -> str:
+    """What gaps look like."""
+    found = looks_of(chart, folder)
+    if not found:
+        return ""
+    parts = []
+    for each in found:
+        data, said = base64.b64encode(each.file.read_bytes()).decode("ascii"), html.escape(caption(each))
+        picture = f"<img alt='{said}' src='data:image/png;base64,{data}'>"
+        parts.append(f"<figure>{picture}<figcaption>{said}</figcaption></figure>")
+    return f"<h2>What these percentages look like</h2><div class='looks'>{''.join(parts)}</div>"
+
+
 def _lead(chart: Chart) -> str:
     """The sentences that a reader should know first."""
-    place = chart.default_place()
-    sentences = []
-    if place is not None:
-        where = "is on the front" if place["on_front"] else "is not on the front"
-        sentences.append(
-            f"refine's default leaves {percent(place['gap'])} in {place['ms']:.0f} ms a frame and {where}: the fastest "
-            f"to that gap, {place['fastest']}, needs {place['fastest_ms']:.0f} ms."
-        )
+    sentences = [each for each in (advice(chart), warm_advice(chart)) if each]
     times = chart.times_to(JUDGED)
     if times:
-        order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in times.items())
-        sentences.append(f"To a gap of 3%: {order}.")
+        order = ", ".join(f"{label(chart, name)} {ms:.0f} ms" for name, ms in list(times.items())[:4])
+        sentences.append(f"First to 3%: {order}.")
     if chart.busy:
         sentences.append(f"Warning: {chart.busy}.")
-    return f"<p>{html.escape(' '.join(sentences))}</p>"
+    return f"<p>{html.escape(' '.join(sentences))}</p><p class='note'>{html.escape(READING)}</p>"
 
 
 def _terms(chart: Chart) -> str:

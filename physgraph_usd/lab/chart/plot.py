@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,11 +11,11 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, SymmetricalLogLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, SymmetricalLogLocator
 
 from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
-from .table import Chart, Point
-from .words import FAR, Change, Style, changes, percent, styles, title
+from .table import Chart, Point, WarmPoint
+from .words import ABOVE, BASELINE, FAR, FRONT, Change, Style, advice, changes, label, percent, styles, title
 
 FLOOR = 1e-4
 """Least gap that is drawn: Phi* itself is known no better."""
@@ -46,11 +48,16 @@ def _figure(chart: Chart) -> Figure:
     steps = changes(chart)
     rows = [each for each in (chart.panels, chart.likeness) if each]
     heights = [4.2, *[2.6] * len(rows), *([0.6 + 0.28 * len(steps)] if steps else [])]
-    figure = Figure(figsize=(9.6, sum(heights) + 1.0), layout="constrained")
-    figure.suptitle(title(chart), x=0.01, ha="left", fontsize=11)
+    figure = Figure(figsize=(10.6, sum(heights) + 1.0), layout="constrained")
+    words = textwrap.fill(advice(chart), 120)
+    figure.suptitle(f"{title(chart)}\n{words}", x=0.01, ha="left", fontsize=9.5)
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     style = styles(chart)
-    axes = parts[0].subplots()
+    if chart.warm:
+        axes, beside = parts[0].subplots(1, 2, sharey=True, width_ratios=[1.7, 1.0])
+        _warm(beside, chart, style)
+    else:
+        axes = parts[0].subplots()
     _curves(axes, chart, style)
     parts[0].legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
     for part, row in zip(parts[1:], rows, strict=False):
@@ -63,10 +70,32 @@ def _figure(chart: Chart) -> Figure:
 
 
 def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
-    """Gap against time."""
+    """Gap against time, the front behind it."""
+    front = chart.front
+    axes.step(
+        [max(p.ms, 1e-2) for p in front],
+        [max(p.gap, FLOOR) for p in front],
+        where="post",
+        color=FRONT,
+        linewidth=7.0,
+        solid_capstyle="round",
+        zorder=1,
+        label="the front: nothing is lower sooner",
+    )
     for name in chart.methods:
-        _line(axes, name, chart.curve(name), style[name], [max(p.gap, FLOOR) for p in chart.curve(name)])
-    axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Energy gap (Phi - Phi*) / (Phi0 - Phi*)")
+        points = chart.curve(name)
+        _line(axes, label(chart, name), points, style[name], [max(p.gap, FLOOR) for p in points], alone=name)
+        _spread(axes, points, style[name])
+    axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Cold frames, contact on")
+    axes.set_ylabel(ABOVE)
+    axes.annotate(
+        "better",
+        xy=(0.02, 0.03),
+        xytext=(0.09, 0.12),
+        xycoords="axes fraction",
+        arrowprops={"arrowstyle": "-|>", "color": "#444444", "linewidth": 1.4},
+        color="#444444",
+    )
     least = min((p.gap for p in chart.points), default=FLOOR)
     axes.set_ylim(max(FLOOR, min(0.5 * least, 0.01)) if least > 0 else FLOOR, CEILING)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value)))
@@ -74,18 +103,48 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
     axes.axhline(JUDGED, color="#b0b0b0", linewidth=0.8, linestyle=":")
 
 
-def _line(axes: Axes, name: str, points: Sequence[Point], style: Style, heights: list[float]) -> None:
-    """One method."""
-    alone = name in ONE_POINT
+def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
+    """Gap against time in frames that begin where the last one ended."""
+    for name in dict.fromkeys(each.method for each in chart.warm):
+        points = sorted((each for each in chart.warm if each.method == name), key=lambda each: each.steps)
+        drawn = style.get(name, Style(BASELINE, dashed=False))
+        _line(axes, label(chart, name), points, drawn, [max(p.gap, FLOOR) for p in points], alone=name)
+        _spread(axes, points, drawn)
+    axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Warm frames")
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    least, most = min(p.ms_least for p in chart.warm), max(p.ms_most for p in chart.warm)
+    axes.set_xlim(10.0 ** math.floor(math.log10(max(least, 1e-2))), 10.0 ** math.ceil(math.log10(max(most, 1.0))))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.axhline(JUDGED, color="#b0b0b0", linewidth=0.8, linestyle=":")
+
+
+def _spread(axes: Axes, points: Sequence[Point | WarmPoint], style: Style) -> None:
+    """The fastest and the slowest turn of each point."""
+    for point in points:
+        ends = [max(each, 1e-2) for each in (point.ms_least, max(point.ms_most, point.ms_least))]
+        axes.plot(ends, [max(point.gap, FLOOR)] * 2, color=style.colour, linewidth=3.2, alpha=0.3, zorder=1.5)
+
+
+def _line(
+    axes: Axes,
+    name: str,
+    points: Sequence[Point | WarmPoint],
+    style: Style,
+    heights: list[float],
+    *,
+    alone: str = "",
+) -> None:
+    """One method, by the name that is written and, where it may be a sign alone, the curve's."""
+    own = alone or name
     axes.plot(
         [max(p.ms, 1e-2) for p in points],
         heights,
         color=style.colour,
-        linestyle="" if alone else "--" if style.dashed else "-",
-        marker=ONE_POINT.get(name, "^" if style.outside else "o"),
-        markersize=11 if name == DEFAULT else 5 if alone or style.outside else 3,
+        linestyle="" if own in ONE_POINT else "--" if style.dashed else "-",
+        marker=ONE_POINT.get(own, "^" if style.outside else "o"),
+        markersize=11 if own == DEFAULT else 5 if own in ONE_POINT or style.outside else 3,
         linewidth=1.4,
-        zorder=5 if name == DEFAULT else 2,
+        zorder=5 if own == DEFAULT else 2,
         label=name,
         clip_on=False,
     )

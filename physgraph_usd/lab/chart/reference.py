@@ -114,12 +114,16 @@ class Solutions:
 
     def apart_mm(self, frame: Frame, points: Sequence[np.ndarray]) -> float | None:
         """RMS distance of fine positions [m] from the frame's reference [mm]; None where none is stored."""
-        file = self._file(frame.time)
-        if frame.time not in self._known and file.exists():
-            with np.load(file) as data:
-                self._known[frame.time] = tuple(data.values())
-        known = self._known.get(frame.time)
+        known = self.points(frame.time)
         return None if known is None else rms_mm(points, known)
+
+    def points(self, time: float | None) -> tuple[np.ndarray, ...] | None:
+        """Fine world positions [m] of the reference of a time code, one array a garment; None where none is stored."""
+        file = self._file(time)
+        if time not in self._known and file.exists():
+            with np.load(file) as data:
+                self._known[time] = tuple(data.values())
+        return self._known.get(time)
 
     def _file(self, time: float | None) -> Path:
         return self._folder / SOLUTION.format("still" if time is None else f"{time:g}")

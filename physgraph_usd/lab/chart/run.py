@@ -27,6 +27,7 @@ from ...usd.write.atomic import check_place
 from ...version import __version__
 from .journal import NAME as JOURNAL
 from .journal import Journal
+from .looks import draw_looks
 from .measure import Curve, CurveBench, find_curves
 from .options import LONG, ChartOptions, Clock, Plan, make_plan
 from .page import write_page
@@ -36,6 +37,7 @@ from .problem import COLD, Problem, plain_detail
 from .reference import Solutions, find_reference
 from .table import Chart, collate
 from .terms import RUN, TermBench, measure_terms
+from .warm import ROW, measure_warm
 
 DEFAULTS = ChartOptions()
 WRITTEN = ("chart.png", "chart.svg", "chart.html", "chart.csv", "chart.json")
@@ -75,10 +77,9 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
     )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        journal = _measure(opened, folder, options)
+        chart = _measure(opened, folder, options)
     finally:
         opened.close()
-    chart = collate(journal)
     chart.write(folder)
     draw_chart(chart, folder)
     write_page(chart, folder / "chart.html")
@@ -96,8 +97,8 @@ def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
         check_place(file)
 
 
-def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
-    """Measure all that is not yet in the folder."""
+def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
+    """Measure all that is not yet in the folder, and draw what gaps look like."""
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
     levels = tuple(choice.level for choice in choose_levels(opened.scene, sample_frames(opened.scene, opened.frame)))
@@ -110,7 +111,7 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
     about = _about(opened, levels, options) | {"vertices": problems[0].vertex_count}
     journal = Journal(folder, about, overwrite=options.overwrite)
     solutions = Solutions(folder, fresh=not journal.rows("reference"))
-    curves = find_curves(options.methods)
+    curves = find_curves(options.names())
     plan = _plan(journal, problems, _frame(opened, _times(opened, 1)[0]), curves=curves, options=options)
     clock.expect(60.0 * plan.minutes)
     frames = tuple(_frame(opened, time) for time in _times(opened, plan.frames))
@@ -124,8 +125,14 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Journal:
     bench.measure(curves)
     measure_peers(bench, parse_peers(options.peers), clock_name=options.clock)
     row = tuple(_frame(opened, time) for time in _row_up_to(opened, frames[-1].time))
+    clock.enter("warm")
+    measure_warm(journal, problems, row[-ROW:], clock)
     measure_terms(journal, TermBench(*problems, opened.scene, levels, frames=frames, row=row, build=build), clock)
-    return journal
+    chart = collate(journal)
+    clock.part(1.0)
+    clock.say("pictures")
+    draw_looks(chart, problems[0], frames[-1], solutions.points(frames[-1].time), folder)
+    return chart
 
 
 def _plan(

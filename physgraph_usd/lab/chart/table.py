@@ -48,6 +48,7 @@ class Point:
         ms: Milliseconds a frame: `typical` over the repeats, mean over the frames.
         ms_median: Milliseconds by the median of all repeats.
         ms_least: Milliseconds of the fastest repeats.
+        ms_most: Milliseconds of the slowest repeats.
         gap: (Phi - Phi*) / (Phi0 - Phi*), both summed over the frames.
         energy: Phi, mean over the frames [J].
         energies: Phi by term [J].
@@ -85,6 +86,34 @@ class Point:
     repeats: int
     note: str = ""
     apart_mm: float | None = None
+    ms_most: float = 0.0
+
+
+@dataclass(frozen=True)
+class WarmPoint:
+    """A method with one budget, in frames that begin where the last one ended.
+
+    Attributes:
+        method: Refine's default, or the integrator's name.
+        steps: Most steps a frame.
+        ms: Milliseconds a frame: `typical` over the repeats.
+        ms_least: Milliseconds of the fastest repeat.
+        ms_most: Milliseconds of the slowest repeat.
+        gap: As for `Point`, of the last frame in the row.
+        inside: Vertices inside bodies there.
+        tangles: Edges of cloth through faces of cloth there.
+        repeats: Number of times that the time was taken.
+    """
+
+    method: str
+    steps: int
+    ms: float
+    ms_least: float
+    ms_most: float
+    gap: float
+    inside: int
+    tangles: int
+    repeats: int
 
 
 @dataclass(frozen=True)
@@ -97,6 +126,7 @@ class Chart:
         references: Per frame, Phi0, Phi*, who found it and how far the next best ended above it.
         terms: What each term, the last frame's detail and each level cost and buy.
         failed: Runs that ended in an error.
+        warm: Methods in frames that begin where the last one ended.
     """
 
     about: dict[str, Any]
@@ -104,6 +134,7 @@ class Chart:
     references: tuple[dict[str, Any], ...]
     terms: tuple[dict[str, Any], ...]
     failed: tuple[dict[str, Any], ...]
+    warm: tuple[WarmPoint, ...] = ()
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -142,6 +173,15 @@ class Chart:
     def curve(self, method: str) -> tuple[Point, ...]:
         """The points of one method, in the order of the budgets."""
         return tuple(sorted((p for p in self.points if p.method == method), key=lambda p: p.steps))
+
+    @property
+    def front(self) -> tuple[Point, ...]:
+        """The points that no other is both faster and lower than, the fastest first; none of solvers outside."""
+        best: list[Point] = []
+        for point in sorted((p for p in self.points if not p.note), key=lambda p: (p.ms, p.gap)):
+            if not best or point.gap < best[-1].gap:
+                best.append(point)
+        return tuple(best)
 
     def time_to(self, method: str, gap: float) -> float | None:
         """`quickest` of a method."""
@@ -236,6 +276,11 @@ def collate(journal: Journal) -> Chart:
         if row["frame"] in found and "energies" in row:
             by = f"{row['method']}, {counted(row['steps'], 'step')}"
             found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
+    warm = journal.rows("warm")
+    for row in warm:
+        if row["frame"] in found and "energies" in row:
+            by = f"{row['method']}, {counted(row['steps'], 'step')}, warm"
+            found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
     keys = dict.fromkeys((row["method"], row["steps"]) for row in rows)
     points = [_point([r for r in rows if (r["method"], r["steps"]) == key], found) for key in keys]
     plan = journal.one("plan") or {}
@@ -246,7 +291,23 @@ def collate(journal: Journal) -> Chart:
         for kind in ("term", "failed")
     )
     references = tuple({"frame": frame, **each.plain()} for frame, each in found.items())
-    return Chart(about, tuple(point for point in points if point is not None), references, terms, failed)
+    whole = tuple(point for point in points if point is not None)
+    return Chart(about, whole, references, terms, failed, _warm(warm, found))
+
+
+def _warm(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> tuple[WarmPoint, ...]:
+    """The points of warm frames."""
+    found = []
+    for method, steps in dict.fromkeys((row["method"], row["steps"]) for row in rows):
+        own = [row for row in rows if (row["method"], row["steps"]) == (method, steps)]
+        judged = next((row for row in own if "energies" in row), None)
+        if judged is None or judged["frame"] not in references:
+            continue
+        times = [row["ms"] for row in own]
+        gap = references[judged["frame"]].gap(sum(judged["energies"].values()))
+        spread = (typical(times), min(times), max(times))
+        found.append(WarmPoint(method, steps, *spread, gap, judged["inside"], judged["tangles"], len(times)))
+    return tuple(sorted(found, key=lambda each: (each.method, each.steps)))
 
 
 def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point | None:
@@ -270,6 +331,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         ms=statistics.fmean(typical(each) for each in times),
         ms_median=statistics.fmean(statistics.median(each) for each in times),
         ms_least=statistics.fmean(min(each) for each in times),
+        ms_most=statistics.fmean(max(each) for each in times),
         gap=(len(values) * energy - least) / max(start - least, TINY),
         energy=energy,
         energies=energies,

@@ -114,7 +114,9 @@ def measure_terms(journal: Journal, bench: TermBench, clock: Clock) -> None:
     tasks += [(f"level {level}", "level", partial(_one_level, bench, level)) for level in levels]
     if len(bench.row) >= 4:
         tasks += [(name, "time", partial(_one_row, bench, name)) for name in ("tether", "warm")]
-    for name, kind, measured in tasks:
+    clock.enter("terms")
+    for number, (name, kind, measured) in enumerate(tasks):
+        clock.part(number / len(tasks))
         if clock.over:
             return
         if journal.one("term", term=name):

@@ -7,7 +7,7 @@ from typing import Any
 
 from ...errors import counted
 from .measure import DEFAULT, SMOOTH, UPSAMPLED
-from .table import Chart, Point
+from .table import TOLERANCE, Chart, Point
 
 FAR = 1e4
 """Distance beyond which cloth that nothing holds has fallen away [mm]."""
@@ -16,6 +16,9 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7
 OUTSIDE = ("#e6007e", "#7fa800", "#5a2d0c")
 """Colours of solvers outside."""
 BASELINE = "#6e6e6e"
+FRONT = "#e9dfc0"
+RECORDED = ("quasi-newton", "physgraph")
+"""Integrators whose steps are recorded once on CUDA and replayed."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +81,50 @@ def title(chart: Chart) -> str:
     return f"{about['shot']}: {about['vertices']:,} fine vertices, level {levels}, {cold}, {where}"
 
 
-def percent(value: float) -> str:
+def percent(value: float, *, digits: int = 3) -> str:
     """A fraction with as many digits as it needs; a large one as a factor."""
     if abs(value) >= 10.0:
         return f"{value:,.0f}x"
-    return f"{100.0 * value:.3g}%"
+    return f"{100.0 * value:.{digits}g}%"
+
+
+ABOVE = "energy above the best known, percent of what solving gains"
+"""The axis of gaps, in words."""
+
+
+def label(chart: Chart, name: str) -> str:
+    """A method as legends name it: on a card the steps of some are recorded."""
+    own = name.partition(",")[0].removesuffix("-flat")
+    return f"{name} (recorded)" if chart.about.get("device", "cpu") != "cpu" and own in RECORDED else name
+
+
+def advice(chart: Chart) -> str:
+    """Which method to take, in a sentence."""
+    place = chart.default_place()
+    if place is None:
+        return ""
+    left = f"{percent(place['gap'], digits=2)} above the best known in {place['ms']:.0f} ms a frame"
+    if place["on_front"]:
+        return f"Take refine's default, which you have without asking: it comes to {left}; nothing gets as low sooner."
+    known = {point.method: point for point in chart.points}[place["fastest"]]
+    asked = f" (--integrator {known.integrator})" if known.method == known.integrator else ""
+    return (
+        f"Take {label(chart, place['fastest'])}{asked} for single frames like these: refine's default comes to {left}, "
+        f"{place['ratio']:.1f} times the {place['fastest_ms']:.0f} ms in which that gets as low."
+    )
+
+
+def warm_advice(chart: Chart) -> str:
+    """What frames after the first cost, in a sentence."""
+    own = next((each for each in chart.warm if each.method == DEFAULT), None)
+    if own is None:
+        return ""
+    rest = [each for each in chart.warm if each.method != DEFAULT and each.gap <= own.gap]
+    best = min(rest, key=lambda each: each.ms, default=None)
+    words = f"Frames begun where the last one ended take it {own.ms:.0f} ms and end at {percent(own.gap, digits=2)}"
+    if best is None or best.ms * TOLERANCE >= own.ms:
+        return f"{words}; nothing else is as low sooner."
+    return f"{words}; {label(chart, best.method)} with {best.steps} steps is as low in {best.ms:.0f} ms."
 
 
 def settings(point: Point) -> str:

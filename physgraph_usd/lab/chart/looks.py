@@ -1,0 +1,114 @@
+"""What gaps look like: the cloth of a frame as it is at a few of them, drawn from the same side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ...shot.page.raycast import Surface, draw, fit_view
+from ...solver.integrate import METHODS
+from ...solver.scene import Frame
+from .measure import find_curves
+from .problem import COLD, Problem
+from .table import GAPS, Chart, Point
+from .words import percent
+
+COLOUR = (0.20, 0.33, 0.52)
+SIZE = (420, 460)
+NEAR = 1.5
+"""Factor by which the gap of a picture may differ from the one that it stands for."""
+FILE = "chart.looks.{}.png"
+
+
+@dataclass(frozen=True)
+class Look:
+    """A picture.
+
+    Attributes:
+        file: Its file.
+        gap: The gap that it shows.
+        words: What it shows.
+    """
+
+    file: Path
+    gap: float
+    words: str
+
+
+def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.ndarray] | None, folder: Path) -> None:
+    """Draw a frame upsampled, at each of `GAPS` where a method came near it, and at its best.
+
+    Args:
+        chart: What was measured.
+        problem: The problem in float32.
+        frame: The frame, one of those measured.
+        best: Fine world positions [m] of each garment at Phi*, or None where they are not known.
+        folder: Where the pictures go.
+    """
+    shapes: dict[str, Sequence[np.ndarray]] = {"100": problem.upsampled(frame, smooth=False)}
+    for gap in GAPS:
+        point = nearest(chart, gap)
+        if point is not None:
+            shapes[f"{100 * gap:g}"] = _solved(problem, frame, point)
+    if best is not None:
+        shapes["0"] = best
+    up = -problem.scene.gravity if problem.scene.gravity.any() else np.array([0.0, 1.0, 0.0])
+    turn = _upright(up)
+    cloud = np.concatenate([np.concatenate(list(each)) for each in shapes.values()]) @ turn.T
+    view, floor = fit_view(cloud, SIZE[0] / SIZE[1]), float(cloud[:, 1].min() - 0.03 * np.ptp(cloud, axis=0).max())
+    meshes = [chain[-1].mesh for chain in problem.refiner.refinements if chain]
+    for name, points in shapes.items():
+        surfaces = [
+            Surface(each @ turn.T, triangles, np.tile(COLOUR, (len(triangles), 1)))
+            for each, mesh in zip(points, meshes, strict=False)
+            for triangles in [mesh.triangulate().triangles]
+        ]
+        Image.fromarray(draw(surfaces, view, size=SIZE, floor=floor)).save(folder / FILE.format(name), optimize=True)
+
+
+def looks_of(chart: Chart, folder: Path) -> list[Look]:
+    """The pictures that there are, the roughest first."""
+    found = []
+    for name, gap in (("100", 1.0), *((f"{100 * gap:g}", gap) for gap in GAPS), ("0", 0.0)):
+        file, point = folder / FILE.format(name), nearest(chart, gap)
+        if not file.exists():
+            continue
+        if name in ("0", "100"):
+            words = "the best known" if name == "0" else "plain upsampling, no physics"
+            found.append(Look(file, gap, words))
+        elif point is not None:
+            found.append(Look(file, point.gap, f"{point.method}, {point.ms:.0f} ms a frame"))
+    return found
+
+
+def nearest(chart: Chart, gap: float) -> Point | None:
+    """The point of a method of ours that lies nearest to a gap, or None where none lies near."""
+    there = [each for each in chart.points if each.integrator in METHODS and gap / NEAR <= each.gap <= gap * NEAR]
+    return min(there, key=lambda each: abs(np.log(each.gap / gap)), default=None)
+
+
+def caption(look: Look) -> str:
+    """Its gap and what it shows."""
+    left = "0%" if look.gap == 0.0 else percent(look.gap, digits=2)
+    return f"{left} above the best known: {look.words}" if 0.0 < look.gap < 1.0 else f"{left}: {look.words}"
+
+
+def _solved(problem: Problem, frame: Frame, point: Point) -> tuple[np.ndarray, ...]:
+    """The positions of a point [m]."""
+    [curve] = [each for each in find_curves() if each.name == point.method] or find_curves([point.integrator])[:1]
+    return problem.solve(frame, replace(COLD, method=curve.method, steps=point.steps, tolerance=0.0)).points
+
+
+def _upright(up: np.ndarray) -> np.ndarray:
+    """The rotation that takes a direction to Y, shape (3, 3), as the shortest turn of the axes does."""
+    axis = int(np.abs(up).argmax())
+    y = up / np.linalg.norm(up)
+    x = np.zeros(3)
+    x[(axis + 2) % 3 if axis == 1 else 0] = 1.0
+    x -= (x @ y) * y
+    x /= np.linalg.norm(x)
+    return np.stack([x, y, np.cross(x, y)])

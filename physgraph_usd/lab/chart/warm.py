@@ -1,0 +1,55 @@
+"""Warm frames: frames in a row, each begun where the last one ended, by refine's default and by what it chooses from.
+
+Each run begins with a cold frame of its own. The last frame is judged, which is one of those whose Phi* is known; the
+time is that of the frames after the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+from ...errors import SolveError, counted
+from ...solver.integrate import METHODS
+from ...solver.scene import Frame
+from .journal import Journal
+from .measure import DEFAULT as AUTO
+from .options import Clock
+from .problem import DEFAULT, Problem
+from .table import typical
+
+METHODS_OF_WARM = ("quasi-newton", "physgraph")
+"""What refine's default chooses from, frame by frame."""
+STEPS = (12, 6, 24, 3, 48)
+"""Most steps of a frame, those that tell most first."""
+ROW = 4
+"""Frames in a row, the cold one included."""
+REPEATS = 3
+
+
+def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Sequence[Frame], clock: Clock) -> None:
+    """Measure what is not yet in the journal, as long as there is time."""
+    if len(row) < 2:
+        return
+    timed, judge = problems
+    runs = [(AUTO, 12, DEFAULT)]
+    for steps in STEPS:
+        runs += [(name, steps, replace(DEFAULT, method=METHODS[name], steps=steps)) for name in METHODS_OF_WARM]
+    for repeat in range(REPEATS):
+        for number, (name, steps, settings) in enumerate(runs):
+            key = {"method": name, "steps": steps, "frame": row[-1].time}
+            if journal.one("warm", repeat=repeat, **key):
+                continue
+            if clock.late:
+                return
+            clock.part((repeat * len(runs) + number) / (REPEATS * len(runs)))
+            clock.say(f"warm frames, {name}, {counted(steps, 'step')}, turn {repeat + 1} of {REPEATS}")
+            timed.refiner.use(settings)
+            try:
+                solved = [timed.next(frame) for frame in row]
+            except SolveError:
+                continue
+            values: dict[str, Any] = {} if repeat else asdict(judge.judge(row[-1], solved[-1].points))
+            spent = [each.milliseconds for each in solved[1:]]
+            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **values)
