@@ -108,8 +108,10 @@ def _figure(chart: Chart) -> go.Figure:
     figure.update_xaxes(type="log", dtick=1, minor={"dtick": "D1", "showgrid": True})
     figure.update_xaxes(title_text="milliseconds a frame", row=1, col=1)
     figure.update_xaxes(title_text="milliseconds a frame", row=len(panels) + warm, col=1)
-    for row in range(1, 2 + warm):
-        figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=row, col=1)
+    figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=1, col=1)
+    if warm:  # Less than a decade of either: labels at 1, 2 and 5.
+        figure.update_xaxes(dtick="D2", minor=None, row=2, col=1)
+        figure.update_yaxes(type="log", dtick="D2", tickformat="~p", row=2, col=1)
     figure.update_layout(
         height=520 + 330 * warm + 220 * (len(panels) - 1),
         template="plotly_white",

@@ -85,7 +85,7 @@ def percent(value: float, *, digits: int = 3) -> str:
     """A fraction with as many digits as it needs; a large one as a factor."""
     if abs(value) >= 10.0:
         return f"{value:,.0f}x"
-    return f"{100.0 * value:.{digits}g}%"
+    return f"{100.0 * value:.{max(digits, 3) if abs(value) >= 0.995 else digits}g}%"
 
 
 ABOVE = "energy above the best known, percent of what solving gains"
