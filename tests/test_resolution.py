@@ -19,9 +19,9 @@ from physgraph_usd.solver import resolution
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.level import build_levels, hinge_geometry
 from physgraph_usd.solver.mesh.subdivide import fine_count, subdivide_times
+from physgraph_usd.solver.folds import EDGES_PER_WAVE
 from physgraph_usd.solver.resolution import (
     AUTO,
-    EDGES_PER_WAVE,
     LEAST_STRAIN,
     LIMIT,
     MOST,

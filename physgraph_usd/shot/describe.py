@@ -197,6 +197,7 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "fine_edge_mm": round(1e3 * choice.edge, 2),
         "wavelength_mm": round(1e3 * choice.wavelength, 2),
         "level_needed": choice.needed,
+        "bending_raised": [round(factor, 2) for factor in choice.raised],
         "fine_points": choice.vertices[0],
         "fine_points_needed": choice.vertices[1],
         "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},

@@ -12,7 +12,8 @@ from shlex import join
 from typing import Any
 
 from ..errors import counted
-from ..solver.resolution import EDGES_PER_WAVE, FEWEST_EDGES, SHARP_FRACTION, LevelChoice, finer
+from ..solver.folds import EDGES_PER_WAVE
+from ..solver.resolution import FEWEST_EDGES, SHARP_FRACTION, LevelChoice, finer
 from ..solver.strain import SHRUNK, StrainedPart
 from .report import RefineReport
 from .settled import COLLAPSED, LIMITED, UNSOLVED, Unsettled
@@ -131,7 +132,7 @@ WARNINGS = {
         "folds may be of the mesh's own size",
         "a finer `--level`, or accept it: the layer is whole",
         "its fabric can fold in waves of {wave:.1f} mm; level {level} has edges of {edge:.1f} mm, a fifth of a wave is "
-        "{fifth:.1f} mm: folds may be of the mesh's own size",
+        "{fifth:.1f} mm: folds may be of the mesh's own size{raised}",
         "{finer}",
     ),
     "sharp_folds": Kind(
@@ -193,6 +194,7 @@ def of_levels(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[s
             level=choice.level,
             edge=1e3 * choice.edge,
             fifth=1e3 * choice.wavelength / EDGES_PER_WAVE,
+            raised=f", and bending is raised {choice.raised[-1]:.3g} times" if choice.raised[-1:] > (1.0,) else "",
             finer=choice.advice,
         )
         for path, choice in zip(garments, choices, strict=True)

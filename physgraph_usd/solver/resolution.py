@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..errors import StageError
+from .folds import EDGES_PER_WAVE, raised_by
 from .level import Level, hinge_geometry
 from .mesh.subdivide import fine_count
 from .mesh.topology import edges_of
@@ -30,7 +31,6 @@ SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
 LIMIT = 5
 """The most that the schema allows."""
-EDGES_PER_WAVE = 5.0
 FEWEST_EDGES = 2.0
 """No mesh carries a wave of fewer edges: what would fold so folds at the mesh's own size."""
 SHARP_FOLD = math.radians(45.0)
@@ -53,6 +53,8 @@ class LevelChoice:
         edge: Mean rest edge at that level [m].
         needed: The least level that resolves the wavelength.
         vertices: Number of vertices at the chosen level, and at the one needed.
+        raised: For the cage and each level up to the chosen one, how many times its own the bending stiffness is on
+            the mean edge.
     """
 
     level: int
@@ -61,6 +63,7 @@ class LevelChoice:
     edge: float
     needed: int
     vertices: tuple[int, int]
+    raised: tuple[float, ...] = ()
 
     @property
     def advice(self) -> str:
@@ -144,10 +147,12 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
             f"auto: {text}" + (f", which takes no more than level {MOST}" * (needed > MOST)),
         )
     fine = edge / 2**level
-    choice = LevelChoice(
-        level, reason, wave, fine, needed, (fine_count(garment.mesh, level), fine_count(garment.mesh, needed))
-    )
+    counts = fine_count(garment.mesh, level), fine_count(garment.mesh, needed)
+    raised = tuple(raised_by(fabric, edge / 2**each) if garment.raises_bending else 1.0 for each in range(level + 1))
+    choice = LevelChoice(level, reason, wave, fine, needed, counts, raised)
     reached = f"; edges of {1e3 * fine:.1f} mm resolve wrinkles of {1e3 * EDGES_PER_WAVE * fine:.1f} mm and more"
+    stiffer = f"; bending is raised {' '.join(f'{each:.3g}' for each in raised)} times, level by level"
+    reached += stiffer if max(raised) > 1.0 else ""
     return replace(choice, reason=reason + reached + (f"; {choice.advice}" if needed > level else ""))
 
 

@@ -68,6 +68,7 @@ class Garment:
         layer: Place in the order of garments, lower is nearer to the body; None, or equal to another's: not ordered.
         apart_from: Paths of the garments that it never touches; each of them names it too.
         grain: Which way its warp lies, and its painted ease; None is unknown, and none.
+        raises_bending: Whether bending is raised on a level whose edges are too long for the fabric's folds.
     """
 
     path: str
@@ -86,6 +87,7 @@ class Garment:
     layer: int | None = None
     apart_from: tuple[str, ...] = ()
     grain: Grain | None = None
+    raises_bending: bool = True
 
     @staticmethod
     def of(

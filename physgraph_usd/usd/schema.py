@@ -173,6 +173,11 @@ PROPERTIES: tuple[Property, ...] = (
         GARMENT_API, "physgraph:refine:detail", "float", 1.0, "", 0.0, 2.0, "Gain of the added detail.",
         "Detail", REFINEMENT, (0.0, 2.0),
     ),
+    Property(
+        GARMENT_API, "physgraph:refine:raiseBending", "bool", True, "", None, None,
+        "Whether bending is raised on a level whose edges are too long for the fabric's folds.",
+        "Raise Bending", REFINEMENT, uniform=True,
+    ),
     *_material(GARMENT_API, fallbacks=True),
     Property(
         GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, 1e12,

@@ -13,24 +13,32 @@ from torch import Tensor
 
 from ..fabric import Fabric
 from ..level import Level
+from ..folds import carried_bend
+from ..mesh.topology import find_edges
 from .base import Force
 from .bending import Bending
 from .gravity import Gravity
 from .membrane import in_plane_terms
 
 
-def elastic_terms(level: Level, fabrics: Sequence[Fabric], *, potential: str) -> tuple[Force, ...]:
+def elastic_terms(
+    level: Level, fabrics: Sequence[Fabric], *, potential: str, raised: Sequence[bool] | None = None
+) -> tuple[Force, ...]:
     """The terms of the cloth itself.
 
     Args:
         level: The level.
         fabrics: Fabric of each garment.
         potential: "continuum" or "paper".
+        raised: For each garment, whether its bending stiffness is raised where edges are too long for its folds; none
+            is when None.
     """
     weft = None
     if any(fabric.weft_bend is not None for fabric in fabrics):
         weft = [fabric.bend if fabric.weft_bend is None else fabric.weft_bend for fabric in fabrics]
-    bending = Bending(level, _each(level, [fabric.bend for fabric in fabrics]), weft=weft, potential=potential)
+    least = None if raised is None or potential == "paper" else _carried(level, fabrics, raised)
+    bends = _each(level, [fabric.bend for fabric in fabrics])
+    bending = Bending(level, bends, weft=weft, least=least, potential=potential)
     return (*in_plane_terms(level, fabrics, potential=potential), bending)
 
 
@@ -44,6 +52,18 @@ def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray, 
         potential: "continuum" or "paper".
     """
     return (Gravity(level, _each(level, [fabric.density for fabric in fabrics]), gravity, potential=potential),)
+
+
+def _carried(level: Level, fabrics: Sequence[Fabric], raised: Sequence[bool]) -> Tensor:
+    """The bending stiffness that hinges of raised garments have at least [N m], shape (H,); 0 where none bends."""
+    owner, ends = level.hinge_garment.long(), level.hinges[:, :2]
+    painted = level.stretch_scale[find_edges(level.edges.cpu().numpy(), ends.cpu().numpy())]
+    edge = level.spacing[ends.long()].mean(dim=1)
+    least = torch.zeros_like(edge)
+    for index, (fabric, wanted) in enumerate(zip(fabrics, raised, strict=True)):
+        if wanted and fabric.bend > 0:
+            least = torch.where(owner == index, carried_bend(fabric, edge) * painted, least)
+    return least
 
 
 def _each(level: Level, values: Sequence[float]) -> Tensor:

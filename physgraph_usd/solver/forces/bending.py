@@ -106,6 +106,7 @@ class Bending:
         rigidity: Float[Tensor, " garments"],
         *,
         weft: Sequence[float] | None = None,
+        least: Float[Tensor, " hinges"] | None = None,
         potential: str = "continuum",
     ) -> None:
         """Weigh the hinges of a level.
@@ -114,12 +115,15 @@ class Bending:
             level: The level.
             rigidity: Bending stiffness D of each garment [N m]; along the warp where the weft's differs.
             weft: Bending stiffness along the weft [N m]; None where it is the warp's, or no grain is known.
+            least: Bending stiffness that a hinge has at least [N m]; None where that is its own.
             potential: "continuum" or "paper".
         """
         owner = level.hinge_garment.long()
         scaled = rigidity.to(level.rest)[owner] * level.bend_scale
         if level.grain is not None and weft is not None:
             scaled = scaled * bending_factor(level.grain.hinge, rigidity.tolist(), weft, owner)
+        if least is not None:
+            scaled = torch.maximum(scaled, least)
         if potential == "paper":
             self.weight = PAPER_HINGE * scaled * level.hinge_area / garment_area(level)[owner]
         else:

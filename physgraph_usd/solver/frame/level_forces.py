@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..fabric import Fabric
+from ..folds import raised_by
 from ..forces import body_terms, elastic_terms
 from ..forces.base import Force, ForceModule
 from ..forces.guide import Guide, GuideMap
@@ -35,6 +37,7 @@ class LevelForces:
         metric: The factorised rest Hessian of all of them.
         density: Areal density of each garment [kg/m^2].
         bends: Whether any cloth resists bending.
+        unresolved: Whether some garment's edges are too long for its folds, and its bending stiffness raised.
     """
 
     level: Level
@@ -43,6 +46,7 @@ class LevelForces:
     metric: Metric
     density: Float[Tensor, " garments"]
     bends: bool
+    unresolved: bool
 
     def without_facets(
         self, x: Float[Tensor, "vertices 3"], below: Float[Tensor, "coarse 3"], smooth: Stencil
@@ -130,14 +134,25 @@ def build_forces(
     if potential == "paper":
         relative = PAPER_SPRING / 3.0 * float(level.rest_length.square().mean() / garment_area(level).mean())
     terms = (
-        *elastic_terms(level, fabrics, potential=potential),
+        *elastic_terms(level, fabrics, potential=potential, raised=[each.raises_bending for each in garments]),
         *body_terms(level, fabrics, gravity=gravity, potential=potential),
     )
     guide = Guide(level, guide_map, torch.as_tensor(stiffness), relative_weight=relative)
     matrix = on_edges(ForceModule((*terms, guide)).rest_matrix(), level.edges.cpu().numpy())
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
-    return LevelForces(level, terms, guide, metric, density, any(fabric.bend > 0 for fabric in fabrics))
+    bends = any(fabric.bend > 0 for fabric in fabrics)
+    unresolved = potential != "paper" and _is_unresolved(level, garments, fabrics)
+    return LevelForces(level, terms, guide, metric, density, bends, unresolved)
+
+
+def _is_unresolved(level: Level, garments: Sequence[Garment], fabrics: Sequence[Fabric]) -> bool:
+    """Whether bending is raised at the mean edge of some garment."""
+    for span, garment, fabric in zip(level.spans, garments, fabrics, strict=True):
+        edge = float(level.spacing[span].mean()) if span.stop > span.start else 0.0
+        if garment.raises_bending and raised_by(fabric, edge) > 1.0:
+            return True
+    return False
 
 
 def blame(

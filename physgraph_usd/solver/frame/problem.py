@@ -140,6 +140,11 @@ class Problem:
         """Fraction of the vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
         return 0.0 if self.contact is None else self.contact.crowding
 
+    @property
+    def unresolved(self) -> bool:
+        """Whether the cage's edges are too long for the folds of some fabric."""
+        return self.forces[0].unresolved
+
     @cached_property
     def remaining(self) -> float:
         """The cage's remaining move, in its edge lengths."""
@@ -258,6 +263,9 @@ class Choice:
     from rest: folded, or pressed on by bodies, it is what coarse levels carry far (`python -m benchmarks.front
     --device cuda`).
 
+    Under one subdivision, folds that the cage's edges are too long for begin as short as the mesh's edges, and stay
+    so. They go through the cage too, where raised bending gives them a length.
+
     Attributes:
         nested: Coarse levels first; otherwise the finest level only.
         steps: Steps at the finest level, over those that were asked for.
@@ -289,6 +297,8 @@ def choose(problem: Problem, nested: bool | None) -> Choice:
     cuda = problem.device != "cpu"
     if not (subdivisions == 1 or (cuda and subdivisions > 1 and problem.remaining < FAR)):
         return Choice(True, reason=f"level by level: {subdivisions} subdivisions", learned=learned)
+    if subdivisions == 1 and problem.unresolved:
+        return Choice(True, reason="level by level: the cage is too coarse for the fabric's folds", learned=learned)
     if problem.crowding > CROWDED:
         reason = "level by level: cloth crosses cloth, or much of it lies near"
         return Choice(True, reason=reason, learned=learned)

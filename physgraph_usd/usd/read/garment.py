@@ -120,7 +120,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     rest, (bent, odd) = checked(prim, edges, rest, first=start), rests_bent(prim)
     notices = [*cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
-    self_contact, layer, level = _constants(prim, request)
+    self_contact, layer, raises, level = _constants(prim, request)
     painted, cut = _painted(prim, points.count, notices, values=values)
     grain, lies = read_grain(prim, cage.mesh, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     order, subdivisions = layer.at(None), round(level.at(None) or 0.0)
@@ -129,13 +129,17 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         self_contact=bool(self_contact.at(None)),
         layer=None if order is None else round(order),
         grain=grain,
+        raises_bending=bool(raises.at(None)),
         **painted,
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
     sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times),
-        sources | {"grain": lies} | values.sources | {"refine:level": level.source},
+        sources
+        | {"grain": lies, "refine:raiseBending": raises.source}
+        | values.sources
+        | {"refine:level": level.source},
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
@@ -145,8 +149,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
 
 
 def _constants(prim: Usd.Prim, request: Request) -> list[Found]:
-    """Self-collision, layer and level, which never change over a shot."""
-    names = ("contact:selfCollision", "contact:layer", "refine:level")
+    """Self-collision, layer, whether bending is raised, and level, which never change over a shot."""
+    names = ("contact:selfCollision", "contact:layer", "refine:raiseBending", "refine:level")
     *others, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
     if request.level is not None and level.source != "--set":
         level = Found(level.row, "--level", None, request.level)
