@@ -17,9 +17,9 @@ from sheets import garment_of
 from physgraph_usd.shot.warnings import of_folds, of_levels
 from physgraph_usd.solver import resolution
 from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.folds import EDGES_PER_WAVE
 from physgraph_usd.solver.level import build_levels, hinge_geometry
 from physgraph_usd.solver.mesh.subdivide import fine_count, subdivide_times
-from physgraph_usd.solver.folds import EDGES_PER_WAVE
 from physgraph_usd.solver.resolution import (
     AUTO,
     LEAST_STRAIN,

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from ..fabric import Fabric
-from ..level import Level
 from ..folds import carried_bend
+from ..level import Level
 from ..mesh.topology import find_edges
 from .base import Force
 from .bending import Bending

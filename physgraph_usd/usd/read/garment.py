@@ -134,12 +134,10 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     )
     notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
     sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
+    sources |= {"grain": lies, "refine:raiseBending": raises.source}
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times),
-        sources
-        | {"grain": lies, "refine:raiseBending": raises.source}
-        | values.sources
-        | {"refine:level": level.source},
+        sources | values.sources | {"refine:level": level.source},
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
