@@ -30,6 +30,7 @@ class Cold:
     warm: bool = False
     device: str = "cpu"
     misled: bool = False
+    unresolved: bool = False
 
 
 def chosen(nested: bool | None, *given: Any, **options: Any) -> Choice:
@@ -53,6 +54,13 @@ def test_the_finest_level_alone_where_one_coarse_level_has_nothing_to_draw_apart
     assert found.nested == nested
     assert found.steps == (1 if nested else LONGER)
     assert found.reason
+
+
+def test_folds_that_the_cage_is_too_coarse_for_go_through_it():
+    found = chosen(None, 1, unresolved=True)
+    assert (found.nested, found.steps) == (True, 1)
+    assert "too coarse" in found.reason
+    assert not chosen(None, 1, unresolved=True, warm=True).nested
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
@@ -111,9 +119,9 @@ def test_refine_leaves_it_open():
 def test_auto_is_what_it_chose_to_the_bit(level: int, same: str, steps: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(METHODS, "physgraph-flat", replace(METHODS["physgraph"], nested=False))
     mesh, rest = sheet(8, 6)
-    points = wave(rest)
-    auto = solved(mesh, rest, points, level=level, integrator="auto", tolerance=0.0)
-    other = solved(mesh, rest, points, level=level, integrator=same, steps=steps, tolerance=0.0)
+    own: dict[str, Any] = {"painted": {"raises_bending": False}}
+    auto = solved(mesh, rest, wave(rest), level=level, integrator="auto", tolerance=0.0, **own)
+    other = solved(mesh, rest, wave(rest), level=level, integrator=same, steps=steps, tolerance=0.0, **own)
     assert np.array_equal(auto.points[0], other.points[0])
     assert auto.telemetry[0]["chosen"].startswith("the finest level alone" if level == 1 else "level by level")
     assert "chosen" not in other.telemetry[0]
@@ -124,7 +132,7 @@ def test_auto_is_what_it_chose_to_the_bit(level: int, same: str, steps: int, mon
 def test_cloth_near_cloth_goes_through_the_cage_and_is_solved_as_if_never_asked():
     lower, upper = square(8), square(8)
     tilted = upper[1] + np.outer(0.3 * upper[1][:, 0] + 0.003, [0.0, 1.0, 0.0])
-    garments = [named(lower, "A"), named(upper, "B")]
+    garments = [named(lower, "A", raises_bending=False), named(upper, "B", raises_bending=False)]
     for place, who in ((tilted, "quasi-newton"), (upper[1] + [0.0, 0.0005, 0.0], "physgraph")):
         auto, asked = (
             refiner_with(garments, integrator=name).solve(frame_with([lower[1], place])) for name in ("auto", who)

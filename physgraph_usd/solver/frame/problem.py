@@ -297,11 +297,11 @@ def choose(problem: Problem, nested: bool | None) -> Choice:
     cuda = problem.device != "cpu"
     if not (subdivisions == 1 or (cuda and subdivisions > 1 and problem.remaining < FAR)):
         return Choice(True, reason=f"level by level: {subdivisions} subdivisions", learned=learned)
-    if subdivisions == 1 and problem.unresolved:
-        return Choice(True, reason="level by level: the cage is too coarse for the fabric's folds", learned=learned)
     if problem.crowding > CROWDED:
         reason = "level by level: cloth crosses cloth, or much of it lies near"
         return Choice(True, reason=reason, learned=learned)
+    if subdivisions == 1 and problem.unresolved:
+        return Choice(True, reason="level by level: the cage is too coarse for the fabric's folds", learned=learned)
     why = "one subdivision" if subdivisions == 1 else "the cage is not far from rest"
     near = "little" if problem.crowding else "no"
     reason = f"the finest level alone: {why}, and {near} cloth lies near cloth"
