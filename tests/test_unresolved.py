@@ -85,7 +85,7 @@ def test_stiff_cloth_does_not_crumple_where_its_folds_are_not_resolved():
             answer = solved(mesh, rest, wave(rest), level=1, fabric=fabric, painted={"raises_bending": raised})
             angle, _, _, length = hinge_geometry(answer.points[0], fine.hinges.numpy())
             bent.append(float((np.abs(angle) * length).sum()))
-        assert bent[0] < 0.9 * bent[1]
+        assert bent[0] < 0.95 * bent[1]
 
 
 def test_the_attribute_is_read(tmp_path: Path):
