@@ -1,10 +1,13 @@
 """Refined cloth beside the same cloth simulated finely, from one animation.
 
-    python -m benchmarks.fidelity [--scenes curtain sleeve] [--fabrics silk] [--frames 30] [--save FOLDER]
+    python -m benchmarks.fidelity [--scenes curtain sleeve] [--fabrics silk] [--frames 20] [--jobs 2] [--save FOLDER]
+    python -m benchmarks.fidelity --newton PYTHON [...]      PYTHON is one that has newton
 
-Each scene is simulated by the solver's own potential and inertia (backward Euler, two increments a frame, no guide, no
-contact), once at the cage's resolution and once at two subdivisions. The first is the animation that is refined, as a
-shot is; the second is what a fine simulation of that fabric shows. Printed over the last half of the frames: curvature
+Each scene is simulated once at the cage's resolution and once at two subdivisions. The first is the animation that is
+refined, as a shot is; the second is what a fine simulation of that fabric shows. Four scenes are simulated by the
+solver's own potential and inertia (backward Euler, two increments a frame, no guide, no contact); with ``--newton``
+four are by Newton's Style3D solver, with its material, contact and friction (`benchmarks/newton_cloth.py`), and what
+it makes is refined with bodies and contact. Printed over the last half of the frames: curvature
 of Loop subdivision, refined and simulated; amplitudes by wavelength, refined over simulated; the angle between their
 folds, where both fold; the correlation of where they fold; the second difference in time of what is finer than the
 cage, refined over simulated. The fine simulation has a history of its own: it sways out of step, and its folds need
@@ -14,23 +17,31 @@ not lie where the cage's do.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.fidelity_stages import SCENES, Stage
 from benchmarks.loose_garment import lowpass, vertex_area
 from benchmarks.rows import say
 from physgraph_usd.shot.solve import prepare_device
+from physgraph_usd.solver.colliders.pose import Collider, ShapePose
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.forces import body_terms, elastic_terms
 from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.forces.membrane import shear_stiffness
 from physgraph_usd.solver.forces.tether import Tether
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.grain import axes
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
@@ -42,6 +53,10 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 RATE, INCREMENTS = 24.0, 2
 STEPS = 40
 """Quasi-Newton steps an increment, at most."""
+SUBSTEPS = 20
+"""Newton's steps a frame: with ten, a cage in silk had a quarter less curvature than with forty."""
+OURS, NEWTON = ("curtain", "sleeve", "skirt", "flag"), ("curtain", "flag", "ball", "elbow")
+"""Scenes by who simulates them."""
 BANDS = (0.3, 0.15, 0.08, 0.04, 0.02)
 """Ends of the bands of wavelengths [m]."""
 PATCH = 0.1
@@ -49,101 +64,16 @@ PATCH = 0.1
 FOLDED = 0.5
 """Part of the cloth that counts as folding: the half with the densest folds, in both."""
 FABRICS = ("jersey", "silk", "denim")
-Motion = Callable[[float], np.ndarray]
 
 
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """A sheet that hangs from what moves.
-
-    Attributes:
-        faces: Quads, shape (F, 4).
-        flat: Its material coordinates [m], shape (V, 2).
-        rest: Rest positions [m], shape (V, 3).
-        held: Which vertices are moved, shape (V,), bool.
-        motion: Positions of all vertices at a time [s], of which those held count.
-    """
-
-    faces: np.ndarray
-    flat: np.ndarray
-    rest: np.ndarray
-    held: np.ndarray
-    motion: Motion
-
-
-def grid(columns: int, rows: int, *, closed: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Quads of a grid, shape (F, 4), and the places of its vertices from 0 to 1, shape (V, 2)."""
-    across = columns if closed else columns + 1
-    u, v = np.meshgrid(np.arange(across) / columns, np.arange(rows + 1) / rows)
-    number = np.arange(across * (rows + 1)).reshape(rows + 1, across)
-    right = np.roll(number, -1, axis=1)
-    corners = np.stack([number[:-1], right[:-1], right[1:], number[1:]], axis=2)
-    return corners[:, :columns].reshape(-1, 4), np.stack([u.ravel(), v.ravel()], axis=1)
-
-
-def curtain() -> Stage:
-    """A curtain of 1 x 1 m whose top is gathered to 70% and swayed."""
-    faces, uv = grid(32, 32)
-    rest = np.stack([uv[:, 0], 0.0 * uv[:, 0], -uv[:, 1]], axis=1)
-
-    def motion(time: float) -> np.ndarray:
-        gather, sway = 0.3 * min(time / 0.4, 1.0), 0.1 * np.sin(2.0 * np.pi * 0.8 * time)
-        waves = 0.01 * np.sin(2.0 * np.pi * 5.0 * uv[:, 0]) * min(time / 0.4, 1.0)
-        return rest * [1.0 - gather, 1.0, 1.0] + np.stack([0 * waves + 0.3 * gather, waves + sway, 0 * waves], axis=1)
-
-    return Stage(faces, uv, rest, uv[:, 1] == 0.0, motion)
-
-
-def sleeve() -> Stage:
-    """A sleeve, 38 cm round and 40 cm long, whose lower end is twisted by a third of a turn and pushed up by 8%."""
-    faces, uv = grid(36, 36, closed=True)
-    angle = 2.0 * np.pi * uv[:, 0]
-    rest = np.stack([0.06 * np.cos(angle), 0.06 * np.sin(angle), -0.4 * uv[:, 1]], axis=1)
-
-    def motion(time: float) -> np.ndarray:
-        part = min(time / 0.8, 1.0) * uv[:, 1]
-        turned = angle + part * 2.0 * np.pi / 3.0
-        height = -0.4 * uv[:, 1] + 0.032 * part
-        return np.stack([0.06 * np.cos(turned), 0.06 * np.sin(turned), height], axis=1)
-
-    return Stage(faces, uv * [0.377, 0.4], rest, (uv[:, 1] == 0.0) | (uv[:, 1] == 1.0), motion)
-
-
-def skirt() -> Stage:
-    """A flared skirt of 50 cm, its waist turned to and fro."""
-    faces, uv = grid(60, 24, closed=True)
-    angle, radius = 2.0 * np.pi * uv[:, 0], 0.13 + 0.22 * uv[:, 1]
-    rest = np.stack([radius * np.cos(angle), radius * np.sin(angle), -0.45 * uv[:, 1]], axis=1)
-
-    def motion(time: float) -> np.ndarray:
-        turn = 0.8 * np.sin(2.0 * np.pi * 0.9 * time)
-        c, s = np.cos(turn), np.sin(turn)
-        return rest @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-    return Stage(faces, uv * [1.5, 0.5], rest, uv[:, 1] == 0.0, motion)
-
-
-def flag() -> Stage:
-    """A flag of 90 x 60 cm whose pole is waved."""
-    faces, uv = grid(36, 24)
-    rest = np.stack([0.9 * uv[:, 0], 0.0 * uv[:, 0], -0.6 * uv[:, 1]], axis=1)
-
-    def motion(time: float) -> np.ndarray:
-        return rest + np.array([0.0, 0.25 * np.sin(2.0 * np.pi * time), 0.0])
-
-    return Stage(faces, uv * [0.9, 0.6], rest, uv[:, 0] == 0.0, motion)
-
-
-SCENES: dict[str, Callable[[], Stage]] = {"curtain": curtain, "sleeve": sleeve, "skirt": skirt, "flag": flag}
-
-
-def garment_of(stage: Stage, level: int) -> Garment:
-    """The stage's sheet as a garment, its warp hanging down."""
-    garment = Garment.of("/Sheet", stage.faces, stage.rest, level=level)
+def garment_of(stage: Stage, level: int, *, touches: bool = False) -> Garment:
+    """The stage's sheet as a garment, its warp along its second material coordinate; whether it touches anything."""
+    feels = tuple(range(len(stage.bodies))) if touches else ()
+    garment = Garment.of("/Sheet", stage.faces, stage.rest, level=level, colliders=feels)
     corners = stage.rest[stage.faces]
     down = corners[:, 3] - corners[:, 0]
     warp, one = down / np.linalg.norm(down, axis=1, keepdims=True), np.ones(len(stage.rest))
-    return replace(garment, pin=stage.held.astype(float), grain=Grain(warp, one, 0.0 * one), self_contact=False)
+    return replace(garment, pin=stage.held.astype(float), grain=Grain(warp, one, 0.0 * one), self_contact=touches)
 
 
 def level_at(garment: Garment, subdivisions: int) -> Level:
@@ -176,11 +106,58 @@ def simulated(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) -
         yield x.double().numpy()
 
 
-def refined(stage: Stage, fabric: Fabric, cages: Sequence[np.ndarray], subdivisions: int) -> list[np.ndarray]:
+def panel_of(stage: Stage, level: Level) -> np.ndarray:
+    """Each triangle laid flat with its weft along x and its warp along y [m], shape (T, 3, 2)."""
+    rest, triangles = level.rest.double().numpy(), level.triangles.numpy()
+    corners = stage.rest[stage.faces[0]]
+    down = np.broadcast_to(corners[3] - corners[0], (len(triangles), 3))
+    warp, across = axes(rest, triangles, down / np.linalg.norm(down[0]))
+    spans = rest[triangles] - rest[triangles][:, :1]
+    return np.stack([-np.einsum("tcx,tx->tc", spans, across), np.einsum("tcx,tx->tc", spans, warp)], axis=2)
+
+
+def problem_of(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) -> dict[str, np.ndarray]:
+    """What `benchmarks/newton_cloth.py` is given: stiffnesses that correspond, and where held vertices and bodies are.
+
+    Its membrane has the fabric's along weft, warp and in shear, no contraction across; its bending, alike in all
+    directions, has the warp's.
+    """
+    level, step = level_at(garment_of(stage, subdivisions), subdivisions), 1.0 / (RATE * SUBSTEPS)
+    held = np.flatnonzero(level.from_coarse @ stage.held.astype(float) > 1.0 - 1e-6)
+    times = step * np.arange(1, frames * SUBSTEPS + 1)
+    poses = [[body.pose(time) for body in stage.bodies] for time in times]
+    weft = fabric.stretch if fabric.weft_stretch is None else fabric.weft_stretch
+    return {
+        "points": level.from_coarse @ stage.rest,
+        "triangles": level.triangles.numpy(),
+        "panel": panel_of(stage, level),
+        "stretch": np.array([weft, fabric.stretch, shear_stiffness(fabric)]),
+        "bend": np.array(fabric.bend),
+        "density": np.array(fabric.density),
+        "held": held,
+        "targets": np.array([(level.from_coarse @ stage.motion(time))[held] for time in times]),
+        "substeps": np.array(SUBSTEPS),
+        "step": np.array(step),
+        "capsules": np.array([(body.radius, body.half) for body in stage.bodies]).reshape(-1, 2),
+        "middles": np.array([[pose.centre for pose in each] for each in poses]),
+        "turns": np.array([[pose.turn for pose in each] for each in poses]),
+    }
+
+
+def refined(
+    stage: Stage, fabric: Fabric, cages: Sequence[np.ndarray], subdivisions: int, *, touches: bool = False
+) -> list[np.ndarray]:
     """Positions of each frame [m], shape (V, 3), of the cages refined as a shot is."""
-    refiner = Refiner(Scene((garment_of(stage, subdivisions),), GRAVITY), SolveSettings())
-    states = (refiner.solve(Frame(float(n), (GarmentFrame(cage, fabric),))) for n, cage in enumerate(cages))
-    return [points for state in states for points in state.points if points is not None]
+    kinds = [body.pose(0.0).kind for body in stage.bodies]
+    colliders = tuple(Collider(f"/Body{number}", kind) for number, kind in enumerate(kinds)) if touches else ()
+    garment = garment_of(stage, subdivisions, touches=touches)
+    refiner = Refiner(Scene((garment,), GRAVITY, (), colliders), SolveSettings())
+    found = []
+    for n, cage in enumerate(cages):
+        poses: tuple[ShapePose, ...] = tuple(body.pose((n + 1) / RATE) for body in stage.bodies) if touches else ()
+        state = refiner.solve(Frame(float(n), (GarmentFrame(cage, fabric),), poses))
+        found += [points for points in state.points if points is not None]
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,52 +209,131 @@ class Judge:
         return float(np.degrees(np.median(apart[both]))) if both.any() else float("nan"), correlation
 
 
-def jerk(frames: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> float:
+def jerk(frames: np.ndarray, smooth: np.ndarray) -> float:
     """RMS second difference in time of the detail [m]."""
-    detail = np.array(frames) - np.array(smooth)
+    detail = frames - smooth
     return float(np.sqrt((np.diff(detail, n=2, axis=0) ** 2).sum(axis=2).mean()))
 
 
-def row_of(name: str, fabric: str, *, frames: int, subdivisions: int) -> tuple[str, list[np.ndarray]]:
-    """A row of the table, and the last frame: the cage, Loop subdivision, refined and simulated [m]."""
-    stage, values = SCENES[name](), PRESETS[fabric]
-    cages = list(simulated(stage, values, 0, frames=frames))
-    truth = list(simulated(stage, values, subdivisions, frames=frames))
-    fine = refined(stage, values, cages, subdivisions)
-    level = level_at(garment_of(stage, subdivisions), subdivisions)
+@dataclass(frozen=True)
+class Task:
+    """A row of the table that is to be made.
+
+    Attributes:
+        scene: Name of the scene.
+        fabric: Name of the preset.
+        frames: How many.
+        subdivisions: How many.
+        python: One that has Newton, which simulates; "" where we do.
+        kept: Folder in which Newton's problems and results stay; a result that is there is not simulated again.
+    """
+
+    scene: str
+    fabric: str
+    frames: int
+    subdivisions: int
+    python: str = ""
+    kept: Path | None = None
+
+    def by_newton(self, subdivisions: int) -> list[np.ndarray]:
+        """Positions of each frame [m], shape (V, 3), by Newton's Style3D solver."""
+        with tempfile.TemporaryDirectory() as folder:
+            place, name = self.kept or Path(folder), f"{self.scene}_{self.fabric}_{subdivisions}"
+            problem, result = place / f"{name}.problem.npz", place / f"{name}.result.npz"
+            if not result.exists():
+                given = problem_of(SCENES[self.scene](), PRESETS[self.fabric], subdivisions, frames=self.frames)
+                np.savez_compressed(problem, allow_pickle=False, **given)
+                script = Path(__file__).with_name("newton_cloth.py")
+                subprocess.run([self.python, script, problem, result], check=True, stdout=subprocess.DEVNULL)
+            return list(np.load(result)["frames"].astype(float))
+
+
+@dataclass(frozen=True, eq=False)
+class Films:
+    """Positions of each frame of the cage, Loop subdivision, refined and simulated [m], each shape (F, V, 3)."""
+
+    cage: np.ndarray
+    loop: np.ndarray
+    refined: np.ndarray
+    simulated: np.ndarray
+
+
+def filmed(task: Task) -> Films:
+    """Simulate the cage and the fine cloth, and refine the cage."""
+    prepare_device("cpu")
+    stage, values = SCENES[task.scene](), PRESETS[task.fabric]
+
+    def moved(subdivisions: int) -> list[np.ndarray]:
+        if task.python:
+            return task.by_newton(subdivisions)
+        return list(simulated(stage, values, subdivisions, frames=task.frames))
+
+    cages, truth = moved(0), moved(task.subdivisions)
+    fine = refined(stage, values, cages, task.subdivisions, touches=bool(task.python))
+    level = level_at(garment_of(stage, task.subdivisions), task.subdivisions)
     loop = [level.smooth_from_coarse @ cage for cage in cages]
-    judge, late = Judge(level, level.from_coarse @ stage.flat), slice(frames // 2, None)
+    return Films(np.array(cages), np.array(loop), np.array(fine), np.array(truth))
+
+
+def row_of(task: Task, films: Films) -> str:
+    """A row of the table."""
+    stage, fine = SCENES[task.scene](), films.refined
+    level = level_at(garment_of(stage, task.subdivisions), task.subdivisions)
+    loop, truth = films.loop, films.simulated
+    judge, late = Judge(level, level.from_coarse @ stage.flat), slice(task.frames // 2, None)
     curvature = [np.mean([judge.curvature(x) for x in each[late]]) for each in (loop, fine, truth)]
     bands = [np.mean([judge.amplitudes(x) for x in each[late]], axis=0) for each in (fine, truth)]
     angle, where = np.mean([judge.compared(x, y) for x, y in zip(fine[late][::4], truth[late][::4], strict=True)], 0)
     moves = jerk(fine[late], loop[late]) / jerk(truth[late], loop[late])
     cells = [f"{each:.2f}" for each in curvature] + [f"{curvature[1] / curvature[2]:.2f}"]
     cells += [f"{ratio:.2f}" for ratio in bands[0] / bands[1]] + [f"{angle:.0f}", f"{where:.2f}", f"{moves:.2f}"]
-    return f"| {name} | {fabric} | {' | '.join(cells)} |", [cages[-1], loop[-1], fine[-1], truth[-1]]
+    who = "Newton" if task.python else "ours"
+    return f"| {task.scene} | {who} | {task.fabric} | {' | '.join(cells)} |"
+
+
+def made(task: Task) -> tuple[str, Films]:
+    """A row of the table, and what it is of."""
+    torch.set_num_threads(1)
+    films = filmed(task)
+    return row_of(task, films), films
+
+
+def heading() -> str:
+    """The table's head."""
+    ends = [f"{1e3 * a:g}-{1e3 * b:g} mm" for a, b in pairwise(BANDS)]
+    names = ["scene", "simulated by", "fabric", "Loop, m", "refined, m", "simulated, m", "refined / simulated", *ends]
+    names += [f"under {1e3 * BANDS[-1]:g} mm", "angle, degrees", "where", "motion"]
+    return f"| {' | '.join(names)} |\n|{'---|' * len(names)}"
+
+
+def say_rows(tasks: Sequence[Task], *, jobs: int, save: Path | None) -> None:
+    """Print the table, and save the positions of all frames."""
+    say(heading())
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        for task, (row, films) in zip(tasks, pool.map(made, tasks), strict=True):
+            say(row)
+            if save:
+                save.mkdir(parents=True, exist_ok=True)
+                who = "newton" if task.python else "ours"
+                np.savez_compressed(save / f"{task.scene}_{who}_{task.fabric}.npz", **vars(films))
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", choices=sorted(SCENES), default=list(SCENES))
+    parser.add_argument("--newton", default="", metavar="PYTHON", help="Simulate by Newton, which this Python has.")
+    parser.add_argument("--kept", type=Path, help="Folder of Newton's problems and results, which are used again.")
+    parser.add_argument("--scenes", nargs="+", choices=list(SCENES))
     parser.add_argument("--fabrics", nargs="+", choices=sorted(PRESETS), default=list(FABRICS))
-    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--level", type=int, default=2, help="Subdivisions.")
-    parser.add_argument("--save", type=Path, help="Folder for the last frames' positions, as .npz.")
+    parser.add_argument("--jobs", type=int, default=1, help="Rows made at once.")
+    parser.add_argument("--save", type=Path, help="Folder for the positions of all frames, as .npz.")
     given = parser.parse_args()
-    prepare_device("cpu")
-    ends = [f"{1e3 * a:g}-{1e3 * b:g} mm" for a, b in pairwise(BANDS)]
-    names = ["scene", "fabric", "Loop, m", "refined, m", "simulated, m", "refined / simulated", *ends]
-    names += [f"under {1e3 * BANDS[-1]:g} mm", "angle, degrees", "where", "motion"]
-    say(f"| {' | '.join(names)} |\n|{'---|' * len(names)}")
-    for name in given.scenes:
-        for fabric in given.fabrics:
-            row, last = row_of(name, fabric, frames=given.frames, subdivisions=given.level)
-            say(row)
-            if given.save:
-                given.save.mkdir(parents=True, exist_ok=True)
-                keys = ("cage", "loop", "refined", "simulated")
-                np.savez(given.save / f"{name}_{fabric}.npz", **dict(zip(keys, last, strict=True)))
+    scenes = given.scenes or (NEWTON if given.newton else OURS)
+    options = given.frames, given.level, given.newton, given.kept
+    tasks = [Task(scene, fabric, *options) for scene, fabric in product(scenes, given.fabrics)]
+    say_rows(tasks, jobs=given.jobs, save=given.save)
 
 
 if __name__ == "__main__":

@@ -21,16 +21,18 @@ NEAR = 0.02
 """Distance from a body up to which distances are asked for [m]."""
 
 
-def opened(name: str, level: int | None = None, garments: Sequence[str] = ()) -> Shot:
+def opened(name: str, level: int | None = None, garments: Sequence[str] = (), *, overrides: Sequence[str] = ()) -> Shot:
     """A sample, opened.
 
     Args:
         name: One of the samples.
         level: Subdivisions, or None for the sample's own.
         garments: Prim paths to refine, or all.
+        overrides: Attributes set for every garment, as `--set` takes them.
     """
     with tempfile.TemporaryDirectory() as folder:
-        return open_shot(str(write_sample(name, Path(folder))), level=level, garments=garments)
+        shot = str(write_sample(name, Path(folder)))
+        return open_shot(shot, level=level, garments=garments, overrides=overrides)
 
 
 def problem_of(shot: Shot, dtype: torch.dtype = torch.float32) -> Problem:

@@ -108,7 +108,7 @@ def measured(fabric: Fabric) -> dict[str, tuple[float, float]]:
     along = np.array([1.0, 0.0, 0.0])
     points, triangles = equilateral(0.16, 0.16, 0.01)
     level = level_of(points, triangles, warp=along)
-    free = replace(fabric, stretch_limit=None)
+    free = replace(fabric, stretch_limit=None, warp_ease=0.0, weft_ease=0.0)
     found: dict[str, tuple[float, float]] = {}
     for name, way in (("warp", free), ("weft", turned(free))):
         found[f"stretch, {name}"] = tensile_test(level, in_plane_terms(level, [way]))[0], way.stretch

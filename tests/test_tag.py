@@ -109,3 +109,8 @@ def test_a_prim_in_an_instance_is_refused(untagged: Path, tmp_path: Path) -> Non
     stage.Save()
     with pytest.raises(StageError, match="instance"):
         tag(path, tmp_path / "tagged.usda", garments=["/Set/copy/rig/coat"])
+
+
+def test_a_worn_preset_is_eased(untagged: Path, tmp_path: Path) -> None:
+    stage = Usd.Stage.Open(str(tag(untagged, tmp_path / "tagged.usda", garments=[COAT], preset="worn-denim")))
+    assert stage.GetPrimAtPath(COAT).GetAttribute("physgraph:rest:weftEase").Get() == pytest.approx(2.0)

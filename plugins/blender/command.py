@@ -11,6 +11,7 @@ from pathlib import Path
 from zlib import crc32
 
 PRESETS = ("paper", "silk", "cotton", "wool", "polyester", "denim", "jersey", "rib", "leather")
+PRESETS += ("worn-denim", "crisp-cotton", "soft-jersey")
 """The fabrics of `physgraph-usd tag --preset`."""
 OF_BLENDER = ("MATERIALX_SEARCH_PATH", "PXR_MTLX_STDLIB_SEARCH_PATHS")
 """What Blender sets for its own USD, of another version than the command's."""

@@ -1,0 +1,165 @@
+"""The sheets of `benchmarks.fidelity`: what they are, what holds them, and the bodies that they touch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from physgraph_usd.solver.colliders.pose import ShapePose
+
+Motion = Callable[[float], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A capsule that moves, or a ball.
+
+    Attributes:
+        radius: [m].
+        half: Half its length without caps [m]; 0 is a ball.
+        ends: Its middle [m] and the direction of its axis, at a time [s].
+    """
+
+    radius: float
+    half: float
+    ends: Callable[[float], tuple[np.ndarray, np.ndarray]]
+
+    def pose(self, time: float) -> ShapePose:
+        """Where it is at a time [s]."""
+        middle, axis = self.ends(time)
+        side = np.cross([0.0, 1.0, 0.0], axis)
+        side = side / np.linalg.norm(side)
+        turn = np.stack([side, np.cross(axis, side), axis], axis=1)
+        kind = "capsule" if self.half else "sphere"
+        return ShapePose(kind, turn, middle, np.array([self.radius, self.radius, self.half or self.radius]))
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A sheet that hangs from what moves.
+
+    Attributes:
+        faces: Quads, shape (F, 4), whose second and third corners lie along the warp from the first and the fourth.
+        flat: Its material coordinates [m], shape (V, 2).
+        rest: Rest positions [m], shape (V, 3).
+        held: Which vertices are moved, shape (V,), bool.
+        motion: Positions of all vertices at a time [s], of which those held count.
+        bodies: What it touches.
+        camera: Azimuth and elevation from which it is drawn [degrees].
+    """
+
+    faces: np.ndarray
+    flat: np.ndarray
+    rest: np.ndarray
+    held: np.ndarray
+    motion: Motion
+    bodies: tuple[Body, ...] = ()
+    camera: tuple[float, float] = (25.0, 8.0)
+
+
+def grid(columns: int, rows: int, *, closed: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Quads of a grid, shape (F, 4), and the places of its vertices from 0 to 1, shape (V, 2)."""
+    across = columns if closed else columns + 1
+    u, v = np.meshgrid(np.arange(across) / columns, np.arange(rows + 1) / rows)
+    number = np.arange(across * (rows + 1)).reshape(rows + 1, across)
+    right = np.roll(number, -1, axis=1)
+    corners = np.stack([number[:-1], right[:-1], right[1:], number[1:]], axis=2)
+    return corners[:, :columns].reshape(-1, 4), np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+def curtain() -> Stage:
+    """A curtain of 1 x 1 m whose top is gathered to 70% and swayed."""
+    faces, uv = grid(32, 32)
+    rest = np.stack([uv[:, 0], 0.0 * uv[:, 0], -uv[:, 1]], axis=1)
+
+    def motion(time: float) -> np.ndarray:
+        gather, sway = 0.3 * min(time / 0.4, 1.0), 0.1 * np.sin(2.0 * np.pi * 0.8 * time)
+        waves = 0.01 * np.sin(2.0 * np.pi * 5.0 * uv[:, 0]) * min(time / 0.4, 1.0)
+        return rest * [1.0 - gather, 1.0, 1.0] + np.stack([0 * waves + 0.3 * gather, waves + sway, 0 * waves], axis=1)
+
+    return Stage(faces, uv, rest, uv[:, 1] == 0.0, motion)
+
+
+def sleeve() -> Stage:
+    """A sleeve, 38 cm round and 40 cm long, whose lower end is twisted by a third of a turn and pushed up by 8%."""
+    faces, uv = grid(36, 36, closed=True)
+    angle = 2.0 * np.pi * uv[:, 0]
+    rest = np.stack([0.06 * np.cos(angle), 0.06 * np.sin(angle), -0.4 * uv[:, 1]], axis=1)
+
+    def motion(time: float) -> np.ndarray:
+        part = min(time / 0.8, 1.0) * uv[:, 1]
+        turned = angle + part * 2.0 * np.pi / 3.0
+        height = -0.4 * uv[:, 1] + 0.032 * part
+        return np.stack([0.06 * np.cos(turned), 0.06 * np.sin(turned), height], axis=1)
+
+    return Stage(faces, uv * [0.377, 0.4], rest, (uv[:, 1] == 0.0) | (uv[:, 1] == 1.0), motion)
+
+
+def skirt() -> Stage:
+    """A flared skirt of 50 cm, its waist turned to and fro."""
+    faces, uv = grid(60, 24, closed=True)
+    angle, radius = 2.0 * np.pi * uv[:, 0], 0.13 + 0.22 * uv[:, 1]
+    rest = np.stack([radius * np.cos(angle), radius * np.sin(angle), -0.45 * uv[:, 1]], axis=1)
+
+    def motion(time: float) -> np.ndarray:
+        turn = 0.8 * np.sin(2.0 * np.pi * 0.9 * time)
+        c, s = np.cos(turn), np.sin(turn)
+        return rest @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    return Stage(faces, uv * [1.5, 0.5], rest, uv[:, 1] == 0.0, motion)
+
+
+def flag() -> Stage:
+    """A flag of 90 x 60 cm whose pole is waved."""
+    faces, uv = grid(36, 24)
+    rest = np.stack([0.9 * uv[:, 0], 0.0 * uv[:, 0], -0.6 * uv[:, 1]], axis=1)
+
+    def motion(time: float) -> np.ndarray:
+        return rest + np.array([0.0, 0.25 * np.sin(2.0 * np.pi * time), 0.0])
+
+    return Stage(faces, uv * [0.9, 0.6], rest, uv[:, 0] == 0.0, motion)
+
+
+def ball() -> Stage:
+    """A sheet of 80 x 80 cm that is laid over a ball of 36 cm and drawn over it by one side."""
+    faces, uv = grid(28, 28)
+    rest = np.stack([0.8 * uv[:, 0] - 0.5, 0.4 - 0.8 * uv[:, 1], 0.0 * uv[:, 0] + 0.005], axis=1)
+
+    def motion(time: float) -> np.ndarray:
+        return rest + np.array([0.3, 0.0, -0.25]) * min(time, 1.0)
+
+    def ends(_: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([0.0, 0.0, -0.18]), np.array([0.0, 0.0, 1.0])
+
+    return Stage(faces, 0.8 * uv, rest, uv[:, 0] == 1.0, motion, (Body(0.18, 0.0, ends),), (30.0, 22.0))
+
+
+def elbow() -> Stage:
+    """A sleeve, 35 cm round and 40 cm long, held at the shoulder, on an arm that bends by 100 degrees at the elbow."""
+    faces, uv = grid(32, 36, closed=True)
+    angle = 2.0 * np.pi * uv[:, 0]
+    rest = np.stack([0.4 * uv[:, 1] - 0.2, 0.055 * np.cos(angle), 0.055 * np.sin(angle)], axis=1)
+
+    def upper(_: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([-0.15, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+
+    def lower(time: float) -> tuple[np.ndarray, np.ndarray]:
+        turn = np.radians(100.0) * min(time / 0.7, 1.0)
+        axis = np.array([np.cos(turn), 0.0, np.sin(turn)])
+        return 0.15 * axis, axis
+
+    arm = tuple(Body(0.042, 0.15, each) for each in (upper, lower))
+    return Stage(faces, uv * [0.346, 0.4], rest, uv[:, 1] == 0.0, lambda _: rest, arm, (10.0, 12.0))
+
+
+SCENES: dict[str, Callable[[], Stage]] = {
+    "curtain": curtain,
+    "sleeve": sleeve,
+    "skirt": skirt,
+    "flag": flag,
+    "ball": ball,
+    "elbow": elbow,
+}
+"""Scenes by name."""
