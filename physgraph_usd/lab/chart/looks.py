@@ -1,4 +1,4 @@
-"""What gaps look like: the cloth of a frame as it is at a few of them, drawn from the same side."""
+"""Pictures of gaps: the cloth of a frame as it is at a few of them, drawn from the same side."""
 
 from __future__ import annotations
 

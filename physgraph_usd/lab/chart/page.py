@@ -109,9 +109,8 @@ def _figure(chart: Chart) -> go.Figure:
     figure.update_xaxes(title_text="milliseconds a frame", row=1, col=1)
     figure.update_xaxes(title_text="milliseconds a frame", row=len(panels) + warm, col=1)
     figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=1, col=1)
-    if warm:  # Less than a decade of either: labels at 1, 2 and 5.
-        figure.update_xaxes(dtick="D2", minor=None, row=2, col=1)
-        figure.update_yaxes(type="log", dtick="D2", tickformat="~p", row=2, col=1)
+    if warm:
+        _label_warm(figure)
     figure.update_layout(
         height=520 + 330 * warm + 220 * (len(panels) - 1),
         template="plotly_white",
@@ -142,6 +141,12 @@ def _add_front(figure: go.Figure, chart: Chart) -> None:
         row=1,
         col=1,
     )
+
+
+def _label_warm(figure: Any) -> None:
+    """Labels at 1, 2 and 5 in the panel of warm frames, which often spans less than a decade."""
+    figure.update_xaxes(dtick="D2", minor=None, row=2, col=1)
+    figure.update_yaxes(type="log", dtick="D2", tickformat="~p", row=2, col=1)
 
 
 def _trace(chart: Chart, name: str, style: Style, *, field: str) -> go.Scatter:
@@ -209,15 +214,15 @@ def _legend(chart: Chart) -> str:
 
 
 def _looks(chart: Chart, folder: Path) -> str:
-    """What gaps look like."""
+    """The pictures of gaps."""
     found = looks_of(chart, folder)
     if not found:
         return ""
     parts = []
     for each in found:
-        data, said = base64.b64encode(each.file.read_bytes()).decode("ascii"), html.escape(caption(each))
-        picture = f"<img alt='{said}' src='data:image/png;base64,{data}'>"
-        parts.append(f"<figure>{picture}<figcaption>{said}</figcaption></figure>")
+        data, words = base64.b64encode(each.file.read_bytes()).decode("ascii"), html.escape(caption(each))
+        picture = f"<img alt='{words}' src='data:image/png;base64,{data}'>"
+        parts.append(f"<figure>{picture}<figcaption>{words}</figcaption></figure>")
     return f"<h2>What these percentages look like</h2><div class='looks'>{''.join(parts)}</div>"
 
 

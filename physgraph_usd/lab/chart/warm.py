@@ -20,7 +20,7 @@ from .problem import DEFAULT, Problem
 from .table import typical
 
 METHODS_OF_WARM = ("quasi-newton", "physgraph")
-"""What refine's default chooses from, frame by frame."""
+"""The methods that refine's default chooses from, frame by frame."""
 STEPS = (12, 6, 24, 3, 48)
 """Most steps of a frame, those that tell most first."""
 ROW = 4

@@ -115,7 +115,7 @@ def advice(chart: Chart) -> str:
 
 
 def warm_advice(chart: Chart) -> str:
-    """What frames after the first cost, in a sentence."""
+    """The cost of frames after the first, in a sentence."""
     own = next((each for each in chart.warm if each.method == DEFAULT), None)
     if own is None:
         return ""
