@@ -143,7 +143,7 @@ def _add_front(figure: go.Figure, chart: Chart) -> None:
     )
 
 
-def _label_warm(figure: Any) -> None:
+def _label_warm(figure: go.Figure) -> None:
     """Labels at 1, 2 and 5 in the panel of warm frames, which often spans less than a decade."""
     figure.update_xaxes(dtick="D2", minor=None, row=2, col=1)
     figure.update_yaxes(type="log", dtick="D2", tickformat="~p", row=2, col=1)
