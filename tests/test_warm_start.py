@@ -106,6 +106,20 @@ class TestTangledStart:
             assert told["contact"]["cloth"]["after"]["crossings"] == 0
             assert told["start"].startswith("warm") == (time > 0)
 
+    def test_what_its_cage_took_through_other_cloth_does_not_hang_on_that(self):
+        """A sheet is pulled up through a smaller one, which stays: its middle may not follow, its rim may."""
+        small, large = square(4), square(12)
+        garments = [named(small, "A", pin=np.ones(len(small[1]))), named(large, "B")]
+        middle = np.concatenate([each[1] for each in (small, large)]).mean(axis=0)
+        solver, strains, starts = refiner_with(garments, times=tuple(range(3))), [], []
+        for time, height in enumerate((-0.02, 0.2, 0.21)):
+            upper = large[1] - large[1].mean(axis=0) + middle + [0.003, height, 0.007]
+            state = solver.solve(frame_with([small[1] - small[1].mean(axis=0) + middle, upper], time=float(time)))
+            starts.append(state.telemetry[1]["start"])
+            strains.append(state.telemetry[1]["strain"]["max"])
+        assert starts[1].startswith("cold: cloth is caught")
+        assert max(strains) < 0.5
+
     def test_of_a_shot_crosses_less_than_its_input(self, tmp_path: Path):
         """Three frames of the T-shirt whose cages cross themselves."""
         shot = open_shot(str(write_sample("tshirt", tmp_path)))

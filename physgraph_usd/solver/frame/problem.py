@@ -31,6 +31,9 @@ CROWDED = 0.1
 FEWER = 1.0 / 3.0
 """Part of the steps that the network makes of a warm frame where something touches: one round. Skirts on bodies end
 lower so than with all of quasi-Newton's, in two thirds to nine tenths of the time."""
+CAUGHT = 3.0
+"""Strain of an edge from which cloth is caught, of one shorter than the mean in mean edges: no fabric stretches to four
+times its length."""
 FAR = 0.4
 """Remaining move of the cage, in its edge lengths, from which it is far from rest; under it CUDA solves cold frames at
 the finest level."""
@@ -150,6 +153,26 @@ class Problem:
         """The cage's remaining move, in its edge lengths."""
         return self.forces[0].remaining(self.aim)
 
+    @cached_property
+    def carried(self) -> Float[Tensor, "vertices 3"]:
+        """The finest vertices with the last frame's detail, as far as they come from where they were [m]."""
+        view, warm = self.view(self.finest), self.start.detailed
+        assert warm is not None
+        return warm if view is None or self.before is None else view.moved(self.before, warm)
+
+    @property
+    def caught(self) -> tuple[float, float] | None:
+        """Greatest strains of edges of what is carried and of the upsampled cage, where cloth was caught; or None.
+
+        Where a cage goes through itself or a body, cloth that may not is held back, and hangs on what holds it.
+        """
+        if not self.warm or self.before is None or self.contact is None:
+            return None
+        level = self.forces[-1].level
+        carried = _stretch(level, self.carried)
+        plain = _stretch(level, level.base.apply(self.aim)) if carried > CAUGHT else 0.0
+        return (carried, plain) if carried > CAUGHT > 3.0 * plain else None
+
     @property
     def device(self) -> str:
         """Where the frame is solved."""
@@ -194,7 +217,7 @@ class Problem:
         level = self.forces[index].level
         view, warm = self.view(index), self.start.detailed
         if warm is not None:
-            return warm if view is None or self.before is None else view.moved(self.before, warm), None
+            return self.carried, None
         linear, smooth = level.from_below, level.smooth_from_below
         first = below is None
         if below is None:  # Only the cage itself starts where the cages walked to.
@@ -227,7 +250,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     before = None if last is None else last.about(cage.origin)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
-    return Problem(
+    problem = Problem(
         began,
         group,
         frame,
@@ -241,6 +264,21 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
         misled=last is not None and last.misled,
     )
+    return problem if problem.caught is None else _anew(problem, *problem.caught)
+
+
+def _stretch(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
+    """Greatest strain of an edge, of one shorter than the mean in mean edges."""
+    rest = level.rest_length
+    return float(((level.lengths(x) - rest) / rest.clamp_min(float(rest.mean()))).max()) if len(rest) else 0.0
+
+
+def _anew(problem: Problem, carried: float, plain: float) -> Problem:
+    """A frame that starts from its cage, since what it would carry on strains an edge so much more than that does."""
+    why = f"cold: cloth is caught, and an edge strained by {carried:.3g}; in the upsampled cage by {plain:.3g}"
+    contact = problem.group.contact(problem.frame, problem.cage)
+    aim = problem.aim if contact is None else contact.aim
+    return replace(problem, start=Start(why), contact=contact, aim=aim, before=None, tether=None)
 
 
 @dataclass(frozen=True)
