@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pxr import Sdf, Usd
 from shots import CLOTH, cloth_shot, command, refine
 
 from physgraph_usd.shot.report import RefineReport
@@ -40,8 +41,13 @@ class TestVerdict:
 
 @pytest.fixture
 def shot(tmp_path: Path) -> Path:
-    """One frame crumples the sheet to a tenth of its size."""
-    return cloth_shot(tmp_path / "shot.usdc", broken={3.0: 0.1})
+    """One frame crumples the sheet to a tenth of its size; its own bending is soft enough for a long way to rest."""
+    path = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 0.1})
+    stage = Usd.Stage.Open(str(path))
+    raises = stage.GetPrimAtPath(CLOTH).CreateAttribute("physgraph:refine:raiseBending", Sdf.ValueTypeNames.Bool)
+    raises.Set(False)
+    stage.GetRootLayer().Save()
+    return path
 
 
 @pytest.fixture
