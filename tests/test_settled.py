@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pxr import Sdf, Usd
 from shots import CLOTH, cloth_shot, command, refine
 
 from physgraph_usd.shot.report import RefineReport
@@ -40,24 +39,13 @@ class TestVerdict:
 
 
 @pytest.fixture
-def shot(tmp_path: Path) -> Path:
-    """One frame crumples the sheet to a tenth of its size; its own bending is soft enough for a long way to rest."""
-    path = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 0.1})
-    stage = Usd.Stage.Open(str(path))
-    raises = stage.GetPrimAtPath(CLOTH).CreateAttribute("physgraph:refine:raiseBending", Sdf.ValueTypeNames.Bool)
-    raises.Set(False)
-    stage.GetRootLayer().Save()
-    return path
-
-
-@pytest.fixture
 def gentle(tmp_path: Path) -> Path:
     """One frame shrinks the sheet to half its size: far to go, but steps get there."""
     return cloth_shot(tmp_path / "gentle.usdc", broken={3.0: 0.5})
 
 
-def test_a_warning_names_prim_time_code_and_figure(shot: Path, tmp_path: Path):
-    report = refine(shot, tmp_path / "fine.usdc", steps=0)
+def test_a_warning_names_prim_time_code_and_figure(gentle: Path, tmp_path: Path):
+    report = refine(gentle, tmp_path / "fine.usdc", steps=0)
     assert {entry["path"] for entry in report.unsettled} == {CLOTH}
     warning = next(each for each in report.warnings if "did not settle" in each)
     worst = max(report.unsettled, key=lambda entry: entry["remaining_move"])
