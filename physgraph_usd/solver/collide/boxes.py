@@ -25,7 +25,8 @@ ROUNDING = wp.constant(wp.float64(2.4e-7))
 
 @wp.struct
 class Motion:
-    """Where vertices are, where they go, which pairs are asked for, and what is near where nothing moves."""
+    """Where vertices are, where they go, which pairs are asked for, what these keep of their distances (a share, up to
+    ``most``, and nine tenths of what is under a floor), and what is near where nothing moves."""
 
     start: wp.array(dtype=wp.vec3d)
     path: wp.array(dtype=wp.vec3d)
@@ -100,8 +101,8 @@ def highest_of(v: wp.vec3d):
 
 @wp.func
 def room_of(boxes: Boxes, motion: Motion, i: wp.int32, j: wp.int32):
-    """Distance of parts of two clusters that is asked for at least, on their way or where nothing moves."""
-    return boxes.radius[i] + boxes.radius[j] + motion.most
+    """Distance of parts of two clusters from which on nothing is asked: nearness, or what pairs keep in a move."""
+    return boxes.radius[i] + boxes.radius[j] + wp.max(motion.most, motion.floor)
 
 
 @wp.func
