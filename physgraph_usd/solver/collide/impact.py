@@ -15,6 +15,8 @@ from .distance import weights_of
 
 wp.set_module_options({"enable_backward": False})
 
+TIGHT = 0.9
+"""Part of a distance under the floor that pairs keep."""
 NEAR = wp.constant(wp.float64(1.0e-3))
 """Part of what is to be kept within which the way there is at its end."""
 STEPS = wp.constant(256)
@@ -41,7 +43,7 @@ def motion_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
 @wp.func
 def kept_of(distance: wp.float64, share: wp.float64, most: wp.float64, floor: wp.float64):
     """What is kept of a distance: a share, up to so much, and all but a tenth of what is under a floor."""
-    return wp.max(wp.min(share * distance, most), wp.min(wp.float64(0.9) * distance, floor))
+    return wp.max(wp.min(share * distance, most), wp.min(wp.float64(TIGHT) * distance, floor))
 
 
 @wp.func

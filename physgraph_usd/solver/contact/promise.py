@@ -28,7 +28,7 @@ TRIES = 4
 """How often tangles in which more crosses are held to the promise, before all are."""
 
 
-class _Given(TypedDict):
+class _MoveOptions(TypedDict):
     """What `safe_move` takes besides positions and parts."""
 
     floor: float
@@ -80,19 +80,19 @@ class Promise:
         Where something is in the way each vertex goes along it; what was cut short goes on from where it came to.
         """
         parts = self.view.parts
-        given = _Given(floor=self.floor, tangle=tangle, detector=self.view.detector)
-        met = in_the_way(start, aim, parts, **given)
+        options = _MoveOptions(floor=self.floor, tangle=tangle, detector=self.view.detector)
+        met = in_the_way(start, aim, parts, **options)
         if not len(met.value):
             return Placed(aim)
         x = start
         for _ in range(GOES):
-            x, late = self._along(x, aim, met, given)
+            x, late = self._along(x, aim, met, options)
             if late <= LONG * parts.spacing or is_over():
                 break
-            met = in_the_way(x, aim, parts, **given)
+            met = in_the_way(x, aim, parts, **options)
         return x
 
-    def _along(self, start: Placed, aim: Tensor, met: Pairs, given: _Given) -> tuple[Placed, float]:
+    def _along(self, start: Placed, aim: Tensor, met: Pairs, options: _MoveOptions) -> tuple[Placed, float]:
         """Where cloth comes that goes along what is in its way, and by how much it was cut short at most [m].
 
         What has changed since it was asked last is asked again, and nothing else.
@@ -101,7 +101,7 @@ class Promise:
             start: Where it is [m].
             aim: Where it is to go [m].
             met: The pairs in the way.
-            given: As `safe_move` takes it.
+            options: As `safe_move` takes them.
         """
         parts, at, ends = self.view.parts, start.double(), aim
         wanted, free = aim.double() - at, (aim != start).any(dim=1, keepdim=True) & parts.level.free
@@ -112,9 +112,9 @@ class Promise:
                 return Placed(aim if torch.equal(ends, aim) else ends), 0.0
             last, way = ends, along(wanted, planes, free=free, threads=parts.level.threads)
             ends = self.view.closed((at + way).to(aim))
-            met = in_the_way(start, ends, parts, **given, asked=_corners(met, (ends != last).any(dim=1)))
+            met = in_the_way(start, ends, parts, **options, asked=_corners(met, (ends != last).any(dim=1)))
             planes = planes.joined(Planes.of(at, ends.double() - at, met, keeps))
-        moved = safe_move(start, ends, parts, **given, asked=_corners(met, torch.zeros_like(free[:, 0])))
+        moved = safe_move(start, ends, parts, **options, asked=_corners(met, torch.zeros_like(free[:, 0])))
         return moved.x, float(((1.0 - moved.share) * way.norm(dim=1)).max())
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.detector import Detector
+from ..collide.impact import TIGHT
 from ..collide.narrow_phase import Pairs
 from ..collide.parts import Parts
 from ..deadline import is_over
@@ -27,8 +28,6 @@ from ..level import Placed
 KEPT = 0.2
 """Part of its distance that a pair keeps in one move, of more than a mean edge that of an edge: it may come as near as
 it likes in several."""
-TIGHT = 0.9
-"""The same under the floor."""
 BACK = 0.9
 """Part of the way to an impact that its vertices go: others, cut in turn, may come nearer than they were to."""
 STRAINS, LEAST = 0.5, 0.01
