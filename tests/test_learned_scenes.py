@@ -26,14 +26,13 @@ def garments_of(report: RefineReport) -> Iterator[dict[str, Any]]:
 
 @pytest.mark.parametrize(
     ("name", "frames", "least"),
-    # Where cloth presses on a body the guard makes many of the steps: no such force was there in training. What crosses
-    # is drawn apart by quasi-Newton: nearly all steps of the block and the crossing sheets.
+    # What crosses is drawn apart by quasi-Newton: half of the crossing sheets' steps.
     # In layers the part is none to most by frame, as four corrections come in a row or do not: the whole shot tells.
     [
-        ("block", (12.0, 13.0), 0.0),
+        ("block", (12.0, 13.0), 0.8),
         ("tshirt", (1.0, 2.0), 0.8),
         pytest.param("layers", (1.0, 30.0), 0.1, marks=pytest.mark.slow),
-        ("crossing", (1.0, 2.0), 0.05),
+        ("crossing", (1.0, 2.0), 0.3),
     ],
 )
 def test_samples_are_refined_without_retraining(
