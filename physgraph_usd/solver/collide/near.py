@@ -36,6 +36,10 @@ class NearPairs:
     way: Float[Tensor, "pairs 3"]
     face: Bool[Tensor, " pairs"]
 
+    def where(self, kept: Int[Tensor, " kept"]) -> NearPairs:
+        """Some of these pairs."""
+        return NearPairs(self.corners[kept], self.weight[kept], self.way[kept], self.face[kept])
+
 
 @wp.kernel
 def _closest(

@@ -7,7 +7,7 @@ nearest alone: cloth that pushes with one part and is held by another would stay
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,13 +28,9 @@ from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
 from .layers import Layers
 from .settings import ContactSettings
+from .springs import HALF, MARGIN, ClothSprings, NearSprings
 from .tangles import Tangles, gaps_out
 
-HALF, MARGIN = 0.5, 0.1
-"""The part of their distance at rest that pairs of one garment keep at most, so that a flat sheet pushes nothing; and
-how much farther than the thickness pairs are asked for, in edges."""
-LEAST = 0.25
-"""Part of its thickness that cloth keeps from cloth, however near the input has the two."""
 TANGLED = 2
 """Rings round what crosses to which nothing is promised but that no more crosses."""
 OUT = 0.5
@@ -135,6 +131,11 @@ class ClothView:
         return Detector(self.parts, self.near)
 
     @cached_property
+    def _springs(self) -> ClothSprings:
+        """What says which near parts have a spring."""
+        return ClothSprings(self._level, self._base, self._thickness, self._settings.cloth_stiffness)
+
+    @cached_property
     def near(self) -> Reach:
         """How near parts are that may push one another before they are looked for again."""
         play = 0.5 * MARGIN * self._level.spacing.double()
@@ -189,32 +190,26 @@ class ClothView:
 
     def _gaps(self, x: Tensor, found: Crossings, *, order: bool) -> PairConstraints:
         """The springs between all parts that are near and do not cross."""
-        near = self._near_pairs(x)
-        corners = near.corners.long()
-        garment = self._level.vertex_garment[corners[:, [0, 3]]].long()
-        at_rest = (near.weight.unsqueeze(2) * self._level.rest[corners]).sum(dim=1).norm(dim=1)
-        at_rest = torch.where(garment[:, 0] == garment[:, 1], at_rest, torch.inf)
-        at_input = (near.weight.unsqueeze(2) * self._base[corners]).sum(dim=1).norm(dim=1)
-        thickness = self._thickness[garment].mean(dim=1)
-        offset = torch.minimum(torch.minimum(thickness, HALF * at_rest), torch.maximum(at_input, LEAST * thickness))
-        distance, way = near.way.norm(dim=1), near.way
-        if order and self._lasting.layers is not None:
-            wrong, most = self._lasting.layers.wrong(self._level, near, x), OUT * float(self._level.spacing.mean())
-            # What is on the wrong side comes back a little each round: all at once would tear the cloth.
-            offset = torch.where(wrong, torch.minimum(offset, most - distance), offset)
-            way = torch.where(wrong.unsqueeze(1), -way, way)
-        kept = distance < offset + MARGIN * self._level.spacing[corners].amin(dim=1)
+        layers = self._lasting.layers if order else None
+        near = self._springs.find(x, self.detector.near(x), wide=layers is not None)
+        if layers is not None:
+            near = self._in_order(layers, near, x)
         if found.count:
-            tangles = self.tangles(x)
-            kept &= ~self.mesh.crossed(found)[corners].any(dim=1)
+            corners, tangles = near.near.corners.long(), self.tangles(x)
+            kept = ~self.mesh.crossed(found)[corners].any(dim=1)
             kept &= tangles is None or order or ~tangles.given_up[corners].all(dim=1)
-        kept = torch.nonzero(kept).squeeze(1)  # Once for all that follows.
-        corners = corners[kept]
-        area = self._level.vertex_area[corners]
-        share = torch.where(near.face[kept], area[:, 0], area.amin(dim=1) / 3.0)
-        normal = torch.nn.functional.normalize(way[kept], dim=1, eps=1e-30).contiguous()
-        stiffness = self._settings.cloth_stiffness * share
-        return PairConstraints(near.corners[kept], near.weight[kept], normal, offset[kept].contiguous(), stiffness)
+            near = near.where(kept)
+        return self._springs.constraints(near)
+
+    def _in_order(self, layers: Layers, springs: NearSprings, x: Tensor) -> NearSprings:
+        """Springs that bring garments back in their order where they are on the wrong side."""
+        near = springs.near
+        wrong, most = layers.wrong(self._level, near, x), OUT * float(self._level.spacing.mean())
+        # What is on the wrong side comes back a little each round: all at once would tear the cloth.
+        back = torch.minimum(springs.offset, most - near.way.norm(dim=1))
+        way = torch.where(wrong.unsqueeze(1), -near.way, near.way)
+        turned = NearSprings(replace(near, way=way), torch.where(wrong, back, springs.offset))
+        return turned.where(self._springs.reached(turned))
 
     def measure(
         self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
