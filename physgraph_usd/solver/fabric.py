@@ -23,6 +23,7 @@ class Fabric:
         stretch_limit: Strain from which the cloth stiffens; None is never.
         warp_ease: Length along the warp that the cloth has and its rest shape does not show, as a fraction.
         weft_ease: The same along the weft.
+        crease_time: Time in which hinges come to rest where they are bent [s]; 0 is never.
     """
 
     stretch: float = 30.0
@@ -35,6 +36,7 @@ class Fabric:
     stretch_limit: float | None = None
     warp_ease: float = 0.0
     weft_ease: float = 0.0
+    crease_time: float = 0.0
 
     @property
     def has_membrane(self) -> bool:

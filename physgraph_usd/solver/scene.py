@@ -150,12 +150,14 @@ class Scene:
         gravity: Gravity [m/s^2], shape (3,).
         times: Time codes to refine, ascending; empty for a shot without samples.
         colliders: The bodies that garments may touch.
+        seconds: Length of one time code [s].
     """
 
     garments: tuple[Garment, ...]
     gravity: np.ndarray
     times: tuple[float, ...] = ()
     colliders: tuple[Collider, ...] = ()
+    seconds: float = 1.0 / 24.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -187,6 +187,11 @@ PROPERTIES: tuple[Property, ...] = (
     _ease("warp"),
     _ease("weft"),
     Property(
+        GARMENT_API, "physgraph:rest:creaseTime", "float", 0.0, "s", 0.0, 1e6,
+        "Time in which folds set: hinges come to rest where they have been bent, half of the way; 0 is never.",
+        "Crease Time", REST, (0.0, 10.0),
+    ),
+    Property(
         GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, 10.0,
         "Distance kept from colliders." + SI, "Contact Offset", CONTACT, (1e-4, 3e-2),
     ),
@@ -277,6 +282,7 @@ def fabric_values(fabric: Fabric) -> dict[str, float]:
         "stretchLimit": None if fabric.stretch_limit is None else 100.0 * fabric.stretch_limit,
         "rest:warpEase": 100.0 * fabric.warp_ease or None,
         "rest:weftEase": 100.0 * fabric.weft_ease or None,
+        "rest:creaseTime": fabric.crease_time or None,
     }
     return {name: value for name, value in values.items() if value is not None}
 

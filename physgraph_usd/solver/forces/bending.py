@@ -19,6 +19,7 @@ Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and W
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -33,6 +34,7 @@ from torch import Tensor
 from ..grain import bending_factor
 from ..level import Level
 from ..mesh.stencil import add_at
+from ..mesh.threads import argument
 from .base import Elements, element_overloads
 from .stretch import garment_area
 
@@ -96,6 +98,7 @@ class Bending:
 
     Attributes:
         weight: Angular stiffness [N m], shape (H,).
+        rest_angle: Angles at rest [rad], shape (H,).
     """
 
     name = "bending"
@@ -128,12 +131,18 @@ class Bending:
             self.weight = PAPER_HINGE * scaled * level.hinge_area / garment_area(level)[owner]
         else:
             self.weight = scaled * level.hinge_factor * level.hinge_shape
-        self._level = level
+        self._level, self.rest_angle = level, level.rest_angle
         self._elements = Elements(_KERNELS, level.hinges, [self.weight, level.rest_angle], level=level)
+
+    def resting_at(self, rest_angle: Float[Tensor, " hinges"]) -> Bending:
+        """These springs with other angles at rest [rad], which are read anew at each evaluation."""
+        bending = copy.copy(self)
+        bending.rest_angle = rest_angle
+        return bending
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(x, force)
+        return self._elements.evaluate(x, force, {1: argument(self.rest_angle)})
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each hinge [J] where the force was added last, and its garment."""

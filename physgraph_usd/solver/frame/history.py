@@ -90,6 +90,16 @@ class Origin:
             farthest = max(farthest, bodies_moved(last, frame.colliders, near))
         return farthest
 
+    def elapsed(self, time: float | None, seconds: float) -> list[float]:
+        """Time from the frame that each garment starts from to a time code [s]; 0 where one of them has none.
+
+        Args:
+            time: The time code.
+            seconds: Length of one time code [s].
+        """
+        starts = [None if each is None else each.time for each in self.frames]
+        return [0.0 if time is None or start is None else seconds * (time - start) for start in starts]
+
     def telemetry(self, walked_from: float | None) -> dict[str, object]:
         """Telemetry of the start, given the time code from which a cold frame's cage walked here, or None."""
         found: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
@@ -152,9 +162,11 @@ def _jumped(
 
 
 def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], near: Sequence[int]) -> bool:
-    """Whether garments and the bodies that they may touch are what they were, and solved together."""
+    """Whether garments and the bodies that they may touch are what they were, solved together, and creases at rest."""
     for index, each in zip(part, (each.last for each in memories), strict=True):
         if each is None or each.part != part or near != each.near:
+            return False
+        if each.state.creeps and frame.time != each.time:
             return False
         now, then = frame.garments[index], each.frame
         if not (set_alike(now, then) and np.array_equal(now.points, then.points)):

@@ -15,6 +15,7 @@ from ..fabric import Fabric
 from ..folds import raised_by
 from ..forces import body_terms, elastic_terms
 from ..forces.base import Force, ForceModule
+from ..forces.bending import Bending
 from ..forces.guide import Guide, GuideMap
 from ..forces.stretch import PAPER_SPRING, garment_area
 from ..forces.tether import Tether
@@ -54,9 +55,17 @@ class LevelForces:
         """The move that takes a coarser mesh's facets out of x, as `facets` gives it [m]; none where nothing bends."""
         return facets(self.level, x, below, smooth.apply) if self.bends else torch.zeros_like(x)
 
-    def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
-        """All terms of one frame, given its recentred coarse positions [m]."""
-        return ForceModule((*self.terms, self.guide.retarget(coarse)))
+    def module(
+        self, coarse: Float[Tensor, "coarse 3"], rest_angle: Float[Tensor, " hinges"] | None = None
+    ) -> ForceModule:
+        """All terms of one frame, given its recentred coarse positions [m], and angles at rest [rad] if not its own."""
+        return ForceModule((*self._resting_at(rest_angle), self.guide.retarget(coarse)))
+
+    def _resting_at(self, rest_angle: Float[Tensor, " hinges"] | None) -> tuple[Force, ...]:
+        """The lasting terms, with other angles at rest [rad] where these are given."""
+        if rest_angle is None:
+            return self.terms
+        return tuple(each.resting_at(rest_angle) if isinstance(each, Bending) else each for each in self.terms)
 
     def system(self, module: ForceModule, tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None) -> System:
         """The system of a frame in which nothing touches, given its terms; the tie as for `lasting_system`."""
@@ -75,7 +84,11 @@ class LevelForces:
         return system.remaining_move(system.apply_metric_inverse(force))
 
     def lasting_system(
-        self, coarse: Float[Tensor, "coarse 3"], tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None
+        self,
+        coarse: Float[Tensor, "coarse 3"],
+        tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None,
+        *,
+        rest_angle: Float[Tensor, " hinges"] | None = None,
     ) -> System:
         """The system of a frame in which nothing touches: the same in every frame, aimed anew.
 
@@ -84,23 +97,26 @@ class LevelForces:
         Args:
             coarse: Recentred coarse positions [m].
             tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
+            rest_angle: Angles at rest [rad], if not the terms' own.
         """
-        tied = tie is not None
-        if tied not in self._lasting:
-            guide = self.guide.retarget(coarse)
+        kind = tie is not None, rest_angle is not None
+        if kind not in self._lasting:
+            guide, angles = self.guide.retarget(coarse), None if rest_angle is None else rest_angle.clone()
             tether = None if tie is None else self.tether(tie[0], tie[1].clone())
-            field = ForceModule((*self.terms, guide, *([] if tether is None else [tether])))
-            self._lasting[tied] = self.system_in(field, lasting=True), guide, tether
-        system, guide, tether = self._lasting[tied]
+            field = ForceModule((*self._resting_at(angles), guide, *([] if tether is None else [tether])))
+            self._lasting[kind] = self.system_in(field, lasting=True), guide, tether, angles
+        system, guide, tether, angles = self._lasting[kind]
         guide.aim(coarse)
+        if rest_angle is not None and angles is not None:
+            angles.copy_(rest_angle)
         if tie is not None and tether is not None:
             stiffness, predicted = tie
             tether.aim(predicted, stiffness)
         return system
 
     @cached_property
-    def _lasting(self) -> dict[bool, tuple[System, Guide, Tether | None]]:
-        """Systems that `lasting_system` gave, by whether they are tied."""
+    def _lasting(self) -> dict[tuple[bool, bool], tuple[System, Guide, Tether | None, Tensor | None]]:
+        """Systems that `lasting_system` gave, by whether they are tied, and whether they rest at other angles."""
         return {}
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:

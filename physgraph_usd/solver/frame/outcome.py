@@ -16,6 +16,7 @@ from ..integrate.solve import FAR, LevelReport
 from ..level import Placed, unhindered
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
+from .creases import keeps_creases
 from .level_forces import named
 from .problem import Choice, Problem
 from .values import State
@@ -63,6 +64,7 @@ def state_left(problem: Problem, x: Placed, reports: Sequence[LevelReport], *, l
     view, cage = problem.view(problem.finest), problem.cage
     stored = problem.group.moving_frames.store(cage.points, x)
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
+    lasts = problem.group.settings.temporal != "off"
     clean = view is not None and not view.crosses(x)
     return replace(
         stored,
@@ -71,6 +73,8 @@ def state_left(problem: Problem, x: Placed, reports: Sequence[LevelReport], *, l
         fine=fine,
         clean=clean,
         misled=_is_misled(problem, reports, learned=learned),
+        bent=() if problem.creases is None else problem.creases.split(problem.forces[-1].level),
+        creeps=lasts and keeps_creases(problem.frame) and not problem.start.rests,
     )
 
 

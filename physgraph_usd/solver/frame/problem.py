@@ -19,6 +19,7 @@ from ..integrate.base import Integrator, System
 from ..integrate.metric import Metric
 from ..integrate.solve import Budget
 from ..level import Level, Placed
+from .creases import Creases, creases_of
 from .group import Group
 from .level_forces import LevelForces
 from .start import Start, start_of
@@ -113,6 +114,7 @@ class Problem:
         before: Where it was [m], float64; None where there is no last frame.
         tether: How stiffly it is tied to its start [1/s^2]; None where it is not.
         misled: As in the `State` that it starts from.
+        creases: What its cloth remembers of its folds; None where it starts cold, or remembers none.
     """
 
     began: float
@@ -127,6 +129,7 @@ class Problem:
     before: Placed | None
     tether: float | None
     misled: bool
+    creases: Creases | None = None
 
     @property
     def warm(self) -> bool:
@@ -194,12 +197,15 @@ class Problem:
     def level(self, index: int, choice: Choice) -> LevelProblem:
         """One level, by its number."""
         lasting, settings = self.forces[index], self.group.settings
-        module = lasting.module(self.aim)
+        angles = self.creases.rest_angle if self.creases is not None and index == self.finest else None
+        module = lasting.module(self.aim, angles)
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
         # What is recorded of a level's steps on CUDA serves in the next frame too.
         recorded = lasting.level.device != "cpu"
-        alone = lasting.lasting_system(self.aim, tie) if recorded else lasting.system(module, tie)
+        alone = lasting.lasting_system(self.aim, tie, rest_angle=angles) if recorded else lasting.system(module, tie)
         budget = settings.budget(self.finest - index, self.began, more=choice.steps, warm=self.warm)
+        if self.creases is not None:  # What moves them is less than the stopping measure sees: they creep on.
+            budget = replace(budget, rest=0.0)
         budget = replace(budget, steps=0) if self.start.rests else budget
         touching = replace(budget, steps=math.ceil(choice.touching * budget.steps))
         who, outward = (self.group.integrator(learned=choice.learned), self.group.untangler), self.group.outward
@@ -242,12 +248,14 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     """
     began = time.perf_counter()
     forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
-    moved = frame.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
     known = None if settings.temporal == "off" else last
+    before = None if last is None else last.about(cage.origin)
+    creases = creases_of(forces[-1].level, frame, known)
+    moved = frame.moved if creases is None else max(frame.moved, creases.moved)
+    moved = moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved)
     contact = group.contact(frame, cage, target=start.detailed)
-    before = None if last is None else last.about(cage.origin)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
     problem = Problem(
@@ -263,6 +271,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         before=before,
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
         misled=last is not None and last.misled,
+        creases=None if start.detailed is None else creases,
     )
     return problem if problem.caught is None else _anew(problem, *problem.caught)
 
@@ -278,7 +287,7 @@ def _anew(problem: Problem, carried: float, plain: float) -> Problem:
     why = f"cold: cloth is caught, and an edge strained by {carried:.3g}; in the upsampled cage by {plain:.3g}"
     contact = problem.group.contact(problem.frame, problem.cage)
     aim = problem.aim if contact is None else contact.aim
-    return replace(problem, start=Start(why), contact=contact, aim=aim, before=None, tether=None)
+    return replace(problem, start=Start(why), contact=contact, aim=aim, before=None, tether=None, creases=None)
 
 
 @dataclass(frozen=True)

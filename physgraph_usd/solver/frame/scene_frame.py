@@ -218,9 +218,11 @@ class SceneFrame:
         edge = float(group.levels[0].spacing.mean())
         origin = origin_of(part, self.frame, memories, near=near, edge=edge, gap=self.gap)
         cage = None if origin.state is not None else self._cage_walked(part)
+        elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         while True:
             touching, moved = self.cloth.touching(part, frames, near), origin.moved(part, self.frame, near)
-            given = FrameInput(frames, self.frame.time, touching, moved, walked=None if cage is None else cage[0])
+            walked = None if cage is None else cage[0]
+            given = FrameInput(frames, self.frame.time, touching, moved, walked=walked, elapsed=elapsed)
             solved = solve_frame(group, given, origin.state)
             more = self.cloth.reached(part, frames, solved.points, self.settings)
             if more <= set(near):

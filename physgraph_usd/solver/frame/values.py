@@ -27,6 +27,7 @@ class FrameInput:
         moved: How far these have moved since the last frame [m]; infinite where more than poses has changed.
         walked: World positions that the cages walked to from an earlier frame [m], shape (C, 3), where a cold frame
             starts; or None.
+        elapsed: Time since the frame that each garment starts from [s]; () where none does.
     """
 
     garments: Sequence[GarmentFrame]
@@ -34,6 +35,7 @@ class FrameInput:
     touching: Sequence[Touching] = ()
     moved: float = np.inf
     walked: np.ndarray | None = None
+    elapsed: Sequence[float] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,9 @@ class State:
         fine: Fine positions [m], world space, float64, from which cloth walks on; None before it was solved.
         clean: Whether nothing of what was solved together crosses there.
         misled: Whether the network's steps raised the energy while the cloth was far from rest.
+        bent: What the finest hinges of each garment remember of their bends [rad], shape (H,), None where nothing is
+            remembered; () where no garment has creases.
+        creeps: Whether creases go on changing, so that the same input leads to another frame.
     """
 
     coarse: Float[Tensor, "coarse 3"]
@@ -72,6 +77,8 @@ class State:
     fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
     misled: bool = False
+    bent: tuple[Tensor | None, ...] = ()
+    creeps: bool = False
 
     def about(self, origin: np.ndarray) -> Placed | None:
         """Fine positions about an origin [m], float64, where cloth walks; else None."""
@@ -101,8 +108,10 @@ def join(parts: Sequence[State]) -> State:
     fine = [part.fine for part in parts if part.fine is not None]
     walked = torch.cat(fine) if len(fine) == len(parts) else None
     clean = all(part.clean for part in parts)
-    misled = any(part.misled for part in parts)
-    return State(*whole, held=min(part.held for part in parts), fine=walked, clean=clean, misled=misled)
+    misled, creeps = any(part.misled for part in parts), any(part.creeps for part in parts)
+    bent = tuple(each for part in parts for each in part.bent or (None,)) if any(part.bent for part in parts) else ()
+    held = min(part.held for part in parts)
+    return State(*whole, held=held, fine=walked, clean=clean, misled=misled, bent=bent, creeps=creeps)
 
 
 def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
@@ -120,6 +129,7 @@ def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[
             detail=state.detail[f],
             frames=state.frames[c],
             fine=None if state.fine is None else state.fine[f],
+            bent=state.bent[place : place + 1],
         )
-        for c, f in zip(coarse, fine, strict=True)
+        for place, (c, f) in enumerate(zip(coarse, fine, strict=True))
     ]

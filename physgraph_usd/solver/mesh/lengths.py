@@ -1,4 +1,4 @@
-"""Lengths of edges and normals of triangles, one kernel each: torch would take many passes."""
+"""Lengths of edges, normals of triangles and angles of hinges, one kernel each: torch would take many passes."""
 
 from __future__ import annotations
 
@@ -39,8 +39,24 @@ def _normals(
     normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)
 
 
+@wp.kernel
+def _angles(
+    first: wp.int32,
+    hinges: wp.array(dtype=wp.vec4i),
+    x: wp.array(dtype=Any),
+    angle: wp.array(dtype=Any),
+):
+    h = first + wp.tid()
+    xi = x[hinges[h][0]]
+    axis = x[hinges[h][1]] - xi
+    il = x[hinges[h][3]] - xi
+    n1 = wp.cross(axis, x[hinges[h][2]] - xi)
+    angle[h] = wp.atan2(-wp.length(axis) * wp.dot(n1, il), wp.dot(n1, wp.cross(il, axis)))
+
+
 LENGTHS, NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
-"""Of edges [m], and of triangles, twice their areas long [m^2]: kernels for `ElementValues`."""
+ANGLES = overloads(_angles, wp.vec4i, VECTOR, SCALAR)
+"""Of edges [m], of triangles, twice their areas long [m^2], and of hinges [rad]: kernels for `ElementValues`."""
 
 
 class ElementValues:

@@ -87,7 +87,8 @@ class Shot:
             replace(reader.source, times=snap(reader.source.times, times)) for reader in readers
         )
         colliders = tuple(body.collider for body in bodies)
-        self.scene = Scene(tuple(reader.garment for reader in readers), request.units.gravity, times, colliders)
+        seconds, gravity = 1.0 / stage.GetTimeCodesPerSecond(), request.units.gravity
+        self.scene = Scene(tuple(reader.garment for reader in readers), gravity, times, colliders, seconds)
         self._readers, self._bodies, self._request = tuple(readers), tuple(bodies), request
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:

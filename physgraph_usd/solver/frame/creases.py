@@ -1,0 +1,97 @@
+"""Crease memory: hinges that stay bent come to rest where they are bent, so that worn cloth does not iron itself.
+
+    c <- c + (1 - exp(-dt / tau)) (wrap(theta - theta0) - c),   a hinge rests at theta0 + s c
+
+| symbol | here | meaning |
+|---|---|---|
+| c | ``bent`` | remembered bend of a hinge beyond its rest shape's [rad] |
+| theta | `Level.angles` | its angle in the frame that this one starts from [rad] |
+| dt | ``elapsed`` | time since that frame [s] |
+| tau | `Fabric.crease_time` | [s] |
+| s | `SHARE` | part of the bend that friction between yarns holds |
+
+This is the standard linear solid in bending: a spring beside a spring and a dashpot in series. A pose that is held
+bends against 1 - s of the stiffness in the end, and a crease in cloth that nothing pulls fades with tau / (1 - s). The
+memory stays between the angles that the hinge has had, and is the same throughout a frame, so a frame's energy has the
+bounds that it has without.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..level import Level
+from .values import FrameInput, State
+
+SHARE = 0.5
+"""Part of a bend that stays: untreated cotton that was folded flat opens to some 90 of 180 degrees (ISO 2313)."""
+FOLD = 5
+"""Hinges side by side that make a fold: five edges a wavelength show one (docs/solver.md)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Creases:
+    """Creases of the finest level in one frame.
+
+    Attributes:
+        bent: Remembered bends [rad], shape (H,).
+        rest_angle: Angles at which hinges rest therefore [rad], shape (H,).
+        moved: How far a fold at rest goes by what has changed since the frame before [m].
+    """
+
+    bent: Float[Tensor, " hinges"]
+    rest_angle: Float[Tensor, " hinges"]
+    moved: float
+
+    def split(self, level: Level) -> tuple[Tensor | None, ...]:
+        """The remembered bends of each garment of a level [rad]."""
+        return torch.split(self.bent, _hinge_counts(level))
+
+
+def keeps_creases(frame: FrameInput) -> bool:
+    """Whether some fabric keeps creases."""
+    return any(each.fabric.crease_time > 0 for each in frame.garments)
+
+
+def creases_of(level: Level, frame: FrameInput, last: State | None) -> Creases | None:
+    """Creases of a frame, by where the cloth was in the one that it starts from; None where no fabric keeps any.
+
+    Args:
+        level: The finest level.
+        frame: The frame.
+        last: What the frame that it starts from left, or None for a cold start.
+    """
+    if last is None or last.fine is None or not keeps_creases(frame):
+        return None
+    times = [each.fabric.crease_time for each in frame.garments]
+    parts = zip(last.bent or [None] * len(times), _hinge_counts(level), strict=True)
+    known = torch.cat([level.rest_angle.new_zeros(count) if each is None else each for each, count in parts])
+    passed = frame.elapsed or [0.0] * len(times)
+    rates = known.new_tensor([_rate(*each) for each in zip(times, passed, strict=True)])
+    keeps, owner = known.new_tensor([float(each > 0) for each in times]), level.hinge_garment.long()
+    before = (last.fine - last.fine.mean(dim=0)).to(known)
+    angle = _wrapped(level.angles(before) - level.rest_angle)
+    now = keeps[owner] * (known + rates[owner] * (angle - known))
+    change = float((now - known).abs().max()) if len(now) else 0.0
+    moved = SHARE * change * FOLD**2 / 8.0 * float(level.spacing.mean())  # An arc's height, n edges long.
+    return Creases(now, level.rest_angle + SHARE * now, moved)
+
+
+def _rate(time: float, elapsed: float) -> float:
+    """Part of the way to its angle that a memory goes."""
+    return -math.expm1(-max(elapsed, 0.0) / time) if time > 0 else 0.0
+
+
+def _wrapped(angle: Float[Tensor, " hinges"]) -> Float[Tensor, " hinges"]:
+    """Angles less whole turns, in [-pi, pi]."""
+    return angle - 2.0 * math.pi * torch.round(angle / (2.0 * math.pi))
+
+
+def _hinge_counts(level: Level) -> list[int]:
+    """Number of hinges of each garment, in whose order they lie."""
+    return torch.bincount(level.hinge_garment.long(), minlength=len(level.spans)).tolist()
