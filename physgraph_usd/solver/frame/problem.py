@@ -204,7 +204,7 @@ class Problem:
         recorded = lasting.level.device != "cpu"
         alone = lasting.lasting_system(self.aim, tie, rest_angle=angles) if recorded else lasting.system(module, tie)
         budget = settings.budget(self.finest - index, self.began, more=choice.steps, warm=self.warm)
-        if self.creases is not None:  # What moves them is less than the stopping measure sees: they creep on.
+        if self.creases is not None and self.start.held:  # What fades is less than the stopping measure sees.
             budget = replace(budget, rest=0.0)
         budget = replace(budget, steps=0) if self.start.rests else budget
         touching = replace(budget, steps=math.ceil(choice.touching * budget.steps))
