@@ -80,6 +80,7 @@ TUNABLES: dict[str, Tunable] = {
         Tunable("stretchLimit", "%", 1.0, lambda f: _percent(f.fabric.stretch_limit), decades=False),
         Tunable("rest:warpEase", "%", 1.0, lambda f: _percent(f.fabric.warp_ease), decades=False),
         Tunable("rest:weftEase", "%", 1.0, lambda f: _percent(f.fabric.weft_ease), decades=False),
+        Tunable("rest:creaseTime", "s", 1.0, lambda f: f.fabric.crease_time, decades=False),
         Tunable("guide:stiffness", "N/m³", 1.0, lambda f: f.guide),
         Tunable("refine:detail", "", 1.0, lambda f: f.detail, decades=False),
         Tunable("contact:offset", "mm", 1e3, lambda f: f.offset),
