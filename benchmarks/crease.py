@@ -2,10 +2,10 @@
 
     python -m benchmarks.crease [--fabric worn-denim] [--level 2]
 
-A sleeve without an arm bends by 100 degrees in half a second, stays so for one, straightens in half a second and is held
-for three. **Folds** are the RMS differences of the hinges' angles at the elbow from those in the first frame, in degrees:
-before it straightens, as soon as it is straight, one second later and three. **Jump** is the RMS second difference of
-the positions of all frames; the time is the mean of the frames that move.
+A sleeve without an arm bends by 100 degrees in half a second, stays so for one, straightens in half a second and is
+held for three. **Folds** are the RMS differences of the hinges' angles at the elbow from those in the first frame, in
+degrees: before it straightens, as soon as it is straight, one second later and three. **Jump** is the RMS second
+difference of the positions of all frames; the time is the mean of the frames that move.
 """
 
 from __future__ import annotations

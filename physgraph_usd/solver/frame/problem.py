@@ -251,10 +251,9 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     known = None if settings.temporal == "off" else last
     before = None if last is None else last.about(cage.origin)
     creases = creases_of(forces[-1].level, frame, known)
-    moved = frame.moved if creases is None else max(frame.moved, creases.moved)
-    moved = moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
+    moved = frame.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
-    start = start_of(known, cage, **reset, moved=moved)
+    start = start_of(known, cage, **reset, moved=moved, pace=1.0 if creases is None else creases.pace)
     contact = group.contact(frame, cage, target=start.detailed)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)

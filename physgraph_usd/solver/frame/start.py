@@ -23,7 +23,8 @@ STILL = 0.02
 there slow settling shows, so cloth slows down."""
 SLOWER, SLOWEST = 2.0, 2.0**8
 """In a held pose the tether holds cloth so many times as stiffly as in the frame before; where that is so many times as
-stiffly as ever, cloth stays where it is: it has a third of a second to settle, and one sees what moves after that."""
+stiffly as ever, cloth stays where it is: it has a third of a second to settle, and one sees what moves after that.
+Cloth that keeps creases takes as long as these need to set (`creases`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,14 @@ class Start:
 
 
 def start_of(
-    state: State | None, cage: Cage, *, frames: MovingFrames, finest: Level, reset: Reset, moved: float = np.inf
+    state: State | None,
+    cage: Cage,
+    *,
+    frames: MovingFrames,
+    finest: Level,
+    reset: Reset,
+    moved: float = np.inf,
+    pace: float = 1.0,
 ) -> Start:
     """Carry the last frame's detail along, unless the cage jumped or it would tear the cloth.
 
@@ -60,6 +68,7 @@ def start_of(
         finest: The finest level.
         reset: When a frame starts cold.
         moved: How far what the cloth may touch has moved since [m]; infinite where more than poses has changed.
+        pace: Part of its usual pace at which cloth in a held pose slows down.
     """
     if state is None:
         return Start("cold")
@@ -74,12 +83,12 @@ def start_of(
         return Start(f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}")
     moves = (cage.points - shifted.coarse).norm(dim=1)
     farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
-    held, slowed = slowing(state.held, farthest)
+    held, slowed = slowing(state.held, farthest, pace)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
     return Start(why, detailed, held, slowed)
 
 
-def slowing(held: int, motion: float) -> tuple[int, float]:
+def slowing(held: int, motion: float, pace: float = 1.0) -> tuple[int, float]:
     """For how many frames a pose has now been held, and how many times as stiffly the tether holds cloth in it.
 
     Never so stiffly that the cloth would be slower than what moves slowly: the cage, or what touches it.
@@ -87,8 +96,9 @@ def slowing(held: int, motion: float) -> tuple[int, float]:
     Args:
         held: For how many frames it had been before.
         motion: How far any point of cage or bodies has moved since, in mean cage edges.
+        pace: Part of its usual pace at which cloth slows down.
     """
     if motion >= STILL:
         return 0, 1.0
     held += 1
-    return held, min(SLOWER ** min(held, 64), SLOWEST, (STILL / max(motion, 1e-9)) ** 2)
+    return held, min(SLOWER ** min(pace * held, 64), SLOWEST, (STILL / max(motion, 1e-9)) ** 2)
