@@ -196,7 +196,7 @@ def test_a_frame_asked_twice_is_the_same():
     assert once.tobytes() == again.tobytes() != other.tobytes()
 
 
-def test_a_jump_forgets_and_a_broken_frame_is_left_out():
+def test_a_jump_forgets():
     group = group_of(MESH, REST, level=1)
     first, second, _ = (FrameInput(each.garments, elapsed=[0.1]) for each in waving(CREASED, 3)[1])
     state = solve_frame(group, second, solve_frame(group, first, None).state).state
@@ -205,6 +205,17 @@ def test_a_jump_forgets_and_a_broken_frame_is_left_out():
     jumped = solve_frame(group, away, state)
     assert jumped.telemetry["start"].startswith("cold")
     assert jumped.state.bent == ()
+
+
+def test_creases_go_on_from_before_a_broken_frame_by_the_time_since_then():
+    """The frame after it is that of a shot without it."""
+    refiner, frames = waving(CREASED)
+    whole = points_of(refiner, [*frames[:3], frames[4]])
+    broken = replace(frames[3], garments=(replace(frames[3].garments[0], points=frames[3].garments[0].points + 100.0),))
+    refiner.forget()
+    *_, last = refiner.refine([*frames[:3], broken, frames[4]])
+    assert last.telemetry[0]["broken_before"] == 3.0
+    assert np.asarray(last.points[0]).tobytes() == whole[-1]
 
 
 def test_a_pose_that_is_held_comes_to_rest_when_creases_have_set():

@@ -146,7 +146,7 @@ def moves(frames: list[Frame]) -> np.ndarray:
     return np.linalg.norm(np.diff(solved(frames), axis=0), axis=2).max(axis=1)
 
 
-def never(_held: int, _motion: float, *, again: bool = False) -> tuple[int, float]:
+def never(_held: int, _motion: float, _pace: float = 1.0, *, again: bool = False) -> tuple[int, float]:
     """Cloth that is never slowed down."""
     del again
     return 0, 1.0

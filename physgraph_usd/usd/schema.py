@@ -188,7 +188,7 @@ PROPERTIES: tuple[Property, ...] = (
     _ease("weft"),
     Property(
         GARMENT_API, "physgraph:rest:creaseTime", "float", 0.0, "s", 0.0, 1e6,
-        "Time in which folds set: hinges come to rest where they have been bent, half of the way; 0 is never.",
+        "Time in which folds set, half of the way; 0 is never." + SI,
         "Crease Time", REST, (0.0, 10.0),
     ),
     Property(

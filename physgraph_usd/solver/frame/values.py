@@ -110,8 +110,8 @@ def join(parts: Sequence[State]) -> State:
     clean = all(part.clean for part in parts)
     misled, creeps = any(part.misled for part in parts), any(part.creeps for part in parts)
     bent = tuple(each for part in parts for each in part.bent or (None,)) if any(part.bent for part in parts) else ()
-    held = min(part.held for part in parts)
-    return State(*whole, held=held, fine=walked, clean=clean, misled=misled, bent=bent, creeps=creeps)
+    kept = {"fine": walked, "clean": clean, "misled": misled, "bent": bent, "creeps": creeps}
+    return State(*whole, held=min(part.held for part in parts), **kept)
 
 
 def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
