@@ -160,10 +160,10 @@ def test_a_system_that_lasts_rests_at_the_angles_of_each_frame():
     assert not torch.equal(forces.module(coarse).energy_and_force(x)[1], fresh[1])
 
 
-def waving(fabric: Fabric, count: int = 6, **options: object) -> tuple[Refiner, list[Frame]]:
+def waving(fabric: Fabric, count: int = 6, *, temporal: str = "tether") -> tuple[Refiner, list[Frame]]:
     """A refiner of a sheet, and frames in which it waves."""
     scene = Scene((garment_of(MESH, REST),), np.array([0.0, -9.81, 0.0]), tuple(map(float, range(count))))
-    refiner = Refiner(scene, settings_of(**options), levels=[1], dtype=torch.float64)
+    refiner = Refiner(scene, settings_of(temporal=temporal), levels=[1], dtype=torch.float64)
     return refiner, [frame_of(wave(REST, phase=0.2 * k), float(k), fabric=fabric) for k in range(count)]
 
 
