@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from hypothesis import strategies as st
 from sheets import equilateral, garment_of, level_of
 from stages import GARMENT_API, add_sheet, author, new_stage, save
 
-from benchmarks.crease import HELD, MOVES, STRAIGHT, Worn, worn
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.forces.bending import Bending
@@ -226,26 +224,6 @@ def test_a_pose_that_is_held_comes_to_rest_when_creases_have_set():
     assert min(moves[:47]) > 1e-7
     assert max(moves[48:]) < 1e-12
     assert refiner.solve(replace(frame, time=60.0)).reused == (True,)
-
-
-@cache
-def elbow(time: float) -> Worn:
-    """The elbow of the benchmark in cotton at one subdivision."""
-    return worn(replace(PRESETS["cotton"], crease_time=time), level=1)
-
-
-def test_an_elbow_that_is_straight_again_shows_where_it_was_bent():
-    """Half as much again one second later, less as it is held, and no jumps or energy that are not there without."""
-    plain, creased = elbow(0.0), elbow(2.0)
-    later, late = STRAIGHT + 24, STRAIGHT + 72
-    assert creased.folds[later] > 1.5 * plain.folds[later]
-    assert creased.folds[late] < 0.9 * creased.folds[STRAIGHT]
-    held = creased.folds[STRAIGHT : late + 1]
-    assert np.diff(held).max() < 0.01 * held[0]
-    assert np.sqrt((creased.jumps**2).mean()) < 1.1 * np.sqrt((plain.jumps**2).mean())
-    assert creased.jumps[STRAIGHT + 1 :].max() < 0.05e-3
-    assert creased.joules.max() < 1.1 * plain.joules.max()
-    assert creased.joules[MOVES + HELD] < plain.joules[MOVES + HELD]
 
 
 def test_more_time_between_samples_sets_more(tmp_path: Path):
