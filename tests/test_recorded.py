@@ -139,17 +139,19 @@ def test_a_followed_step_of_its_own_is_that_step():
 
 @pytest.mark.parametrize("integrator", ["quasi-newton", "physgraph"])
 def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, monkeypatch: pytest.MonkeyPatch):
-    """A cold frame, warm ones with a tether, and another fabric: systems aimed anew give the same bytes."""
+    """A cold frame, warm ones with a tether, another fabric, and creases: systems aimed anew give the same bytes."""
     mesh, rest = sheet(6, 5)
     stiff = Fabric(10.0 * FABRIC.stretch, FABRIC.bend, FABRIC.density)
-    shown = [(0.0, FABRIC), (0.1, FABRIC), (0.2, FABRIC), (0.2, stiff), (0.3, stiff)]
+    creased = replace(FABRIC, crease_time=0.1)
+    shown = [(0.0, FABRIC), (0.1, FABRIC), (0.2, FABRIC), (0.2, stiff), (0.3, stiff), (0.4, creased), (0.5, creased)]
     frames = [[GarmentFrame(wave(rest, phase=phase), fabric, GUIDE)] for phase, fabric in shown]
     fresh = Problem.level
 
     def lasting(problem: Problem, index: int, choice: Choice) -> LevelProblem:
         detailed, stiffness = problem.start.detailed, problem.tether
         tie = None if detailed is None or stiffness is None else (stiffness, detailed)
-        system = problem.forces[index].lasting_system(problem.aim, tie)
+        angles = None if problem.creases is None else problem.creases.rest_angle
+        system = problem.forces[index].lasting_system(problem.aim, tie, rest_angle=angles)
         return replace(fresh(problem, index, choice), alone=system)
 
     results = []
@@ -158,7 +160,7 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
         monkeypatch.setattr(Problem, "level", level)
         state, points = None, []
         for frame in frames:
-            solved = solve_frame(group, FrameInput(frame), state)
+            solved = solve_frame(group, FrameInput(frame, elapsed=[0.05]), state)
             state = solved.state
             points.append(solved.points[0])
         results.append(points)
