@@ -113,16 +113,17 @@ def main(
     journal.parent.mkdir(parents=True, exist_ok=True)
     journal.touch()
     known = {(row["shot"], row["level"]) for row in read(journal)}
-    names = [each for each in SHOTS if each.startswith(tuple(shots.split(","))) and is_there(each, folder)]
-    cases = [
-        (each, level)
-        for level in sorted(map(int, levels.split(",")), reverse=True)
-        for each in names
-        if level < 2 or each not in COARSE
-    ]
+    cases = cases_of(levels, shots, folder)
     options = [*([str(folder)] if folder else []), "--device", device, "--seconds", str(seconds)]
     run_all([each for each in cases if each not in known], options, journal, jobs)
     report(list(read(journal)))
+
+
+def cases_of(levels: str, shots: str, folder: Path | None) -> list[tuple[str, int]]:
+    """Shots that begin with one of the names and can be opened, each with its levels, the finest first."""
+    names = [each for each in SHOTS if each.startswith(tuple(shots.split(","))) and is_there(each, folder)]
+    order = sorted(map(int, levels.split(",")), reverse=True)
+    return [(each, level) for level in order for each in names if level < 2 or each not in COARSE]
 
 
 def is_there(name: str, folder: Path | None) -> bool:
@@ -130,7 +131,14 @@ def is_there(name: str, folder: Path | None) -> bool:
     return "." not in name or (folder is not None and (folder / name).exists())
 
 
-def run_all(cases: Sequence[tuple[str, int]], options: Sequence[str], journal: Path, jobs: int) -> None:
+def run_all(
+    cases: Sequence[tuple[str, int]],
+    options: Sequence[str],
+    journal: Path,
+    jobs: int,
+    *,
+    program: str = "benchmarks.choice",
+) -> None:
     """Measure cases side by side, each on a core of its own; their rows go to the journal as they come."""
     cores: queue.Queue[int] = queue.Queue()
     for core in sorted(os.sched_getaffinity(0))[:jobs]:
@@ -138,7 +146,7 @@ def run_all(cases: Sequence[tuple[str, int]], options: Sequence[str], journal: P
 
     def run(case: tuple[str, int]) -> None:
         core = cores.get()
-        command = ["taskset", "-c", str(core), sys.executable, "-m", "benchmarks.choice", *options]
+        command = ["taskset", "-c", str(core), sys.executable, "-m", program, *options]
         with journal.open("a", encoding="utf-8") as file:
             done = subprocess.run(
                 [*command, "--one", f"{case[0]}:{case[1]}"],

@@ -63,7 +63,8 @@ class TrainConfig:
         average: Decay of the weights' running mean, which is the result.
         held_out: Patches to measure on, of another seed.
         rounds: Rounds of moving scenes with contact that it is trained on, beside the patches.
-        start: Weights to begin with: "" none, "shipped" those that ship, or a file; a larger network begins as they do.
+        start: Weights to begin with: "" none, "shipped" those that ship, or a file; in TOML
+            relative to it; a larger network begins as they do.
     """
 
     kind: str = "physgraph"

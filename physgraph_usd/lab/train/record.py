@@ -84,7 +84,7 @@ def run_training(
 
 
 def read_config(file: Path) -> TrainConfig:
-    """Read a configuration.
+    """Read a configuration; a file that training is to start with lies beside it or where its path says.
 
     Raises:
         UsageError: The file is missing, is not TOML or has an unknown key or value.
@@ -104,6 +104,8 @@ def read_config(file: Path) -> TrainConfig:
     unknown = [name for name in getattr(network, "vectors", ()) if name not in VECTORS]
     if unknown:
         raise UsageError(f"{file}: unknown vectors {', '.join(unknown)}; known: {', '.join(VECTORS)}")
+    if (start := values.get("start")) and start != "shipped":
+        values["start"] = str(file.parent / str(start))
     return _filled(TrainConfig, values | {"network": network, "patches": patches, "rounds": rounds}, where=str(file))
 
 
