@@ -86,7 +86,7 @@ class RefineOptions:
         metavar="N|auto",
     )
     integrator: str = _solver(AUTO, f"How forces become displacements: {', '.join(INTEGRATORS)}.", metavar="NAME")
-    weights: Path | None = _solver(None, "Weights for a learned integrator.", metavar="FILE")
+    weights: Path | None = _solver(None, "Weights for the learned integrator.", metavar="FILE")
     steps: int = _solver(12, "Most steps at the finest level.", metavar="N", least=0)
     tolerance: float = _solver(
         2e-3, "Stop when the cloth would move less, RMS, in local edge lengths.", metavar="T", least=0

@@ -19,9 +19,7 @@ from ..contact.settings import ContactSettings
 from ..forces.base import ForceModule
 from ..forces.guide import GuideMap
 from ..integrate.base import Integrator, System
-from ..integrate.learned import guarded
 from ..integrate.quasi_newton import QuasiNewton
-from ..integrate.weights import shipped_network
 from ..level import Level, Placed, build_levels, unhindered
 from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame, recentred
@@ -123,8 +121,9 @@ class Group:
         return self._forces[key]
 
     def integrator(self, *, learned: bool) -> Integrator:
-        """The shipped network's integrator, or the one that the settings name; built when first asked for."""
-        return self._built(_shipped if learned else self.settings.method.build)
+        """The network's integrator, where the settings leave the choice, or their own; built when first asked for."""
+        method = self.settings.method
+        return self._built(method.learned if learned and method.learned else method.build)
 
     @property
     def untangler(self) -> Integrator:
@@ -231,8 +230,3 @@ class Group:
         world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
         coarse = self.tensor((world - world.mean(dim=0)).numpy())
         return [lasting.module(coarse) for lasting in self.forces_for(frames)], coarse
-
-
-def _shipped() -> Integrator:
-    """The integrator of the network that ships."""
-    return guarded(shipped_network("physgraph"))

@@ -6,7 +6,7 @@ A new integrator is one file and one line in `METHODS`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...errors import UsageError
@@ -26,21 +26,28 @@ class Method:
     Attributes:
         build: Makes the integrator.
         nested: Solve coarse levels first; otherwise the finest level only. None chooses frame by frame: `choice`.
+        learned: Makes the network's integrator, where frames choose; None where there is no choice.
     """
 
     build: Callable[[], Integrator]
     nested: bool | None
+    learned: Callable[[], Integrator] | None = None
+
+
+def _shipped() -> Integrator:
+    """The integrator of the network that ships."""
+    return guarded(shipped_network("physgraph"))
 
 
 METHODS: dict[str, Method] = {
-    "auto": Method(QuasiNewton, nested=None),
+    "auto": Method(QuasiNewton, nested=None, learned=_shipped),
     "quasi-newton": Method(QuasiNewton, nested=True),
     "quasi-newton-flat": Method(QuasiNewton, nested=False),
     "lbfgs": Method(lambda: QuasiNewton(use_metric=False), nested=False),
     "adam": Method(lambda: Guard(Adam()), nested=False),
     "gd": Method(lambda: Guard(GradientDescent()), nested=False),
     "newton": Method(Newton, nested=True),
-    "physgraph": Method(lambda: guarded(shipped_network("physgraph")), nested=True),
+    "physgraph": Method(_shipped, nested=True),
     "physgraph-paper": Method(lambda: guarded(shipped_network("physgraph-paper")), nested=False),
 }
 """Every method by its name on the command line."""
@@ -61,9 +68,14 @@ def method_named(name: str, weights: Path | None = None) -> Method:
     """
     if name not in METHODS:
         raise UsageError(f"unknown integrator '{name}'; known integrators: {', '.join(METHODS)}")
+    method = METHODS[name]
     if weights is None:
-        return METHODS[name]
-    if name not in LEARNED:
-        raise UsageError(f"integrator '{name}' has no weights; name one that has: {', '.join(LEARNED)}")
-    network = load_network(weights, kind=name)
-    return Method(lambda: guarded(network), nested=METHODS[name].nested)
+        return method
+    if name not in LEARNED and method.learned is None:
+        raise UsageError(f"integrator '{name}' has no weights; name one that has: auto, {', '.join(LEARNED)}")
+    network = load_network(weights, kind=name if name in LEARNED else "physgraph")
+
+    def own() -> Integrator:
+        return guarded(network)
+
+    return replace(method, build=own) if name in LEARNED else replace(method, learned=own)
