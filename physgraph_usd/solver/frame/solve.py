@@ -108,7 +108,7 @@ def solve_one_level(
         view, terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
     carry, last, terms, made, touched, integrator = None, None, (), 0, False, problem.integrator
-    while not made or made < _most_steps(budget, reports[-1], touched=touched):
+    while not made or made < _most_steps(problem.budget, reports[-1], touched=touched):
         view, terms = view.terms(x)
         if terms and not touched:
             touched, budget = True, problem.touching
