@@ -77,6 +77,7 @@ class ClusterPairs:
         slack: Float[Tensor, " vertices"],
         allowed: Float[Tensor, " vertices"],
         half: float,
+        asked: Bool[Tensor, " clusters"] | None = None,
     ) -> ClusterPairs:
         """Find the pairs.
 
@@ -88,11 +89,13 @@ class ClusterPairs:
             slack: How far each may be from its path [m], float64.
             allowed: How far each may go while parts that were listed serve [m], float64.
             half: What lies in one garment is asked for only within this part of its distance at rest.
+            asked: Only pairs with one of these clusters; all where None.
         """
         path = torch.zeros_like(start) if end is None else end - start
-        m = parts.patches.measured(start, end, least=float(LEAST + MARGIN), enough=half + float(MARGIN))
+        enough = half + float(MARGIN)
+        m = parts.patches.measured(start, end, least=float(LEAST + MARGIN), enough=enough, around=asked)
         motion = motion_of(start, path, radius=radius, slack=slack)
-        found, relied = _in_boxes(parts, motion, m, half=half)
+        found, relied = _in_boxes(parts, motion, m, half=half, asked=asked)
         pairs = found[:, :2].contiguous()
         occurs = torch.zeros(parts.count, dtype=torch.bool, device=start.device)
         occurs[pairs.reshape(-1).long()] = True
@@ -177,7 +180,7 @@ def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: i
 
 
 def _in_boxes(
-    parts: Parts, motion: Any, m: Tensor, *, half: float
+    parts: Parts, motion: Any, m: Tensor, *, half: float, asked: Bool[Tensor, " clusters"] | None
 ) -> tuple[Int[Tensor, "pairs 3"], Float[Tensor, " patches"]]:
     """Pairs of clusters whose boxes meet on their way, what is proved of them, and what that relies on of m."""
     size, device = parts.count, str(m.device)
@@ -191,13 +194,19 @@ def _in_boxes(
     proofs = Proofs()
     proofs.m, proofs.grades, proofs.half = wp.from_torch(m), wp.from_torch(grades.view(-1)), half
     tree, room, workers = wp.Bvh(all_low, all_high), ROOM, workers_on(device)
+    which = None if asked is None else torch.nonzero(asked).squeeze(1).to(torch.int32)
+    rows = size if which is None else len(which)
     while True:
-        slots = torch.empty((size, room, 3), dtype=torch.int32, device=device)
-        count = torch.zeros(size, dtype=torch.int32, device=device)
-        inputs = [workers, table, proofs, tree.id, swept, all_low, all_high, room]
-        inputs += [argument(slots.view(-1, 3), wp.vec3i), argument(count)]
-        launch(parts, find_clusters, groups * workers, *inputs, least=LEAST_QUERIES)
-        most = int(count.max()) if size else 0
+        slots = torch.empty((rows, room, 3), dtype=torch.int32, device=device)
+        count = torch.zeros(rows, dtype=torch.int32, device=device)
+        out = (room, argument(slots.view(-1, 3), wp.vec3i), argument(count))
+        if which is None:
+            inputs = [workers, table, proofs, tree.id, swept, all_low, all_high, *out]
+            launch(parts, find_clusters, groups * workers, *inputs, least=LEAST_QUERIES)
+        else:
+            inputs = [argument(which), argument(asked), table, proofs, tree.id, swept, *out]
+            launch(parts, find_asked, rows, *inputs, least=LEAST_QUERIES)
+        most = int(count.max()) if rows else 0
         if most <= room:
             return slots[torch.arange(room, device=device) < count.unsqueeze(1)], _relied(m, grades)
         room = most
@@ -367,20 +376,21 @@ def pairs_of(
     room: wp.int32,
     out: wp.array(dtype=wp.vec3i),
     found: wp.array(dtype=wp.int32),
+    row: wp.int32,
     i: wp.int32,
     begin: wp.int32,
     end: wp.int32,
 ):
-    """Write the pairs of a cluster and others that it can come near, those that are own ones of a patch."""
+    """Write the pairs of a cluster and others that it can come near, those that are own ones of a patch, in a row."""
     for k in range(begin, end):
         j = patches.own[k]
         if not overlap(swept.low[i], swept.high[i], swept.low[j], swept.high[j]):
             continue
         known = proved(patches, proofs, swept.near[i] + swept.near[j], i, j)
         if known < OUT:
-            if found[i] < room:
-                out[i * room + found[i]] = wp.vec3i(wp.min(i, j), wp.max(i, j), known)
-            found[i] = found[i] + 1
+            if found[row] < room:
+                out[row * room + found[row]] = wp.vec3i(wp.min(i, j), wp.max(i, j), known)
+            found[row] = found[row] + 1
 
 
 @wp.kernel
@@ -420,7 +430,36 @@ def find_clusters(
             i = patches.own[n]
             if overlap(swept.low[i], swept.high[i], all_low[b], all_high[b]):
                 begin, end = wp.where(a == b, n, patches.first_own[q]), patches.first_own[q + 1]
-                pairs_of(parts, patches, proofs, swept, room, out, found, i, begin, end)
+                pairs_of(parts, patches, proofs, swept, room, out, found, i, i, begin, end)
+
+
+@wp.kernel
+def find_asked(
+    first: wp.int32,
+    parts: Topology,
+    which: wp.array(dtype=wp.int32),
+    asked: wp.array(dtype=wp.bool),
+    patches: Patches,
+    proofs: Proofs,
+    tree: wp.uint64,
+    swept: Swept,
+    room: wp.int32,
+    out: wp.array(dtype=wp.vec3i),
+    found: wp.array(dtype=wp.int32),
+):
+    """Clusters that those asked for can come near, each pair once, as `find_clusters` has them."""
+    n = first + wp.tid()
+    i, b = which[n], wp.int32(0)
+    query = wp.bvh_query_aabb(tree, swept.low[i], swept.high[i])
+    while wp.bvh_query_next(query, b):
+        q = patches.wide_count + b
+        begin, end = patches.first_own[q], patches.first_own[q + 1]
+        if not feel(parts, i, patches.own[begin]):
+            continue
+        for k in range(begin, end):
+            j = patches.own[k]
+            if j >= i or not asked[j]:
+                pairs_of(parts, patches, proofs, swept, room, out, found, n, i, k, k + 1)
 
 
 @wp.kernel

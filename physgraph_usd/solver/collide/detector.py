@@ -30,6 +30,8 @@ LIST_RADIUS = 0.1
 forces half as much."""
 KNOWN = 4
 """Positions of which it is known what they are in double precision."""
+FEW = 0.25
+"""Part of the clusters up to which a move that no broad phase serves has one of its own, of those asked for alone."""
 SPARE = 1.05
 """What is listed reaches so much farther than it need: distances are rounded."""
 IMPACTS, NEAR = 4, 16
@@ -154,7 +156,7 @@ class Detector:
             return Pairs.none(asked.device)
         at, to = self._places.of(start), self._places.of(end)
         path = to - at
-        found, last = self._broad(at, to), self._listed
+        found, last = self._broad(at, to, asked), self._listed
         near, asks = Pairs.none(at.device), ~found.apart
         motion = motion_of(at, path, asked=asked, tangle=tangle)
         motion.share, motion.most, motion.floor = share, share * self.parts.spacing, floor
@@ -170,14 +172,20 @@ class Detector:
         motion = motion_of(at, torch.zeros_like(at))
         return self._narrow(found, found.pairs, motion, at, room=IMPACTS, kernel=kernel, asked=~found.apart)[0]
 
-    def _broad(self, at: Tensor, to: Tensor | None) -> ClusterPairs:
-        """Pairs of clusters that serve for a move from some positions to others, or for positions."""
+    def _broad(self, at: Tensor, to: Tensor | None, asked: Tensor | None = None) -> ClusterPairs:
+        """Pairs of clusters that serve for a move from some positions to others, or for positions.
+
+        Where only a few vertices are asked for, pairs without one of them may be missing.
+        """
         last = to if to is not None else at
         known = self._found is not None and ((to is None and last is self._served) or self._found.covers(at, to))
         if self._found is None or not known:
             radius = self._radius if self.reach is None else self._radius + SPARE * self._may
-            limits = {"radius": radius, "slack": self._slack_for(at, to), "allowed": self._may, "half": self._half}
-            self._found = ClusterPairs.find(self.parts, at, to, **limits)
+            limits = {"radius": radius, "allowed": self._may, "half": self._half}
+            clusters = None if asked is None else self.parts.with_any(asked)
+            if clusters is not None and float(clusters.float().mean()) < FEW:
+                return ClusterPairs.find(self.parts, at, to, **limits, slack=0.0 * self._slack, asked=clusters)
+            self._found = ClusterPairs.find(self.parts, at, to, **limits, slack=self._slack_for(at, to))
         self._served = last
         return self._found
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -70,6 +70,12 @@ class Parts:
         """The least of some values at the corners of each cluster."""
         out = torch.full((self.count,), torch.inf, dtype=values.dtype, device=values.device)
         return out.scatter_reduce(0, self._cluster, values[self._corner], "amin")
+
+    def with_any(self, vertices: Bool[Tensor, " vertices"]) -> Bool[Tensor, " clusters"]:
+        """Which clusters have one of some vertices at a corner."""
+        out = torch.zeros(self.count, dtype=torch.bool, device=vertices.device)
+        out[self._cluster[vertices[self._corner]]] = True
+        return out
 
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=self.level.device)

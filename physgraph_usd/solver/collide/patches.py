@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 import warp as wp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -134,13 +134,14 @@ def measure_patches(
     least: wp.float32,
     enough: wp.float32,
     known: wp.array(dtype=wp.float32),
+    wanted: wp.array(dtype=wp.bool),
     found: wp.array(dtype=wp.float32),
 ):
-    """m of some patches over a move along straight paths, by each worker; of small ones only where that of the wide one
-    round them, which is known, is not enough in every case."""
+    """m of some of the wanted patches over a move along straight paths, by each worker; of small ones only where that
+    of the wide one round them, which is known, is not enough in every case."""
     place = (first + wp.tid()) + begin_at * workers
     p, worker = place // workers, place % workers
-    if patches.first_face[p] == patches.first_face[p + 1]:
+    if not wanted[p] or patches.first_face[p] == patches.first_face[p + 1]:
         return
     around = patches.within[p]
     if around >= 0:
@@ -255,6 +256,7 @@ class MonotonePatches:
         *,
         least: float,
         enough: float,
+        around: Bool[Tensor, " clusters"] | None = None,
     ) -> Float[Tensor, " patches"]:
         """m of each patch on the straight paths between positions [m], float64; -1 where it is not known.
 
@@ -263,13 +265,17 @@ class MonotonePatches:
             end: Where the vertices go; None where nothing moves.
             least: What m must be more than.
             enough: Of which distance at rest, at most, all that is nearer is to be left out: a part.
+            around: Only patches that some clusters are own ones of; all where None.
         """
         workers = workers_on(self.level.device)
+        wanted = torch.full((self.count,), around is None, dtype=torch.bool, device=start.device)
+        for of in () if around is None else (self.table.wide, self.table.small):
+            wanted[wp.to_torch(of)[around].long()] = True
         by_worker = torch.full((self.count, workers), float(NOTHING), dtype=torch.float32, device=start.device)
         out, x, moves = by_worker[:, 0].clone(), _array(start), end is not None
         path = x if end is None else _array(end - start)
         for begin, size in ((0, self.wide), (self.wide, self.count - self.wide)):
-            inputs = (begin, self.table, x, path, moves, least, enough, argument(out))
+            inputs = (begin, self.table, x, path, moves, least, enough, argument(out), argument(wanted))
             self._launch(
                 measure_patches, size * workers, workers, *inputs, argument(by_worker.view(-1)), least=LEAST_QUERIES
             )
