@@ -21,6 +21,10 @@ from .topology import Topology
 
 wp.set_module_options({"enable_backward": False})
 
+ROOM, MOST_ROOM = 2**19, 64
+"""Pairs of parts that there is room for in any case, shared by the pairs of clusters, and most of two clusters': those
+that have more are looked at twice."""
+
 
 @wp.struct
 class Found:
@@ -200,6 +204,8 @@ def faces_met(
     reach = room_of(boxes, motion, i, j)
     for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
         v = parts.vertices[k]
+        if boxes.asked[j] == 0 and not motion.asked[v]:
+            continue
         at = motion.start[v]
         way = motion.path[v] - boxes.mean[j]
         lowest = at + wp.min(way, wp.vec3d()) - wp.vec3d(reach + boxes.spread[j])
@@ -235,6 +241,8 @@ def edges_met(
     reach = room_of(boxes, motion, i, j)
     for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
         e = parts.edges[k]
+        if boxes.asked[j] == 0 and not motion.asked[e[0]] and not motion.asked[e[1]]:
+            continue
         near, far = motion.start[e[0]], motion.start[e[1]]
         end, other = motion.path[e[0]] - boxes.mean[j], motion.path[e[1]] - boxes.mean[j]
         lowest = wp.min(near + wp.min(end, wp.vec3d()), far + wp.min(other, wp.vec3d()))
@@ -349,7 +357,7 @@ def find(
         kernel: The kernel.
         motion: What moves.
         boxes: Boxes of the clusters that occur.
-        room: Pairs of parts of two clusters that there is room for before they are counted.
+        room: Pairs of parts of two clusters that there is room for at least before they are counted.
         asked: Which pairs of clusters are asked; all where None.
 
     Returns:
@@ -363,7 +371,7 @@ def find(
     clusters, size = clusters[which], len(which)
     if not size:
         return _room(0, device), which
-    inputs = (parts, clusters, kernel, motion, boxes)
+    inputs, room = (parts, clusters, kernel, motion, boxes), max(room, min(MOST_ROOM, ROOM // size))
     begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
     count = torch.zeros_like(begin[:size])
     found = _write(*inputs, begin=begin, count=count, out=_room(room * size, device))
