@@ -22,8 +22,9 @@ LONG = 1.0
 """Mean edges by which cloth may be cut short: what a move loses comes in the next round."""
 ROUNDS = 4
 """How often it is found what else is in the way of vertices that go along what was, before they are cut short."""
-GOES = 3
-"""How often what is left of each way is gone: what was in the way may have gone too."""
+GOES, GAINS = 3, 0.5
+"""How often what is left of each way is gone: what was in the way may have gone too; no more where a go has left over
+so much of what was left before it."""
 TRIES = 4
 """How often tangles in which more crosses are held to the promise, before all are."""
 
@@ -84,10 +85,11 @@ class Promise:
         met = in_the_way(start, aim, parts, **options)
         if not len(met.value):
             return Placed(aim)
-        x = start
-        for _ in range(GOES):
+        x, late = start, torch.inf
+        for last in range(GOES):
+            known = late
             x, late = self._along(x, aim, met, options)
-            if late <= LONG * parts.spacing or is_over():
+            if late <= LONG * parts.spacing or late > GAINS * known or last == GOES - 1 or is_over():
                 break
             met = in_the_way(x, aim, parts, **options)
         return x
