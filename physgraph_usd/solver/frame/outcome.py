@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...errors import SolveError
 from ..forces.base import ForceModule
-from ..integrate.solve import FAR, LevelReport
+from ..integrate.solve import LevelReport
 from ..level import Placed, unhindered
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
@@ -52,14 +52,12 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
-def state_left(problem: Problem, x: Placed, reports: Sequence[LevelReport], *, learned: bool) -> State:
+def state_left(problem: Problem, x: Placed) -> State:
     """State from which the next frame starts.
 
     Args:
         problem: The frame.
         x: The result [m].
-        reports: Those of the levels' rounds.
-        learned: Whether the network made the steps.
     """
     view, cage = problem.view(problem.finest), problem.cage
     stored = problem.group.moving_frames.store(cage.points, x)
@@ -72,20 +70,9 @@ def state_left(problem: Problem, x: Placed, reports: Sequence[LevelReport], *, l
         held=problem.start.held,
         fine=fine,
         clean=clean,
-        misled=_is_misled(problem, reports, learned=learned),
         bent=() if problem.creases is None else problem.creases.split(problem.forces[-1].level),
         creeps=lasts and keeps_creases(problem.frame) and not problem.start.rests,
     )
-
-
-def _is_misled(problem: Problem, reports: Sequence[LevelReport], *, learned: bool) -> bool:
-    """Whether cloth is far from rest, and most of the network's steps were corrected, in this frame or before it."""
-    own = [report for report in reports if report.level == problem.finest]
-    if not own or not own[-1].remaining_move > FAR * problem.group.settings.tolerance:
-        return False
-    if not learned:
-        return problem.misled
-    return 2 * sum(report.movers.get("physgraph", 0) for report in own) < sum(report.steps for report in own)
 
 
 def telemetry_of(

@@ -113,7 +113,6 @@ class Problem:
         walked: Where the cages walked to from an earlier frame [m], for a cold start; or None.
         before: Where it was [m], float64; None where there is no last frame.
         tether: How stiffly it is tied to its start [1/s^2]; None where it is not.
-        misled: As in the `State` that it starts from.
         creases: What its cloth remembers of its folds; None where it starts cold, or remembers none.
     """
 
@@ -128,7 +127,6 @@ class Problem:
     walked: Float[Tensor, "coarse 3"] | None
     before: Placed | None
     tether: float | None
-    misled: bool
     creases: Creases | None = None
 
     @property
@@ -269,7 +267,6 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
         before=before,
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
-        misled=last is not None and last.misled,
         creases=None if start.detailed is None else creases,
     )
     return problem if problem.caught is None else _anew(problem, *problem.caught)
@@ -296,9 +293,7 @@ class Choice:
     The network makes the steps, in cold frames and in warm ones, where cloth touches and where it does not, and where
     the cage crosses itself: on the CPU it is within 1.1 of the best method's time to its energy more often than
     quasi-Newton is, in each of these (`python -m benchmarks.choice`; docs/notes/chart.md has the table). Quasi-Newton
-    draws apart what crosses, and solves cages that are not subdivided. A frame in which most of the network's steps
-    raised the energy, and which ended far from rest, hands over to it too, until cloth is near rest again: three layers
-    that are shaken ended at ten times the energy so.
+    draws apart what crosses, and solves cages that are not subdivided.
 
     Coarse levels are cheap and carry folds far, but each has a start of its own. Under one subdivision lies one
     coarse level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where cloth
@@ -337,7 +332,7 @@ def choose(problem: Problem, nested: bool | None) -> Choice:
     warm, subdivisions = problem.warm, problem.finest
     if nested is not None:
         return Choice(nested and not warm)
-    learned = subdivisions > 0 and not (warm and problem.misled)
+    learned = subdivisions > 0
     if warm:
         return Choice(False, learned=learned, touching=FEWER if learned else 1.0)
     cuda = problem.device != "cpu"

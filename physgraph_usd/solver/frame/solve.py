@@ -69,7 +69,7 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
         raise SolveError(broken) from error
     assert x is not None
-    left = state_left(problem, x, reports, learned=choice.learned)
+    left = state_left(problem, x)
     shown, finish = scaled(problem, x), dict[str, object]()
     if problem.contact is not None:
         shown, finish = problem.contact.finish(shown)

@@ -64,7 +64,6 @@ class State:
         held: For how many frames the pose had been held.
         fine: Fine positions [m], world space, float64, from which cloth walks on; None before it was solved.
         clean: Whether nothing of what was solved together crosses there.
-        misled: Whether the network's steps raised the energy while the cloth was far from rest.
         bent: What the finest hinges of each garment remember of their bends [rad], shape (H,), None where nothing is
             remembered; () where no garment has creases.
         creeps: Whether creases go on changing, so that the same input leads to another frame.
@@ -76,7 +75,6 @@ class State:
     held: int = 0
     fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
-    misled: bool = False
     bent: tuple[Tensor | None, ...] = ()
     creeps: bool = False
 
@@ -108,9 +106,9 @@ def join(parts: Sequence[State]) -> State:
     fine = [part.fine for part in parts if part.fine is not None]
     walked = torch.cat(fine) if len(fine) == len(parts) else None
     clean = all(part.clean for part in parts)
-    misled, creeps = any(part.misled for part in parts), any(part.creeps for part in parts)
+    creeps = any(part.creeps for part in parts)
     bent = tuple(each for part in parts for each in part.bent or (None,)) if any(part.bent for part in parts) else ()
-    kept = {"fine": walked, "clean": clean, "misled": misled, "bent": bent, "creeps": creeps}
+    kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps}
     return State(*whole, held=min(part.held for part in parts), **kept)
 
 
