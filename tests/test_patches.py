@@ -16,7 +16,9 @@ from folds import named
 from meshes import grid
 
 from physgraph_usd.solver.collide import broad_phase, patches
+from physgraph_usd.solver.collide import detector as detecting
 from physgraph_usd.solver.collide.broad_phase import ClusterPairs
+from physgraph_usd.solver.collide.detector import Detector
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -105,11 +107,11 @@ class Cloth:
             owners(table.first_face, table.face_number),
         )
 
-    def pairs(self, x: np.ndarray, end: np.ndarray) -> ClusterPairs:
-        """The broad phase for a move, with nothing to spare."""
+    def pairs(self, x: np.ndarray, end: np.ndarray, few: torch.Tensor | None = None) -> ClusterPairs:
+        """The broad phase for a move, with nothing to spare, of some clusters alone where these are given."""
         none = torch.zeros(len(x), dtype=torch.float64)
         given = {"radius": none, "slack": none, "allowed": none, "half": 0.0}
-        return ClusterPairs.find(self.parts, torch.as_tensor(x), torch.as_tensor(end), **given)
+        return ClusterPairs.find(self.parts, torch.as_tensor(x), torch.as_tensor(end), **given, asked=few)
 
     def judged(self, found: ClusterPairs, x: np.ndarray, end: np.ndarray) -> tuple[int, int, bool]:
         """Pairs of parts that the toolkit takes for candidates on the straight way and nobody asks; how many of them
@@ -262,3 +264,38 @@ def test_what_is_known_of_positions_changes_no_answer(shape: Shape):
             served.append(found.covers(x, end))
             assert served[-1] == replace(found, _near=[], _went=[]).covers(x, end)
     assert 0 < sum(served) < len(served)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_search_for_few_clusters_has_all_their_pairs(shape: Shape):
+    """Each once, and others only where a patch of clusters that are not asked for would have left them out."""
+    cloth, rng, more = Cloth(shape), np.random.default_rng(8), 0
+    for _ in range(12):
+        x = placed(cloth.rest, rng)
+        end = x + placed(0.3 * cloth.rest, rng) if rng.uniform() < 0.6 else folded(x, rng)
+        few = cloth.parts.with_any(torch.as_tensor(rng.uniform(size=len(x)) < 0.02))
+        whole, found = cloth.pairs(x, end), cloth.pairs(x, end, few)
+        own = {pair for pair in asked(whole) if few[list(pair)].any()}
+        assert own <= asked(found)
+        assert len({tuple(pair) for pair in found.pairs.tolist()}) == len(found.pairs)
+        assert bool(few[found.pairs.long()].any(dim=1).all())
+        more += len(own)
+    assert more > 100
+
+
+def test_a_move_of_few_that_leaves_its_paths_is_asked_as_any(monkeypatch: pytest.MonkeyPatch):
+    cloth, rng, met = Cloth(spiral), np.random.default_rng(9), []
+    x = torch.as_tensor(placed(cloth.rest, rng))
+    for few in (detecting.FEW, 0.0):
+        monkeypatch.setattr(detecting, "FEW", few)
+        detector, other = Detector(cloth.parts), np.random.default_rng(10)
+        detector.impacts(x, x + 0.1 * EDGE, share=0.2, floor=0.0, asked=torch.ones(len(x), dtype=torch.bool))
+        found = detector._found
+        for _ in range(6):
+            near = (x - x[other.integers(len(x))]).norm(dim=1) < 2.0 * EDGE
+            end = x + torch.where(near.unsqueeze(1), 4.0 * EDGE * torch.as_tensor(other.normal(size=3)), 0.0)
+            pairs = detector.impacts(x, end, share=0.2, floor=0.0, asked=near)
+            met.append({tuple(each) for each in pairs.corners.tolist()})
+        assert (detector._found is found) == (few > 0.0)
+    assert met[:6] == met[6:]
+    assert sum(map(len, met)) > 20
