@@ -136,8 +136,8 @@ def ball() -> Stage:
     return Stage(faces, 0.8 * uv, rest, uv[:, 0] == 1.0, motion, (Body(0.18, 0.0, ends),), (30.0, 22.0))
 
 
-def elbow() -> Stage:
-    """A sleeve, 35 cm round and 40 cm long, held at the shoulder, on an arm that bends by 100 degrees at the elbow."""
+def elbow(degrees: float = 100.0) -> Stage:
+    """A sleeve, 35 cm round and 40 cm long, held at the shoulder, on an arm that bends at the elbow by an angle."""
     faces, uv = grid(32, 36, closed=True)
     angle = 2.0 * np.pi * uv[:, 0]
     rest = np.stack([0.4 * uv[:, 1] - 0.2, 0.055 * np.cos(angle), 0.055 * np.sin(angle)], axis=1)
@@ -146,7 +146,7 @@ def elbow() -> Stage:
         return np.array([-0.15, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
 
     def lower(time: float) -> tuple[np.ndarray, np.ndarray]:
-        turn = np.radians(100.0) * min(time / 0.7, 1.0)
+        turn = np.radians(degrees) * min(time / 0.7, 1.0)
         axis = np.array([np.cos(turn), 0.0, np.sin(turn)])
         return 0.15 * axis, axis
 
