@@ -1,4 +1,4 @@
-"""What contact leaves on blocks, tori, cloth and several garments, in our form and in the paper's, as rows.
+"""What contact leaves on blocks, tori, cloth and several garments, as rows.
 
     python -m benchmarks.contact_rows colliders|itself|several [--long]
 
@@ -26,16 +26,15 @@ FRAMES = {True: 2, False: 5}
 OBJECTS = ("block", "torus")
 ITSELF = ("hood", "armpit")
 SEVERAL = ("layers", "crossing")
-HEAD = ("sample", "form", "inside", "%", "deepest [mm]", "body crossings", "cloth crossings", "of garments", "strain")
+HEAD = ("sample", "inside", "%", "deepest [mm]", "body crossings", "cloth crossings", "of garments", "strain")
 
 
 def colliders(short: bool) -> Found:
     """The block and the torus: penetration, Loop's potential, and the shape."""
     rows, lines = [], []
     for name in OBJECTS:
-        sums = runs(name, short)
-        lines += described(name, sums)
-        ours = sums["ours"]
+        ours = run_of(name, short)
+        lines.append(described(name, ours))
         rows += [
             under(f"{name}: deepest vertex", ours.deepest, 0.5, unit=" mm"),
             under(f"{name}: vertices over 0.1 mm inside", ours.percent, 0.0, unit=" %", paper="correct results"),
@@ -59,9 +58,8 @@ def crossings(names: tuple[str, ...], short: bool) -> Found:
     """Crossings of cloth and cloth in some samples."""
     rows, lines = [], []
     for name in names:
-        sums = runs(name, short)
-        lines += described(name, sums)
-        ours = sums["ours"]
+        ours = run_of(name, short)
+        lines.append(described(name, ours))
         rows.append(fewer(f"{name}: crossings of cloth and cloth", ours.cloth, ours.cloth[0]))
         if names is SEVERAL:
             rows.append(fewer(f"{name}: those of different garments", ours.between, ours.between[0]))
@@ -71,15 +69,12 @@ def crossings(names: tuple[str, ...], short: bool) -> Found:
     return Found(rows, [table(HEAD, lines)])
 
 
-def runs(name: str, short: bool) -> dict[str, Sums]:
-    """Our form and the paper's on a sample."""
-    found = {}
+def run_of(name: str, short: bool) -> Sums:
+    """Frames in a row of a sample."""
     with tempfile.TemporaryDirectory() as folder:
         shot, first = open_one(name, Path(folder), None)
-        for form in ("ours", "paper"):
-            first_here = min(first, len(shot.scene.times) - FRAMES[short])
-            found[form] = run(shot, first_here, FRAMES[short], level=level_of(name, short), settings=FORMS[form])
-    return found
+        first = min(first, len(shot.scene.times) - FRAMES[short])
+        return run(shot, first, FRAMES[short], level=level_of(name, short), settings=FORMS["ours"])
 
 
 def level_of(name: str, short: bool) -> int:
@@ -87,14 +82,11 @@ def level_of(name: str, short: bool) -> int:
     return 1 if short and name in SEVERAL else 2
 
 
-def described(name: str, sums: dict[str, Sums]) -> list[list[str]]:
-    """The lines of a sample."""
-    return [
-        [name, form, *(f"{a} -> {b}" for a, b in [each.inside]), f"{each.percent:.3f}", f"{each.deepest:.2f}"]
-        + [f"{a} -> {b}" for a, b in (each.body, each.cloth, each.between)]
-        + [f"{each.strain:.3f}"]
-        for form, each in sums.items()
-    ]
+def described(name: str, sums: Sums) -> list[str]:
+    """The line of a sample."""
+    inside, crossings = sums.inside, (sums.body, sums.cloth, sums.between)
+    line = [name, f"{inside[0]} -> {inside[1]}", f"{sums.percent:.3f}", f"{sums.deepest:.2f}"]
+    return [*line, *(f"{before} -> {after}" for before, after in crossings), f"{sums.strain:.3f}"]
 
 
 def fewer(what: str, pair: tuple[int, int], most: int) -> Row:
