@@ -24,6 +24,7 @@ ALLOWED = {
     "contact/broad_phase.py Bodies._meets: _bounds": "of a pose, until the next one",
     "contact/broad_phase.py Bodies._posed: _surfaces": "of a pose, until the next one",
     "contact/cloth.py ClothView._look: _looked": "of the positions asked for last, and of no others",
+    "contact/cloth.py ClothView.term: came_near": "of the frame's report alone",
     "contact/cloth.py ClothView.remember: _looked": "what the last frame found at those positions",
     "contact/metric.py HeldMetric.solve: _last": "of the force solved for last, and of no other",
     "contact/metric.py HeldMetric.stiffened: _last": "of the force solved for last, and of no other",

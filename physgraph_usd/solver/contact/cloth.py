@@ -84,6 +84,7 @@ class ClothView:
     Attributes:
         mesh: The level's mesh, sewn as in this frame.
         keeps_sides: Whether nothing passes through anything: not by spheres, which are no promise.
+        came_near: Whether parts were near one another wherever `term` looked; None where it never did.
     """
 
     def __init__(
@@ -110,6 +111,7 @@ class ClothView:
         self._lasting, self._level, self._settings, self._thickness = lasting, level, settings, thickness
         self._base, self._seam = base, seam
         self._looked: _Looked | None = None
+        self.came_near: bool | None = None
 
     @property
     def parts(self) -> Parts:
@@ -182,6 +184,7 @@ class ClothView:
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
+        self.came_near = bool(self.came_near) or len(gaps.corners) > 0
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
     def _near_pairs(self, x: Tensor) -> NearPairs:
