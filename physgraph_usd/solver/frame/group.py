@@ -52,8 +52,7 @@ class Group:
     moving_frames: MovingFrames
     followers: Followers
     cloth: ClothContact
-    # The lasting terms by potential and materials, of the last ones alone; and integrators, which last on CUDA with
-    # what they recorded.
+    # The lasting terms by potential and materials, of the last ones alone; and integrators with what they recorded.
     _forces: dict[tuple[object, ...], list[LevelForces]] = field(default_factory=dict)
     _integrators: dict[Callable[[], Integrator], Integrator] = field(default_factory=dict)
 
