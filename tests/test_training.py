@@ -386,3 +386,13 @@ def test_the_committed_configurations_can_be_read():
     paper = record.read_config(folder / "physgraph-paper.toml")
     assert isinstance(paper.network, PaperConfig)
     assert (paper.network.latent, paper.network.rounds, paper.unroll, paper.patches.elastic) == (128, 10, 5, True)
+
+
+def test_weights_to_start_with_are_named_beside_the_configuration(tmp_path: Path):
+    """What ships goes on from weights that lie there."""
+    file = tmp_path / "own.toml"
+    for text, start in (("first.safetensors", str(tmp_path / "first.safetensors")), ("shipped", "shipped"), ("", "")):
+        file.write_text(f'start = "{text}"')
+        assert record.read_config(file).start == start
+    shipped = record.read_config(Path(record.__file__).parent / "physgraph.toml")
+    assert Path(shipped.start).is_file()

@@ -184,7 +184,8 @@ class Detector:
             limits = {"radius": radius, "allowed": self._may, "half": self._half}
             clusters = None if asked is None else self.parts.with_any(asked)
             if clusters is not None and float(clusters.float().mean()) < FEW:
-                return ClusterPairs.find(self.parts, at, to, **limits, slack=0.0 * self._slack, asked=clusters)
+                none = torch.zeros_like(self._slack)
+                return ClusterPairs.find(self.parts, at, to, **limits, slack=none, asked=clusters)
             self._found = ClusterPairs.find(self.parts, at, to, **limits, slack=self._slack_for(at, to))
         self._served = last
         return self._found

@@ -288,8 +288,7 @@ class FrameContact:
             said |= self._bodies.measure(finest, base, x, view=view.bodies_around(x))
         if view.cloth is not None:
             cloth, crossing = view.cloth.measure(view.closed(base), x)
-            if view.cloth.came_near is None:
-                view.cloth.term(x)
-            near = view.cloth.came_near or any(each["crossings"] for each in cloth.values())
-            said["cloth"] = {"near": near, **cloth}
+            near = view.cloth.came_near
+            near = view.cloth.term(x) is not None if near is None else near
+            said["cloth"] = {"near": near or any(each["crossings"] for each in cloth.values()), **cloth}
         return said, crossing

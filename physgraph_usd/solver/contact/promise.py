@@ -86,10 +86,10 @@ class Promise:
         if not len(met.value):
             return Placed(aim)
         x, late = start, torch.inf
-        for last in range(GOES):
+        for go in range(GOES):
             known = late
             x, late = self._along(x, aim, met, options)
-            if late <= LONG * parts.spacing or late > GAINS * known or last == GOES - 1 or is_over():
+            if late <= LONG * parts.spacing or late > GAINS * known or go == GOES - 1 or is_over():
                 break
             met = in_the_way(x, aim, parts, **options)
         return x
