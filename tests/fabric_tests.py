@@ -5,8 +5,8 @@
 prints the tables of docs/fabrics.md. Pulled strips give Young's modulus along warp and weft, a sheared frame the shear
 stiffness, strips of two bending lengths clamped at one end the bending stiffness, by the heavy elastica. In the drape
 test a disc of 30 cm hangs over one of 18 cm (ISO 9073-9), in triangles of 6 mm or of EDGE metres; the coefficient is
-the shadow's share of the ring between them. A disc comes to rest in several numbers of folds; it is started in some,
-and the one of least energy counts.
+the shadow's share of the ring between them. A disc comes to rest in several numbers of folds, whose energies differ by
+a few percent: it is started in some, and as in a laboratory the mean counts.
 """
 
 from __future__ import annotations
@@ -17,14 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from probes import G, cantilever, hang, plane_stiffness, rigidity_from, tensile_test
+from probes import G, cantilever, clamped, hang, plane_stiffness, rigidity_from, tensile_test
 from sheets import equilateral, level_of
 
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS, Fabric
-from physgraph_usd.solver.forces import elastic_terms
-from physgraph_usd.solver.forces.base import ForceModule
-from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.forces.membrane import in_plane_terms, shear_stiffness
 from physgraph_usd.solver.level import Level
 
@@ -81,19 +78,21 @@ def shadow(points: np.ndarray, triangles: np.ndarray) -> float:
     return float(hidden.sum()) * (2 * reach / PIXELS) ** 2
 
 
-def drape(fabric: Fabric, folds: int, *, edge: float = EDGE) -> tuple[float, float]:
-    """Drape coefficient [%] and energy [J] of a disc that is started in a number of folds."""
-    level, _ = disc(edge)
+def drape(fabric: Fabric, folds: int, *, edge: float = EDGE) -> float:
+    """Drape coefficient [%] of a disc that is started in a number of folds."""
+    level = clamped(disc(edge)[0])
     flat = level.rest.numpy()
     out = np.maximum(np.linalg.norm(flat, axis=1) - INNER, 0.0)
     start = flat.copy()
     start[:, 2] = -3.0 * out**2 + 0.15 * out * np.cos(folds * np.arctan2(flat[:, 1], flat[:, 0]))
     settled = hang(level, start, fabric)
-    weight = Gravity(level, torch.tensor([fabric.density]), np.array([0.0, 0.0, -G]))
-    forces = (*elastic_terms(level, [fabric], potential="continuum"), weight)
-    energy = sum(ForceModule(forces).energies(torch.as_tensor(settled)).values())
     ring = np.pi * (OUTER**2 - INNER**2)
-    return 100.0 * (shadow(settled, level.triangles.numpy()) - np.pi * INNER**2) / ring, energy
+    return 100.0 * (shadow(settled, level.triangles.numpy()) - np.pi * INNER**2) / ring
+
+
+def drapes(fabric: Fabric, *, edge: float = EDGE) -> list[float]:
+    """Drape coefficients [%] from several numbers of folds."""
+    return [drape(fabric, folds, edge=edge) for folds in FOLDS]
 
 
 def turned(fabric: Fabric) -> Fabric:
@@ -123,11 +122,11 @@ def drape_row(name: str, *, edge: float) -> str:
     """A fabric's row of the drape test."""
     fabric, (low, high) = PRESETS[name], BANDS[name]
     length = 100.0 * (fabric.bend / (fabric.density * G)) ** (1 / 3)
-    found = [drape(fabric, folds, edge=edge) for folds in FOLDS]
-    least, every = min(found, key=lambda each: each[1])[0], [each[0] for each in found]
-    verdict = "in the band" if low <= least <= high else "**below**" if least < low else "**above**"
+    every = drapes(fabric, edge=edge)
+    mean = float(np.mean(every))
+    verdict = "in the band" if low <= mean <= high else "**below**" if mean < low else "**above**"
     spread = f"{min(every):.0f} to {max(every):.0f} %"
-    return f"| {name} | {length:.2f} | {least:.0f} % | {spread} | {low} to {high} % | {verdict} |\n"
+    return f"| {name} | {length:.2f} | {mean:.1f} % | {spread} | {low} to {high} % | {verdict} |\n"
 
 
 def main() -> None:

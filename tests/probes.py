@@ -8,7 +8,7 @@ The bending probe does the same with the three uniform curvatures. The strips ar
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -207,7 +207,7 @@ def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int 
     system = System(
         module, Metric(module.rest_matrix(), free=level.free, dtype=level.dtype), free=level.free, spacing=level.spacing
     )
-    for integrator, count in ((QuasiNewton(), steps), (Newton(), 60)):
+    for integrator, count in ((QuasiNewton(), steps), (Newton(), 200)):
         x, _ = solve_level(system, integrator, x, level=0, budget=Budget(count, 1e-7))
     return x
 
@@ -217,6 +217,16 @@ def hang(level: Level, start: np.ndarray, fabric: Fabric) -> np.ndarray:
     weight = Gravity(level, torch.tensor([fabric.density]), np.array([0.0, 0.0, -G]))
     forces = (*elastic_terms(level, [fabric], potential="continuum"), weight)
     return relax(level, forces, torch.as_tensor(start)).numpy()
+
+
+def clamped(level: Level) -> Level:
+    """The level with hinges at its clamp twice as stiff.
+
+    A hinge stands for the halves of two triangles; of one of them the clamp leaves nothing to bend.
+    """
+    held = ~level.free[:, 0][level.hinges.long()]
+    at_clamp = held[:, :2].all(dim=1) & (held[:, 2] ^ held[:, 3])
+    return replace(level, bend_scale=torch.where(at_clamp, 2.0, 1.0) * level.bend_scale)
 
 
 def cantilever(kind: str, length: float, fabric: Fabric, *, edges: int = 24, warp: np.ndarray | None = None) -> float:
@@ -230,7 +240,7 @@ def cantilever(kind: str, length: float, fabric: Fabric, *, edges: int = 24, war
     start, out = points.copy(), np.maximum(points[:, 0], 0.0)
     start[:, 0] = np.minimum(points[:, 0], 0.0) + length * np.sin(out / length)
     start[:, 2] = -length * (1.0 - np.cos(out / length))
-    settled = hang(level, start, fabric)
+    settled = hang(clamped(level), start, fabric)
     tip = settled[points[:, 0] > length * (1 - 1e-3)].mean(axis=0)
     return float(np.arctan2(-tip[2], tip[0]))
 

@@ -163,6 +163,19 @@ def test_float32_agrees_with_float64_and_repeats_bit_for_bit(case: Case):
         assert (g - f).abs().max() < 3e-5 * size
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_hinge_knows_its_angle_all_the_way_round(dtype: torch.dtype):
+    rest = np.array([[0.0, 0.0, 0.0], [0.0, 0.01, 0.0], [0.01, 0.005, 0.0], [-0.01, 0.005, 0.0]])
+    level = level_of(rest, np.array([[0, 2, 1], [0, 1, 3]]), dtype=dtype)
+    bending, eps = Bending(level, torch.tensor([2.0])), float(torch.finfo(dtype).eps)
+    weight = float(bending.weight[0])
+    for angle in np.concatenate([np.linspace(-3.14, 3.14, 315), np.logspace(-4, 0, 20)]):
+        x = torch.as_tensor(rest).clone()
+        x[3, 0], x[3, 2] = -0.01 * np.cos(angle), 0.01 * np.sin(angle)
+        energy, _ = evaluate(bending, x.to(dtype))
+        assert (2.0 * energy / weight) ** 0.5 == pytest.approx(abs(angle), rel=8 * eps, abs=4 * eps)
+
+
 def test_no_elements_have_no_energy():
     level = level_of(np.zeros((3, 3)), np.zeros((0, 3), np.int64))
     for name in INTERNAL:

@@ -50,7 +50,7 @@ def choose(
         return frame_of((1.0 - squeeze) * rest, time, fabric=fabric)
 
     scene = Scene((replace(garment_of(MESH, rest), level=level),), DOWN, times)
-    return choose_levels(scene, sample_frames(scene, frame_at))[0], read
+    return choose_levels(scene, sample_frames(scene.times, frame_at))[0], read
 
 
 @pytest.mark.parametrize("squeeze", [0.02, 0.1, 0.3])

@@ -22,6 +22,7 @@ from stages import (
 )
 
 from physgraph_usd.usd.read.reader import Shot, open_shot
+from physgraph_usd.usd.schema import AUTO_LEVEL
 
 ROOT = "/World/rig"
 JOINTS = [int(x > 2) for x in sheet_points()[:, 0]]
@@ -88,6 +89,11 @@ def test_nothing_after_the_range_is_baked_and_other_meshes_are_not(tmp_path: Pat
     assert cloth.GetTimeSamples() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]  # A run may walk there from any before.
     assert body.GetTimeSamples() == []
     assert shot.stage.GetPrimAtPath(f"{ROOT}/body").IsActive()
+    assert shot.times_to_sample == shot.scene.times
+    shot = open_shot(save(stage), frames=(5.0, 7.0), level=AUTO_LEVEL)  # A level is chosen from all of the shot.
+    assert shot.scene.times == (5.0, 6.0, 7.0)
+    cloth = UsdGeom.Mesh.Get(shot.stage, f"{ROOT}/cloth").GetPointsAttr()
+    assert tuple(cloth.GetTimeSamples()) == shot.times_to_sample == tuple(map(float, range(1, 21)))
 
 
 def test_instanced_roots_are_baked_and_told(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def begin_report(
     Returns:
         What the user should know.
     """
-    first, frames = _first_frame(opened), sample_frames(opened.scene, opened.frame)
+    first, frames = _first_frame(opened), sample_frames(opened.times_to_sample, opened.frame)
     choices = choose_levels(opened.scene, frames)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
     written = "--velocities" if options.velocities else "none"

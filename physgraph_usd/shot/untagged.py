@@ -101,7 +101,7 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     if AUTO not in colliders:
         return open_shot(shot, colliders=colliders, **options)
     with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **options)) as first:
-        beside = bodies_beside(first, sample_frames(first.scene, first.frame))
+        beside = bodies_beside(first, sample_frames(first.scene.times, first.frame))
         named = [*first.colliders, *(each.path for each in beside)]
     return open_shot(shot, colliders=named, **options)
 
@@ -119,7 +119,7 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
     """
     try:
         with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
-            found = bodies_beside(opened, sample_frames(opened.scene, opened.frame))
+            found = bodies_beside(opened, sample_frames(opened.scene.times, opened.frame))
             lying = {path for each in found for path in each.shares}
             garments = [garment.path for garment in opened.scene.garments if garment.path in lying]
             return command_of(opened.path, garments, [each.path for each in found]) if found else ""

@@ -5,10 +5,10 @@ amplitude a and wavenumber k, pays D a^2 k^4 / 4 for bending it and K a^2 / 4 to
 to folds longer than the cage's edges. Two wavelengths follow.
 
 - Settled: a fold takes up a given length, a^2 k^2 constant, so D k^2 + K / k^2 is least: 2 pi (D / K)^(1/4). With the
-  guide of 2,000 N/m^3 that is 44 mm in jersey, 36 in silk, 68 in denim: five edges at one or two subdivisions. And
+  guide of 2,000 N/m^3 that is 44 mm in jersey, 36 in silk, 75 in denim: five edges at one or two subdivisions. And
   folds shorter than the cage's edges feel no guide: they would grow longer still.
 - Beginning: what gains at all has D k^2 < Y e, and waves of 2 pi sqrt(D / (Y e)) and longer grow. At e = 0.1% these
-  have five edges of 6 mm in silk and denim, of 16 mm in jersey; at 1% of 2 and 5 mm.
+  have five edges of 6 mm in silk, 8 in denim, 16 in jersey; at 1% of 2, 2.5 and 5 mm.
 
 The second governs what a mesh shows: a few steps from a cage leave the folds about as they began, and stiff cloth
 (denim) begins in shorter ones than soft (jersey), though settled in 300 steps it has the smoother folds. So D is raised

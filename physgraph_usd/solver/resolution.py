@@ -92,16 +92,16 @@ def finer(level: int, needed: int, edge: float) -> str:
     )
 
 
-def sample_frames(scene: Scene, frame_at: Callable[[float | None], Frame]) -> list[Frame]:
+def sample_frames(times: Sequence[float], frame_at: Callable[[float | None], Frame]) -> list[Frame]:
     """Read a few frames spread over the shot, the first and the last among them; unreadable ones are left out.
 
     Args:
-        scene: The scene.
+        times: Its time codes; of none, the default values are read.
         frame_at: Reads a frame.
     """
-    picks = np.linspace(0, len(scene.times) - 1, min(SAMPLED_FRAMES, len(scene.times))).round().astype(int)
-    times: list[float | None] = [scene.times[i] for i in picks] or [None]
-    return [frame for time in times if (frame := _readable(frame_at, time)) is not None]
+    picks = np.linspace(0, len(times) - 1, min(SAMPLED_FRAMES, len(times))).round().astype(int)
+    picked: list[float | None] = [times[i] for i in picks] or [None]
+    return [frame for time in picked if (frame := _readable(frame_at, time)) is not None]
 
 
 def choose_levels(scene: Scene, frames: Sequence[Frame]) -> list[LevelChoice]:

@@ -101,7 +101,9 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
     """Measure all that is not yet in the folder, and draw what gaps look like."""
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
-    levels = tuple(choice.level for choice in choose_levels(opened.scene, sample_frames(opened.scene, opened.frame)))
+    levels = tuple(
+        choice.level for choice in choose_levels(opened.scene, sample_frames(opened.times_to_sample, opened.frame))
+    )
 
     def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:
         threads = min(MOST_THREADS, os.cpu_count() or 1) if options.clock == "wall" else 1

@@ -35,13 +35,41 @@ from ..grain import bending_factor
 from ..level import Level
 from ..mesh.stencil import add_at
 from ..mesh.threads import argument
-from .base import Elements, element_overloads
+from .base import FUSED, Elements, element_overloads
 from .stretch import garment_area
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(FUSED)
 
 PAPER_HINGE = 3.46
 """The paper's k_b over D: both in N m."""
+
+
+@wp.func
+def _angle(y: wp.float32, x: wp.float32) -> wp.float32:
+    """The angle of (x, y) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1].
+
+    It takes less than half of the time of the C library's function.
+    """
+    along = wp.abs(x)
+    across = wp.abs(y)
+    a = wp.min(along, across) / wp.max(wp.max(along, across), wp.float32(1.0e-37))
+    s = a * a
+    p = wp.float32(0.023040125) - wp.float32(0.0043554027) * s
+    p = wp.float32(-0.057773575) + p * s
+    p = wp.float32(0.09794234) + p * s
+    p = wp.float32(-0.13976581) + p * s
+    p = wp.float32(0.19962704) + p * s
+    p = wp.float32(-0.3333166) + p * s
+    angle = a + a * s * p
+    angle = wp.where(across > along, wp.float32(math.pi / 2.0) - angle, angle)
+    angle = wp.where(x < wp.float32(0.0), wp.float32(math.pi) - angle, angle)
+    return wp.where(y < wp.float32(0.0), -angle, angle)
+
+
+@wp.func
+def _angle(y: wp.float64, x: wp.float64) -> wp.float64:
+    """The angle of (x, y) [rad]."""
+    return wp.atan2(y, x)
 
 
 @wp.kernel
@@ -56,10 +84,11 @@ def _bending(
 ):
     h = first + wp.tid()
     one = weight.dtype(1.0)
-    xi = x[corners[h][0]]
-    axis = x[corners[h][1]] - xi
-    ik = x[corners[h][2]] - xi
-    il = x[corners[h][3]] - xi
+    corner = corners[h]
+    xi = x[corner[0]]
+    axis = x[corner[1]] - xi
+    ik = x[corner[2]] - xi
+    il = x[corner[3]] - xi
     n1 = wp.cross(axis, ik)
     n2 = wp.cross(il, axis)
     square = wp.dot(axis, axis)
@@ -71,7 +100,7 @@ def _bending(
     s1 = wp.max(wp.dot(n1, n1), floor)
     s2 = wp.max(wp.dot(n2, n2), floor)
     # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
-    theta = wp.atan2(-length * wp.dot(n1, il), wp.dot(n1, n2))
+    theta = _angle(-length * wp.dot(n1, il), wp.dot(n1, n2))
     half_turn = weight.dtype(math.pi)
     bent = theta - rest_angle[h]
     if bent > half_turn:
@@ -82,8 +111,9 @@ def _bending(
     moment = weight[h] * bent * length
     at_k = n1 * (moment / s1)
     at_l = n2 * (moment / s2)
-    t1 = wp.dot(ik, axis) / square
-    t2 = wp.dot(il, axis) / square
+    per_square = one / square
+    t1 = wp.dot(ik, axis) * per_square
+    t2 = wp.dot(il, axis) * per_square
     corner_force[4 * h] = -(at_k * (one - t1) + at_l * (one - t2))
     corner_force[4 * h + 1] = -(at_k * t1 + at_l * t2)
     corner_force[4 * h + 2] = at_k

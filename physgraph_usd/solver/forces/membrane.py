@@ -42,10 +42,10 @@ from torch import Tensor
 from ..fabric import Fabric
 from ..level import Level
 from ..mesh.stencil import add_at
-from .base import Elements, Force, element_overloads
+from .base import FUSED, Elements, Force, element_overloads
 from .stretch import Stretch, garment_area
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(FUSED)
 
 POISSON = 1.0 / 3.0
 """Poisson's ratio between warp and weft; edge springs have the same."""
@@ -66,14 +66,8 @@ def _membrane(
     first: wp.int32,
     x: wp.array(dtype=Any),
     corners: wp.array(dtype=wp.vec3i),
-    a: wp.array(dtype=Any),
-    b: wp.array(dtype=Any),
-    c: wp.array(dtype=Any),
-    d: wp.array(dtype=Any),
-    warp_stiffness: wp.array(dtype=Any),
-    weft_stiffness: wp.array(dtype=Any),
-    coupling: wp.array(dtype=Any),
-    shear_stiffness: wp.array(dtype=Any),
+    inverse: wp.array(dtype=Any),
+    stiffness: wp.array(dtype=Any),
     limit: wp.array(dtype=Any),
     energy: wp.array(dtype=Any),
     corner_force: wp.array(dtype=Any),
@@ -81,45 +75,57 @@ def _membrane(
     t = first + wp.tid()
     half = limit.dtype(0.5)
     one = limit.dtype(1.0)
-    x0 = x[corners[t][0]]
-    side1 = x[corners[t][1]] - x0
-    side2 = x[corners[t][2]] - x0
-    f1 = side1 * a[t] + side2 * c[t]
-    f2 = side1 * b[t] + side2 * d[t]
-    l1 = wp.length(f1)
-    l2 = wp.length(f2)
+    tiny = limit.dtype(1.0e-6)
+    corner = corners[t]
+    x0 = x[corner[0]]
+    side1 = x[corner[1]] - x0
+    side2 = x[corner[2]] - x0
+    g = inverse[t]
+    c = stiffness[t]
+    f1 = side1 * g[0] + side2 * g[2]
+    f2 = side1 * g[1] + side2 * g[3]
+    q1 = wp.dot(f1, f1)
+    q2 = wp.dot(f2, f2)
+    l1 = wp.sqrt(q1)
+    l2 = wp.sqrt(q2)
     e1 = l1 - one
     e2 = l2 - one
     # The stiffnesses carry the rest area: s is stress times area.
-    s1 = warp_stiffness[t] * e1 + coupling[t] * e2
-    s2 = weft_stiffness[t] * e2 + coupling[t] * e1
+    s1 = c[0] * e1 + c[2] * e2
+    s2 = c[1] * e2 + c[2] * e1
+    stored = s1 * e1 + s2 * e2
     # Beyond its limit the cloth is stiffer.
-    over1 = wp.max(e1 - limit[t], limit.dtype(0.0))
-    over2 = wp.max(e2 - limit[t], limit.dtype(0.0))
-    more1 = limit.dtype(STIFFER) * warp_stiffness[t] * over1
-    more2 = limit.dtype(STIFFER) * weft_stiffness[t] * over2
+    over = limit[t]
+    over1 = e1 - over
+    over2 = e2 - over
+    if over1 > limit.dtype(0.0):
+        more1 = limit.dtype(STIFFER) * c[0] * over1
+        stored += more1 * over1
+        s1 += more1
+    if over2 > limit.dtype(0.0):
+        more2 = limit.dtype(STIFFER) * c[1] * over2
+        stored += more2 * over2
+        s2 += more2
     # Shear by the angle between them; directions fade where one vanishes.
     rounding = limit.dtype(ROUNDING) * limit.dtype(ROUNDING)
-    inverse1 = one / wp.sqrt(l1 * l1 + rounding)
-    inverse2 = one / wp.sqrt(l2 * l2 + rounding)
-    u1 = f1 * inverse1
-    u2 = f2 * inverse2
-    sine = wp.dot(u1, u2)
-    s12 = shear_stiffness[t] * (one + rounding) * (one + rounding) * sine
-    energy[t] = half * (s1 * e1 + s2 * e2 + s12 * sine + more1 * over1 + more2 * over2)
-    tiny = limit.dtype(1.0e-6)
-    turn1 = s12 * inverse1
-    turn2 = s12 * inverse2
-    p1 = f1 * ((s1 + more1) / wp.max(l1, tiny) - sine * inverse1 * turn1) + u2 * turn1
-    p2 = f2 * ((s2 + more2) / wp.max(l2, tiny) - sine * inverse2 * turn2) + u1 * turn2
-    at1 = -(p1 * a[t] + p2 * b[t])
-    at2 = -(p1 * c[t] + p2 * d[t])
+    n1 = q1 + rounding
+    n2 = q2 + rounding
+    r = one / wp.sqrt(n1 * n2)
+    sine = wp.dot(f1, f2) * r
+    s12 = c[3] * (one + rounding) * (one + rounding) * sine
+    turn = s12 * r
+    back = sine * turn * r
+    energy[t] = half * (stored + s12 * sine)
+    p1 = f1 * (s1 / wp.max(l1, tiny) - back * n2) + f2 * turn
+    p2 = f2 * (s2 / wp.max(l2, tiny) - back * n1) + f1 * turn
+    at1 = -(p1 * g[0] + p2 * g[1])
+    at2 = -(p1 * g[2] + p2 * g[3])
     corner_force[3 * t] = -(at1 + at2)
     corner_force[3 * t + 1] = at1
     corner_force[3 * t + 2] = at2
 
 
-_KERNELS = element_overloads(_membrane, width=3, parameters=9)
+_KERNELS = element_overloads(_membrane, width=3, parameters=1, quad_parameters=2)
 
 
 class Membrane:
@@ -167,9 +173,8 @@ class Membrane:
         self.shear_stiffness = weight * shear.to(level.rest)[owner]
         limits = torch.full_like(youngs, NO_LIMIT) if limit is None else limit
         self._level = level
-        parameters = [column.contiguous() for column in level.triangle_inverse.T]
-        parameters += [self.warp_stiffness, self.weft_stiffness, self.coupling, self.shear_stiffness]
-        parameters.append(limits.to(level.rest)[owner])
+        stiffness = torch.stack(self._stiffnesses, dim=1)
+        parameters = [level.triangle_inverse.contiguous(), stiffness, limits.to(level.rest)[owner]]
         self._elements = Elements(_KERNELS, level.triangles, parameters, level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:

@@ -124,7 +124,7 @@ def solve_one_level(
         blocked = x is not wanted
         if _is_last(report, blocked=blocked) or (smoothing is None and _is_near(report, budget, made)):
             break
-        if carry.setbacks >= PATIENCE:
+        if carry.setbacks >= PATIENCE or (smoothing is None and _went_up(reports)):
             integrator, budget, carry = problem.untangler, problem.budget, None
         elif blocked:  # Corrections of the guard were made for other positions.
             carry = None if carry.setbacks else replace(carry, x=x)
@@ -168,6 +168,11 @@ def _most_steps(budget: Budget, report: LevelReport, *, touched: bool) -> int:
     """How many steps a level makes, by its last round's report: more where something touches or it is far from rest."""
     most = budget.steps + budget.extra * budget.is_far(report.remaining_move)
     return max(most, min(MOST, TOUCHING * budget.steps)) if touched else most
+
+
+def _went_up(reports: list[LevelReport]) -> bool:
+    """Whether the last round began at a higher energy than the one before: that went into what it did not see."""
+    return len(reports) > 1 and reports[-1].energy_before > reports[-2].energy_before
 
 
 def _is_last(report: LevelReport, *, blocked: bool) -> bool:

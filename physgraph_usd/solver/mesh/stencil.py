@@ -37,6 +37,8 @@ def _gather_rows(
 
 VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
 """Warp's 3-vector for each torch scalar type."""
+QUAD = {torch.float32: wp.vec4f, torch.float64: wp.vec4d}
+"""Warp's 4-vector for each torch scalar type."""
 SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64}
 """Warp's scalar for each torch scalar type."""
 
@@ -59,10 +61,11 @@ _GATHER = overloads(_gather_rows, wp.int32, wp.int32, SCALAR, VECTOR, VECTOR)
 
 
 def vectors(tensor: Tensor) -> Any:
-    """A kernel's view of a contiguous (N, 3) tensor as N vectors, without a copy."""
+    """A kernel's view of a contiguous (N, 3) or (N, 4) tensor as N vectors, without a copy."""
+    kind = (VECTOR if tensor.shape[1] == 3 else QUAD)[tensor.dtype]
     if not len(tensor):  # Empty tensors keep strides that Warp refuses.
-        return wp.empty(0, dtype=VECTOR[tensor.dtype], device=str(tensor.device))
-    return argument(tensor, VECTOR[tensor.dtype])
+        return wp.empty(0, dtype=kind, device=str(tensor.device))
+    return argument(tensor, kind)
 
 
 def add_at(total: Tensor, places: Int[Tensor, " items"], values: Tensor) -> Tensor:

@@ -21,9 +21,9 @@ from pxr import Sdf, Usd
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
-from ..lookup import check_limits, check_overrides, is_on, parse_overrides
+from ..lookup import check_limits, check_overrides, find_value, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
-from ..schema import GARMENT
+from ..schema import AUTO_LEVEL, GARMENT
 from ..stage import (
     GarmentSource,
     Notice,
@@ -105,8 +105,20 @@ class Shot:
 
     def times_until(self, last: float) -> list[float]:
         """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
-        every = merge(time for source in self.sources for time in (*source.times, *source.left_out))
-        return [time for time in every if time < last] + [last]
+        return [time for time in self._every_time() if time < last] + [last]
+
+    @property
+    def times_to_sample(self) -> tuple[float, ...]:
+        """Time codes of which a few are looked at before a run: its own, or all where a level is chosen by the folds.
+
+        A shot has one level, whatever part of it is refined.
+        """
+        is_auto = any(garment.level == AUTO_LEVEL for garment in self.scene.garments)
+        return self._every_time() if is_auto else self.scene.times
+
+    def _every_time(self) -> tuple[float, ...]:
+        """Time codes at which any garment has a sample, outside the range of frames too."""
+        return merge(time for source in self.sources for time in (*source.times, *source.left_out))
 
     def frame(self, time: float | None) -> Frame:
         """Read one time code; None reads the default values.
@@ -302,7 +314,8 @@ def _read(
     notices += [_left_out(prim, "is disabled") for prim in prims if prim not in on]
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in on}
     # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
-    frames = None if request.frames is None or request.rest_frame is not None else (-math.inf, request.frames[1])
+    all_of_it = request.frames is None or request.rest_frame is not None or any(_is_auto(prim, request) for prim in on)
+    frames = None if all_of_it else (-math.inf, request.frames[1])
     notices += request.bake.add([*roots], frames, bodies=bodies)
     readers, every = [], []
     for path, instances in roots.items():
@@ -323,6 +336,12 @@ def _read(
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")
     return readers
+
+
+def _is_auto(prim: Usd.Prim, request: Request) -> bool:
+    """Whether a garment's level is chosen by its folds."""
+    asked, row = request.level, GARMENT["refine:level"]
+    return (find_value(prim, row, request.overrides).at(None) if asked is None else asked) == AUTO_LEVEL
 
 
 def _left_out(prim: Usd.Prim, why: str) -> Notice:
