@@ -16,7 +16,6 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import torch
 from probes import G, cantilever, clamped, hang, plane_stiffness, rigidity_from, tensile_test
 from sheets import equilateral, level_of
 

@@ -40,6 +40,11 @@ def test_s38_a_fabric_drapes_as_published_on_any_mesh(name: str):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_s38_strips_and_frames_of_a_fabric_show_its_stiffnesses(name: str):
-    """Bending within a twentieth of what a strip with free sides shows: the mesh's strip is 24 edges long."""
-    for which, (shown, given) in measured(PRESETS[name]).items():
-        assert shown == pytest.approx(given, rel=0.05 if which.startswith("bend") else 0.02), which
+    """Bending within a twentieth of what a strip with free sides shows, which is 24 edges long.
+
+    Where warp and weft differ, a regular lattice is off by up to a quarter of the difference (`grain.bending_factor`).
+    """
+    fabric = PRESETS[name]
+    bend = 0.05 if fabric.weft_bend is None else 0.05 + 0.25 * abs(1.0 - fabric.weft_bend / fabric.bend)
+    for which, (shown, given) in measured(fabric).items():
+        assert shown == pytest.approx(given, rel=bend if which.startswith("bend") else 0.02), which
