@@ -206,6 +206,28 @@ def test_cloth_that_comes_near_after_the_first_steps(tmp_path: Path) -> None:
     assert all(np.isfinite(points).all() for points in points_of(out).values())
 
 
+def test_creases_agree_and_repeat(tmp_path: Path) -> None:
+    """Three frames of the sleeve, in which hinges come to rest where they are bent."""
+    stage, points = write_sample("sleeve", tmp_path), dict[str, np.ndarray]()
+    for name, device, crease in (
+        ("cpu", "cpu", 0.2),
+        ("off", "cpu", 0.0),
+        ("cuda", "cuda", 0.2),
+        ("again", "cuda", 0.2),
+    ):
+        out = tmp_path / f"{name}.usda"
+        options = ["--device", device, "--frames", "20:22", "--level", "1", "--steps", "40"]
+        options += ["--set", f"physgraph:rest:creaseTime={crease}", "--integrator", "quasi-newton"]
+        result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(out), *options])
+        assert result.exit_code == 0, result.output
+        (points[name],) = points_of(out).values()
+    assert points["cuda"].tobytes() == points["again"].tobytes()
+    size = np.ptp(points["cpu"], axis=(0, 1)).max()
+    moved, apart = (np.linalg.norm(points[each][-1] - points["cpu"][-1], axis=-1) for each in ("off", "cuda"))
+    assert np.median(apart) < 2e-3 * size
+    assert np.median(apart) < 0.5 * np.median(moved)
+
+
 def points_of(layer: Path) -> dict[str, np.ndarray]:
     """Points of every mesh at every time sample, by path."""
     stage = Usd.Stage.Open(str(layer))
