@@ -12,7 +12,7 @@ import torch
 import trimesh
 from click.testing import CliRunner
 from cloth import frame_of, settings_of, sheet, wave
-from pxr import Usd, UsdGeom
+from pxr import Usd
 from sheets import garment_of
 
 from physgraph_usd.cli import main
@@ -229,11 +229,12 @@ def test_creases_agree_and_repeat(tmp_path: Path) -> None:
 
 
 def points_of(layer: Path) -> dict[str, np.ndarray]:
-    """Points of every mesh at every time sample, by path."""
+    """Points at every time sample of all that the layer has some of, by path; it holds overs alone."""
     stage = Usd.Stage.Open(str(layer))
     found = {}
-    for prim in stage.Traverse():
-        mesh = UsdGeom.Mesh(prim)
-        if mesh and (times := mesh.GetPointsAttr().GetTimeSamples()):
-            found[str(prim.GetPath())] = np.array([mesh.GetPointsAttr().Get(t) for t in times], dtype=np.float64)
+    for prim in stage.TraverseAll():
+        points = prim.GetAttribute("points")
+        if points and (times := points.GetTimeSamples()):
+            found[str(prim.GetPath())] = np.array([points.Get(t) for t in times], dtype=np.float64)
+    assert found
     return found
