@@ -33,6 +33,8 @@ from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import GarmentFrame
 
 EDGE = 0.02
+ALIKE = {"layers": 8e-3}
+"""Median distance of two answers over the size of a sample whose layers, pressed together, have not come to rest."""
 
 pytestmark = [
     pytest.mark.gpu,
@@ -127,7 +129,8 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     garments, frames = [garment_of(mesh, points)], frame_of(points * [0.95, 0.9, 1.0]).garments
     chains, down, answers = refine_garments(garments, [4]), np.array([0.0, -9.81, 0.0]), []
     for device in ("cpu", "cuda", "cuda"):
-        one = Group.of(garments, chains, down, settings_of(steps=60), dtype=torch.float32, device=device)
+        settings = settings_of(steps=60, tolerance=1e-6)
+        one = Group.of(garments, chains, down, settings, dtype=torch.float32, device=device)
         answers.append(solve_frame(one, FrameInput(frames), None))
     assert not any(crossing.any() for answer in answers for crossing in answer.crossing)
     assert np.abs(answers[1].points[0] - answers[0].points[0]).max() < 1e-3 * 0.05
@@ -181,7 +184,7 @@ def test_samples_are_refined_alike(tmp_path: Path, sample: str, integrator: str)
     for path, found in points["cuda"].items():
         assert found.tobytes() == points["again"][path].tobytes()
         size = np.ptp(points["cpu"][path], axis=(0, 1)).max()
-        assert np.median(np.linalg.norm(found - points["cpu"][path], axis=-1)) < 2e-3 * size
+        assert np.median(np.linalg.norm(found - points["cpu"][path], axis=-1)) < ALIKE.get(sample, 2e-3) * size
 
 
 def test_a_recording_keeps_what_it_writes_to() -> None:
@@ -216,7 +219,7 @@ def test_creases_agree_and_repeat(tmp_path: Path) -> None:
         ("again", "cuda", 0.2),
     ):
         out = tmp_path / f"{name}.usda"
-        options = ["--device", device, "--frames", "20:22", "--level", "1", "--steps", "40"]
+        options = ["--device", device, "--frames", "20:22", "--level", "1", "--steps", "300", "--tolerance", "1e-5"]
         options += ["--set", f"physgraph:rest:creaseTime={crease}", "--integrator", "quasi-newton"]
         result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(out), *options])
         assert result.exit_code == 0, result.output

@@ -61,6 +61,12 @@ NO_LIMIT = 1e9
 """A strain that nothing reaches."""
 
 
+@wp.func
+def _beyond(limit: Any, strain: Any, stiffness: Any):
+    """The stress by which cloth is stiffer beyond its limit, times the rest area [N m]."""
+    return type(strain)(STIFFER) * stiffness * wp.max(strain - limit, type(strain)(0.0))
+
+
 @wp.kernel
 def _membrane(
     first: wp.int32,
@@ -73,17 +79,13 @@ def _membrane(
     corner_force: wp.array(dtype=Any),
 ):
     t = first + wp.tid()
-    half = limit.dtype(0.5)
     one = limit.dtype(1.0)
-    tiny = limit.dtype(1.0e-6)
     corner = corners[t]
     x0 = x[corner[0]]
-    side1 = x[corner[1]] - x0
-    side2 = x[corner[2]] - x0
     g = inverse[t]
     c = stiffness[t]
-    f1 = side1 * g[0] + side2 * g[2]
-    f2 = side1 * g[1] + side2 * g[3]
+    f1 = (x[corner[1]] - x0) * g[0] + (x[corner[2]] - x0) * g[2]
+    f2 = (x[corner[1]] - x0) * g[1] + (x[corner[2]] - x0) * g[3]
     q1 = wp.dot(f1, f1)
     q2 = wp.dot(f2, f2)
     l1 = wp.sqrt(q1)
@@ -93,36 +95,24 @@ def _membrane(
     # The stiffnesses carry the rest area: s is stress times area.
     s1 = c[0] * e1 + c[2] * e2
     s2 = c[1] * e2 + c[2] * e1
-    stored = s1 * e1 + s2 * e2
-    # Beyond its limit the cloth is stiffer.
-    over = limit[t]
-    over1 = e1 - over
-    over2 = e2 - over
-    if over1 > limit.dtype(0.0):
-        more1 = limit.dtype(STIFFER) * c[0] * over1
-        stored += more1 * over1
-        s1 += more1
-    if over2 > limit.dtype(0.0):
-        more2 = limit.dtype(STIFFER) * c[1] * over2
-        stored += more2 * over2
-        s2 += more2
+    more1 = _beyond(limit[t], e1, c[0])
+    more2 = _beyond(limit[t], e2, c[1])
+    stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit[t]) + more2 * (e2 - limit[t])
     # Shear by the angle between them; directions fade where one vanishes.
     rounding = limit.dtype(ROUNDING) * limit.dtype(ROUNDING)
     n1 = q1 + rounding
     n2 = q2 + rounding
     r = one / wp.sqrt(n1 * n2)
     sine = wp.dot(f1, f2) * r
-    s12 = c[3] * (one + rounding) * (one + rounding) * sine
-    turn = s12 * r
+    turn = c[3] * (one + rounding) * (one + rounding) * sine * r
+    energy[t] = limit.dtype(0.5) * (stored + turn * wp.dot(f1, f2))
     back = sine * turn * r
-    energy[t] = half * (stored + s12 * sine)
-    p1 = f1 * (s1 / wp.max(l1, tiny) - back * n2) + f2 * turn
-    p2 = f2 * (s2 / wp.max(l2, tiny) - back * n1) + f1 * turn
-    at1 = -(p1 * g[0] + p2 * g[1])
-    at2 = -(p1 * g[2] + p2 * g[3])
-    corner_force[3 * t] = -(at1 + at2)
-    corner_force[3 * t + 1] = at1
-    corner_force[3 * t + 2] = at2
+    tiny = limit.dtype(1.0e-6)
+    p1 = f1 * ((s1 + more1) / wp.max(l1, tiny) - back * n2) + f2 * turn
+    p2 = f2 * ((s2 + more2) / wp.max(l2, tiny) - back * n1) + f1 * turn
+    corner_force[3 * t + 1] = -(p1 * g[0] + p2 * g[1])
+    corner_force[3 * t + 2] = -(p1 * g[2] + p2 * g[3])
+    corner_force[3 * t] = p1 * (g[0] + g[2]) + p2 * (g[1] + g[3])
 
 
 _KERNELS = element_overloads(_membrane, width=3, parameters=1, quad_parameters=2)

@@ -124,7 +124,8 @@ def solve_one_level(
         blocked = x is not wanted
         if _is_last(report, blocked=blocked) or (smoothing is None and _is_near(report, budget, made)):
             break
-        if carry.setbacks >= PATIENCE or (smoothing is None and _went_up(reports)):
+        other = integrator.name != problem.untangler.name
+        if carry.setbacks >= PATIENCE or (other and smoothing is None and _went_up(reports)):
             integrator, budget, carry = problem.untangler, problem.budget, None
         elif blocked:  # Corrections of the guard were made for other positions.
             carry = None if carry.setbacks else replace(carry, x=x)
