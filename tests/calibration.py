@@ -28,6 +28,7 @@ from probes import (
 )
 from sheets import KINDS, level_of_kind
 
+from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces.membrane import in_plane_terms
 
@@ -158,14 +159,16 @@ columns are a strip pulled along x with its long sides free.
 - On irregular triangles springs are a little soft: the mesh relaxes into its irregularities.
 - **One-way diagonals** cannot be isotropic with three directions of springs: Y is a third along the diagonal's normal.
   Author the quads as quads, or a shear stiffness.
-- **The membrane** is exact on every mesh. With G other than 0.375 Y the cloth is not isotropic: Y is as asked for along
+- **The membrane** is exact but for capped slivers of irregular triangles. With G other than 0.375 Y the cloth is not
+  isotropic: Y is as asked for along
   warp and weft, softer on the bias, as in woven cloth. That range is the same on every mesh.
 
 ## Bending
 
 The rim takes a uniform curvature, the inside relaxes; D in units of the D asked for. Then the sheet is rolled onto a
 cylinder of ten edges' radius with every vertex held on it. Then a strip is clamped at one end and hangs under its own
-weight: two bending lengths (D / density g)^(1/3) long, 24 edges, a third as wide. Its chord's angle is compared
+weight: two bending lengths (D / density g)^(1/3) long, 24 edges, a third as wide, hinges at the clamp twice as stiff,
+for it leaves one of their triangles to bend. Its chord's angle is compared
 with the heavy elastica, {narrow:.1f} degrees for a strip with free sides whose stiffness is D (1 - nu^2) with nu = 1/3,
 and {wide:.1f} degrees for D. The last column is
 the D with which the elastica would hang at the angle found.
@@ -198,4 +201,5 @@ def page() -> str:
 
 
 if __name__ == "__main__":
+    prepare_device("cpu")
     Path(sys.argv[1]).write_text(page(), encoding="utf-8")

@@ -42,17 +42,27 @@ wp.set_module_options(FUSED)
 
 PAPER_HINGE = 3.46
 """The paper's k_b over D: both in N m."""
+TURN = 2.0 * math.pi
+"""A full turn [rad]."""
+PER_TURN = 1.0 / TURN
+
+
+@wp.func
+def _larger(a: Any, b: Any):
+    """The larger of two numbers; that of Warp takes five instructions, for numbers that are none."""
+    return wp.where(a > b, a, b)
 
 
 @wp.func
 def _angle(y: wp.float32, x: wp.float32) -> wp.float32:
-    """The angle of (x, y) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1].
+    """The angle of (x, y) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1], without a branch.
 
-    It takes less than half of the time of the C library's function.
+    The C library's takes as long where angles are alike, and twice as long where they are not.
     """
     along = wp.abs(x)
     across = wp.abs(y)
-    a = wp.min(along, across) / wp.max(wp.max(along, across), wp.float32(1.0e-37))
+    steep = across > along
+    a = wp.where(steep, along, across) / (wp.where(steep, across, along) + wp.float32(1.0e-37))
     s = a * a
     p = wp.float32(0.023040125) - wp.float32(0.0043554027) * s
     p = wp.float32(-0.057773575) + p * s
@@ -61,7 +71,7 @@ def _angle(y: wp.float32, x: wp.float32) -> wp.float32:
     p = wp.float32(0.19962704) + p * s
     p = wp.float32(-0.3333166) + p * s
     angle = a + a * s * p
-    angle = wp.where(across > along, wp.float32(math.pi / 2.0) - angle, angle)
+    angle = wp.where(steep, wp.float32(math.pi / 2.0) - angle, angle)
     angle = wp.where(x < wp.float32(0.0), wp.float32(math.pi) - angle, angle)
     return wp.where(y < wp.float32(0.0), -angle, angle)
 
@@ -94,28 +104,23 @@ def _bending(
     square = wp.dot(axis, axis)
     # The floors are relative to the hinge's own size: they act on collapsed triangles only.
     tiny = weight.dtype(1.0e-12) * (square + wp.dot(ik, ik) + wp.dot(il, il))
-    square = wp.max(square, tiny + weight.dtype(1.0e-30))
+    square = _larger(square, tiny + weight.dtype(1.0e-30))
     length = wp.sqrt(square)  # pyright: ignore[reportArgumentType]
     floor = tiny * square + weight.dtype(1.0e-37)
-    s1 = wp.max(wp.dot(n1, n1), floor)
-    s2 = wp.max(wp.dot(n2, n2), floor)
+    s1 = _larger(wp.dot(n1, n1), floor)
+    s2 = _larger(wp.dot(n2, n2), floor)
     # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
     theta = _angle(-length * wp.dot(n1, il), wp.dot(n1, n2))
-    half_turn = weight.dtype(math.pi)
     bent = theta - rest_angle[h]
-    if bent > half_turn:
-        bent = bent - half_turn - half_turn
-    if bent < -half_turn:
-        bent = bent + half_turn + half_turn
+    bent = bent - weight.dtype(TURN) * wp.rint(bent * weight.dtype(PER_TURN))
     energy[h] = weight.dtype(0.5) * weight[h] * bent * bent
     moment = weight[h] * bent * length
     at_k = n1 * (moment / s1)
     at_l = n2 * (moment / s2)
     per_square = one / square
-    t1 = wp.dot(ik, axis) * per_square
-    t2 = wp.dot(il, axis) * per_square
-    corner_force[4 * h] = -(at_k * (one - t1) + at_l * (one - t2))
-    corner_force[4 * h + 1] = -(at_k * t1 + at_l * t2)
+    at_j = at_k * (wp.dot(ik, axis) * per_square) + at_l * (wp.dot(il, axis) * per_square)
+    corner_force[4 * h] = at_j - at_k - at_l
+    corner_force[4 * h + 1] = -at_j
     corner_force[4 * h + 2] = at_k
     corner_force[4 * h + 3] = at_l
 

@@ -64,7 +64,7 @@ NO_LIMIT = 1e9
 @wp.func
 def _beyond(limit: Any, strain: Any, stiffness: Any):
     """The stress by which cloth is stiffer beyond its limit, times the rest area [N m]."""
-    return type(strain)(STIFFER) * stiffness * wp.max(strain - limit, type(strain)(0.0))
+    return wp.where(strain > limit, type(strain)(STIFFER) * stiffness * (strain - limit), type(strain)(0.0))
 
 
 @wp.kernel
@@ -80,12 +80,15 @@ def _membrane(
 ):
     t = first + wp.tid()
     one = limit.dtype(1.0)
+    tiny = limit.dtype(1.0e-6)
     corner = corners[t]
     x0 = x[corner[0]]
     g = inverse[t]
     c = stiffness[t]
-    f1 = (x[corner[1]] - x0) * g[0] + (x[corner[2]] - x0) * g[2]
-    f2 = (x[corner[1]] - x0) * g[1] + (x[corner[2]] - x0) * g[3]
+    side1 = x[corner[1]] - x0
+    side2 = x[corner[2]] - x0
+    f1 = side1 * g[0] + side2 * g[2]
+    f2 = side1 * g[1] + side2 * g[3]
     q1 = wp.dot(f1, f1)
     q2 = wp.dot(f2, f2)
     l1 = wp.sqrt(q1)
@@ -107,12 +110,13 @@ def _membrane(
     turn = c[3] * (one + rounding) * (one + rounding) * sine * r
     energy[t] = limit.dtype(0.5) * (stored + turn * wp.dot(f1, f2))
     back = sine * turn * r
-    tiny = limit.dtype(1.0e-6)
-    p1 = f1 * ((s1 + more1) / wp.max(l1, tiny) - back * n2) + f2 * turn
-    p2 = f2 * ((s2 + more2) / wp.max(l2, tiny) - back * n1) + f1 * turn
-    corner_force[3 * t + 1] = -(p1 * g[0] + p2 * g[1])
-    corner_force[3 * t + 2] = -(p1 * g[2] + p2 * g[3])
-    corner_force[3 * t] = p1 * (g[0] + g[2]) + p2 * (g[1] + g[3])
+    p1 = f1 * ((s1 + more1) / wp.where(l1 > tiny, l1, tiny) - back * n2) + f2 * turn
+    p2 = f2 * ((s2 + more2) / wp.where(l2 > tiny, l2, tiny) - back * n1) + f1 * turn
+    at1 = -(p1 * g[0] + p2 * g[1])
+    at2 = -(p1 * g[2] + p2 * g[3])
+    corner_force[3 * t] = -(at1 + at2)
+    corner_force[3 * t + 1] = at1
+    corner_force[3 * t + 2] = at2
 
 
 _KERNELS = element_overloads(_membrane, width=3, parameters=1, quad_parameters=2)
