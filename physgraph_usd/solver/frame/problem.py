@@ -31,7 +31,7 @@ CROWDED = 0.1
 """Fraction of the vertices with cloth near them from which a cold frame goes through the levels."""
 FEWER = 1.0 / 3.0
 """Part of the steps that the network makes of a warm frame where something touches, if they bring it near rest: one
-round. Over 20 shots and levels warm frames take 0.74 of the time so and end a tenth higher."""
+round."""
 CAUGHT = 3.0
 """Strain of an edge from which cloth is caught, of one shorter than the mean in mean edges: no fabric stretches to four
 times its length."""
