@@ -54,7 +54,7 @@ def _larger(a: Any, b: Any):
 
 
 @wp.func
-def _angle(y: wp.float32, x: wp.float32) -> wp.float32:
+def _angle(y: wp.float32, x: wp.float32) -> wp.float32:  # pyright: ignore[reportRedeclaration]
     """The angle of (x, y) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1], without a branch.
 
     The C library's takes as long where angles are alike, and twice as long where they are not.

@@ -314,8 +314,8 @@ def _read(
     notices += [_left_out(prim, "is disabled") for prim in prims if prim not in on]
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in on}
     # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
-    all_of_it = request.frames is None or request.rest_frame is not None or any(_is_auto(prim, request) for prim in on)
-    frames = None if all_of_it else (-math.inf, request.frames[1])
+    whole = request.rest_frame is not None or any(_is_auto(prim, request) for prim in on)
+    frames = None if request.frames is None or whole else (-math.inf, request.frames[1])
     notices += request.bake.add([*roots], frames, bodies=bodies)
     readers, every = [], []
     for path, instances in roots.items():
