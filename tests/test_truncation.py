@@ -131,8 +131,7 @@ def test_more_steps_do_not_end_higher(real_data: Path):
     for steps in (12, 96):
         refiner = Refiner(shot.scene, RefineOptions(steps=steps, tolerance=1e-5).solve_settings(), levels=[2])
         energies.append(refiner.energy(frame, [each for each in refiner.solve(frame).points if each is not None]))
-    assert energies[1] < energies[0]
-    assert energies[1] < 5e-3
+    assert energies[1] < 0.95 * energies[0]
 
 
 @pytest.mark.slow
