@@ -27,5 +27,6 @@ def test_an_elbow_that_is_straight_again_shows_where_it_was_bent():
     assert np.diff(held).max() < 0.01 * held[0]
     assert np.sqrt((creased.jumps**2).mean()) < 1.1 * np.sqrt((plain.jumps**2).mean())
     assert creased.jumps[STRAIGHT + 1 :].max() < 0.05e-3
+    assert creased.joules.max() < 1.1 * plain.joules.max()
     assert creased.joules[:STRAIGHT].mean() < 1.05 * plain.joules[:STRAIGHT].mean()
     assert creased.joules[MOVES + HELD] < plain.joules[MOVES + HELD]

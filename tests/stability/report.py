@@ -69,7 +69,7 @@ CASES = (
     Case(9, "levels 0 to 3", "gap under 10 % in 200 steps", solver.s9_resolution),
     Case(10, "a patch alone, and beside 100 times its area", "difference under 1 %", solver.s10_patch),
     Case(11, "turned, and 3e5 m away, float32", "2e-2 edges", solver.s11_far_and_turned),
-    Case(12, "no force; weight x 1e6", "no move (1e-5 edges); finite", solver.s12_forces),
+    Case(12, "no force; weight x 1e6", "no move (1e-5 edges); finite, or refused by name", solver.s12_forces),
     Case(13, "flat sheet squeezed by a tenth", "wrinkles take up half the energy", solver.s13_saddle),
     Case(14, "a hinge at and past half a turn", "gradient to 1e-4", once=stages.s14_folds),
     Case(15, "crumpled ball, noise of three edges", "energy / 10 in 200 steps", solver.s15_crumpled),

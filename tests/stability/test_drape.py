@@ -42,9 +42,10 @@ def test_s38_a_fabric_drapes_as_published_on_any_mesh(name: str):
 def test_s38_strips_and_frames_of_a_fabric_show_its_stiffnesses(name: str):
     """Bending within a twentieth of what a strip with free sides shows, which is 24 edges long.
 
-    Where warp and weft differ, a regular lattice is off by up to a quarter of the difference (`grain.bending_factor`).
+    Within a tenth where warp and weft differ: a regular lattice is off by up to a quarter of the difference
+    (`grain.bending_factor`).
     """
     fabric = PRESETS[name]
-    bend = 0.05 if fabric.weft_bend is None else 0.05 + 0.25 * abs(1.0 - fabric.weft_bend / fabric.bend)
+    bend = 0.05 if fabric.weft_bend is None else 0.1
     for which, (shown, given) in measured(fabric).items():
         assert shown == pytest.approx(given, rel=bend if which.startswith("bend") else 0.02), which

@@ -17,7 +17,7 @@ from ..mesh.threads import Launch
 
 wp.set_module_options({"enable_backward": False})
 FUSED = {"enable_backward": False, "cpu_compiler_flags": "-march=native -ffp-contract=fast"}
-"""Options of modules whose kernels compute most: on the CPU products and sums are fused, which saves a fifth."""
+"""Options of modules whose kernels compute most: on the CPU a product and a sum are one instruction."""
 
 
 @runtime_checkable

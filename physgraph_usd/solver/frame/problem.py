@@ -205,7 +205,9 @@ class Problem:
         if self.creases is not None and self.start.held:  # What fades is less than the stopping measure sees.
             budget = replace(budget, rest=0.0)
         budget = replace(budget, steps=0) if self.start.rests else budget
-        touching = replace(budget, steps=math.ceil(choice.touching * budget.steps))
+        # With creases it sees less of what is left than there is.
+        part = choice.touching if self.creases is None else 1.0
+        touching = replace(budget, steps=math.ceil(part * budget.steps))
         who, outward = (self.group.integrator(learned=choice.learned), self.group.untangler), self.group.outward
         return LevelProblem(lasting, module, alone, self.view(index), *who, budget, touching, outward)
 

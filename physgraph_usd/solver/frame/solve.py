@@ -124,8 +124,8 @@ def solve_one_level(
         blocked = x is not wanted
         if _is_last(report, blocked=blocked) or (smoothing is None and _is_near(report, budget, made)):
             break
-        other = integrator.name != problem.untangler.name
-        if carry.setbacks >= PATIENCE or (other and smoothing is None and _went_up(reports)):
+        replaceable = smoothing is None and integrator.name != problem.untangler.name
+        if carry.setbacks >= PATIENCE or (replaceable and _went_up(reports)):
             integrator, budget, carry = problem.untangler, problem.budget, None
         elif blocked:  # Corrections of the guard were made for other positions.
             carry = None if carry.setbacks else replace(carry, x=x)
@@ -172,7 +172,7 @@ def _most_steps(budget: Budget, report: LevelReport, *, touched: bool) -> int:
 
 
 def _went_up(reports: list[LevelReport]) -> bool:
-    """Whether the last round began at a higher energy than the one before: that went into what it did not see."""
+    """Whether the last round began at a higher energy than the one before it, whose steps ran into unseen contact."""
     return len(reports) > 1 and reports[-1].energy_before > reports[-2].energy_before
 
 
