@@ -32,9 +32,6 @@ CROWDED = 0.1
 FEWER = 1.0 / 3.0
 """Part of the steps that the network makes of a warm frame where something touches, if they bring it near rest: one
 round."""
-CAUGHT = 3.0
-"""Strain of an edge from which cloth is caught, of one shorter than the mean in mean edges: no fabric stretches to four
-times its length."""
 FAR = 0.4
 """Remaining move of the cage, in its edge lengths, from which it is far from rest; under it CUDA solves cold frames at
 the finest level."""
@@ -162,19 +159,6 @@ class Problem:
         return warm if view is None or self.before is None else view.moved(self.before, warm)
 
     @property
-    def caught(self) -> tuple[float, float] | None:
-        """Greatest strains of edges of what is carried and of the upsampled cage, where cloth was caught; or None.
-
-        Where a cage goes through itself or a body, cloth that may not is held back, and hangs on what holds it.
-        """
-        if not self.warm or self.before is None or self.contact is None:
-            return None
-        level = self.forces[-1].level
-        carried = _stretch(level, self.carried)
-        plain = _stretch(level, level.base.apply(self.aim)) if carried > CAUGHT else 0.0
-        return (carried, plain) if carried > CAUGHT > 3.0 * plain else None
-
-    @property
     def device(self) -> str:
         """Where the frame is solved."""
         return self.forces[0].level.device
@@ -257,7 +241,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     contact = group.contact(frame, cage, target=start.detailed)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
-    problem = Problem(
+    return Problem(
         began,
         group,
         frame,
@@ -271,21 +255,6 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
         creases=None if start.detailed is None else creases,
     )
-    return problem if problem.caught is None else _anew(problem, *problem.caught)
-
-
-def _stretch(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
-    """Greatest strain of an edge, of one shorter than the mean in mean edges."""
-    rest = level.rest_length
-    return float(((level.lengths(x) - rest) / rest.clamp_min(float(rest.mean()))).max()) if len(rest) else 0.0
-
-
-def _anew(problem: Problem, carried: float, plain: float) -> Problem:
-    """A frame that starts from its cage, since what it would carry on strains an edge so much more than that does."""
-    why = f"cold: cloth is caught, and an edge strained by {carried:.3g}; in the upsampled cage by {plain:.3g}"
-    contact = problem.group.contact(problem.frame, problem.cage)
-    aim = problem.aim if contact is None else contact.aim
-    return replace(problem, start=Start(why), contact=contact, aim=aim, before=None, tether=None, creases=None)
 
 
 @dataclass(frozen=True)

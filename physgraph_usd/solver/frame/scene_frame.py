@@ -20,8 +20,8 @@ from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
 from .history import Memory, SolvedFrame, is_same, origin_of
+from .recovery import RunawayError, solve_soundly
 from .settings import SolveSettings
-from .solve import solve_frame
 from .values import FrameInput, split
 
 
@@ -223,16 +223,19 @@ class SceneFrame:
             touching, moved = self.cloth.touching(part, frames, near), origin.moved(part, self.frame, near)
             walked = None if cage is None else cage[0]
             given = FrameInput(frames, self.frame.time, touching, moved, walked=walked, elapsed=elapsed)
-            solved = solve_frame(group, given, origin.state)
+            try:
+                solved = solve_soundly(group, given, origin.state)
+            except RunawayError as error:
+                return self._on_cages(part, error)
             more = self.cloth.reached(part, frames, solved.points, self.settings)
             if more <= set(near):
                 break
             near = tuple(sorted({*near, *more}))
         self._refuse_strayed(part, solved.points)
         entry = solved.telemetry | self._surroundings(part, near)
-        entry |= origin.telemetry(None if cage is None else cage[1]) | (
-            {"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}
-        )
+        begun = origin.telemetry(None if cage is None else cage[1])
+        entry |= begun | ({"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {})
+        entry |= {"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         found = list[Answer]()
         for place, (index, memory) in enumerate(zip(part, memories, strict=True)):

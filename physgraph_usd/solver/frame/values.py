@@ -67,6 +67,8 @@ class State:
         bent: What the finest hinges of each garment remember of their bends [rad], shape (H,), None where nothing is
             remembered; () where no garment has creases.
         creeps: Whether creases go on changing, so that the same input leads to another frame.
+        failures: How many starts from the cage in a row have not mended an unsound result.
+        wait: Frames until the next such start.
     """
 
     coarse: Float[Tensor, "coarse 3"]
@@ -77,6 +79,8 @@ class State:
     clean: bool = False
     bent: tuple[Tensor | None, ...] = ()
     creeps: bool = False
+    failures: int = 0
+    wait: int = 0
 
     def about(self, origin: np.ndarray) -> Placed | None:
         """Fine positions about an origin [m], float64, where cloth walks; else None."""
@@ -108,7 +112,8 @@ def join(parts: Sequence[State]) -> State:
     clean = all(part.clean for part in parts)
     creeps = any(part.creeps for part in parts)
     bent = tuple(each for part in parts for each in part.bent or (None,)) if any(part.bent for part in parts) else ()
-    kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps}
+    failures, wait = (max(getattr(part, name) for part in parts) for name in ("failures", "wait"))
+    kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
     return State(*whole, held=min(part.held for part in parts), **kept)
 
 

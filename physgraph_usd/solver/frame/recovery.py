@@ -1,0 +1,96 @@
+"""Recovery of frames that end worse than a start from the cage would: they are started anew."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ...errors import SolveError
+from ..deadline import is_over
+from .group import Group
+from .solve import solve_frame
+from .values import FrameInput, Solved, State
+
+ROUNDING = 1e-3
+"""Fraction of the energies' size by which two energies count as equal: sums are in single precision."""
+CONTACT = frozenset({"contact", "self_contact"})
+"""Names of the terms by which a cage that crosses or lies in a body has any energy."""
+MOST_WAIT = 64
+"""Most frames between two starts from the cage. The wait doubles with each start that does not help, so such starts
+cost little in a shot whose cloth cannot be drawn apart."""
+
+
+class RunawayError(SolveError):
+    """Cloth that ends with more energy than its upsampled cage, from wherever it starts."""
+
+
+def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved:
+    """Solve a frame, and once more from the cage where the result is unsound.
+
+    A result is unsound if cloth crosses, or if its energy is above the upsampled cage's without contact. The second
+    result stands if less crosses in it, or as much and its energy is lower than one above the cage's.
+
+    Args:
+        group: Garments that are solved together.
+        frame: The frame.
+        last: What the last frame left, or None for a cold start.
+
+    Raises:
+        SolveError: As `solve_frame`.
+        RunawayError: Both results have more energy than the upsampled cage with contact.
+    """
+    solved = solve_frame(group, frame, last)
+    why = _unsound(solved.telemetry)
+    if not why or (last is None and frame.walked is None) or is_over() or group.settings.budget_ms is not None:
+        return solved
+    if last is not None and last.wait:
+        return _waiting(solved, last.failures, last.wait - 1)
+    fresh = solve_frame(group, replace(frame, moved=np.inf, walked=None, elapsed=()), None)
+    if _is_better(fresh.telemetry, solved.telemetry):
+        return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {why}"})
+    if all(_excess(each.telemetry, contact=True) > 0.0 for each in (solved, fresh)):
+        raise RunawayError(f"{why}, and a start from the cage ends no better")
+    failures = 1 if last is None else last.failures + 1
+    return _waiting(solved, failures, min(2**failures - 1, MOST_WAIT))
+
+
+def _waiting(solved: Solved, failures: int, wait: int) -> Solved:
+    """The result, with the number of starts from the cage that did not help, and of frames until the next one."""
+    return replace(solved, state=replace(solved.state, failures=failures, wait=wait))
+
+
+def _unsound(telemetry: Mapping[str, Any]) -> str:
+    """Why a result is unsound; "" where it is not."""
+    if (excess := _excess(telemetry)) > 0.0:
+        return f"it ended with {excess:.3g} J more than its upsampled cage has"
+    crossings = _crossings(telemetry)
+    return f"it kept {crossings:,} crossings" if crossings else ""
+
+
+def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
+    """Whether a second result replaces an unsound first one."""
+    crossings = _crossings(fresh), _crossings(solved)
+    if crossings[0] != crossings[1]:
+        return crossings[0] < crossings[1]
+    return _excess(solved) > 0.0 and _energy(fresh) < _energy(solved)
+
+
+def _crossings(telemetry: Mapping[str, Any]) -> int:
+    """Crossings of cloth with cloth in a result."""
+    return int(telemetry.get("contact", {}).get("cloth", {}).get("after", {}).get("crossings", 0))
+
+
+def _excess(telemetry: Mapping[str, Any], *, contact: bool = False) -> float:
+    """Energy of the result above its upsampled cage's, with or without the cage's contact [J]; 0 if below or equal."""
+    sides = telemetry["energy_joules"]
+    before = {name: value for name, value in sides["input"].items() if contact or name not in CONTACT}
+    size = sum(abs(each) for each in (*before.values(), *sides["output"].values()))
+    return max(_energy(telemetry) - sum(before.values()) - ROUNDING * size, 0.0)
+
+
+def _energy(telemetry: Mapping[str, Any]) -> float:
+    """Energy of the result [J]."""
+    return sum(telemetry["energy_joules"]["output"].values())
