@@ -273,6 +273,7 @@ def median_shape(edges: np.ndarray, poses: Sequence[np.ndarray]) -> tuple[np.nda
         wanted = span * (median / np.maximum(length, np.finfo(float).tiny))[:, None]
         last, shape = shape, solve(pull @ wanted + hold * ahead)
         before, error = error, float((weight * (length - median) ** 2).sum())
-        last_pace, pace = (1.0 if error > before else pace), 0.5 + np.sqrt(0.25 + pace**2)
+        last_pace = 1.0 if error > before else pace
+        pace = 0.5 + np.sqrt(0.25 + last_pace**2)
         ahead = shape + (last_pace - 1.0) / pace * (shape - last)
     return shape, nearest
