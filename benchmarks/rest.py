@@ -11,10 +11,8 @@ from contextlib import closing
 
 import numpy as np
 
-from physgraph_usd.solver.mesh.topology import edges_of
 from physgraph_usd.usd.read.reader import open_shot
-
-FRAMES = 9
+from physgraph_usd.usd.read.rest import MOST_FITTED
 
 
 def main() -> None:
@@ -28,15 +26,15 @@ def main() -> None:
             with closing(open_shot(shot, garments=given.garment, rest_frame="auto")) as auto:
                 fitted = [garment.rest for garment in auto.scene.garments]
             times = plain.scene.times
-            picks = np.linspace(0, len(times) - 1, min(FRAMES, len(times))).round().astype(int)
+            picks = np.linspace(0, len(times) - 1, min(MOST_FITTED, len(times))).round().astype(int)
             frames = [plain.frame(times[pick]) for pick in picks]
             for index, garment in enumerate(plain.scene.garments):
-                ends = edges_of(garment.mesh.triangulate(garment.rest).triangles, garment.mesh.vertex_count).vertices
+                ends = garment.mesh.half_edges.edges
                 poses = [frame.garments[index].points for frame in frames]
                 lengths = np.array([_lengths(pose, ends) for pose in poses])
                 median = np.median(lengths, axis=0)
                 nearest = poses[int(np.abs(lengths - median).sum(axis=1).argmin())]
-                shapes = {"as authored": garment.rest, "nearest frame": nearest, "auto": fitted[index]}
+                shapes = {"by default": garment.rest, "nearest frame": nearest, "auto": fitted[index]}
                 for name, shape in shapes.items():
                     low, high = np.percentile(_lengths(shape, ends) / median - 1.0, [1, 99])
                     sys.stdout.write(f"{shot} {garment.path} {name}: {low:+.1%} to {high:+.1%}\n")

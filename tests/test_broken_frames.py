@@ -50,15 +50,15 @@ def test_a_broken_first_frame_is_named_and_left_behind(name: str, anew: int):
         assert told[anew][1]["jumped_from"] == 0.0
 
 
-def test_a_first_frame_that_is_the_rest_shape_too_is_named(tmp_path: Path):
-    shot = cloth_shot(tmp_path / "shot.usdc", broken={1.0: -1.0})
-    out = tmp_path / "fine.usdc"
-    (warning,) = (each for each in refine(shot, out).warnings if each.startswith(f"<{CLOTH}> at time code 1: "))
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_first_frame_that_no_other_rest_shape_is_authored_for_is_named(tmp_path: Path, frozen: bool):
+    """Held from the second frame on, cloth was taken over from there for good."""
+    shot = cloth_shot(tmp_path / "shot.usdc", broken={1.0: -1.0}, frozen=frozen)
+    whole = cloth_shot(tmp_path / "whole.usdc", frozen=frozen)
+    report = refine(shot, tmp_path / "fine.usdc")
+    (warning,) = (each for each in report.warnings if each.startswith(f"<{CLOTH}> at time code 1: "))
     assert "--frames" in warning
-    assert "--rest" in warning
-    whole = cloth_shot(tmp_path / "whole.usdc")
-    refine(whole, tmp_path / "unbroken.usdc", rest_frame=2.0)
-    refine(shot, out, rest_frame=2.0, frames=(2.0, 6.0), overwrite=True)
+    refine(whole, tmp_path / "unbroken.usdc")
     pair = [fine(shot, tmp_path / name, 6.0) for name in ("fine.usdc", "unbroken.usdc")]
     assert np.abs(pair[0] - pair[1]).max() < 1e-3
 

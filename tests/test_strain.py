@@ -1,8 +1,9 @@
-"""A rest shape that is not the cloth's: who is told, what `--rest auto` makes of it, and where it came from."""
+"""A rest shape that is not the cloth's: who is told, and the one that is fitted to the shot."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ from stages import GARMENT_API, new_stage, save, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.solver.strain import strained_parts, strayed
-from physgraph_usd.usd.read.garment import median_shape
+from physgraph_usd.shot.untagged import rest_options
+from physgraph_usd.shot.warnings import of_strain
+from physgraph_usd.solver.strain import StrainedPart, strained_parts, strayed
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.read.rest import FITTED, median_shape
 
 SLEEVE = "/World/sleeve"
 AROUND, ROWS, RADIUS, LENGTH = 16, 13, 0.06, 0.4
@@ -34,9 +37,15 @@ def tube(puff: float, *, bend: float = 0.0) -> np.ndarray:
 
 
 def puffed_shot(
-    path: Path, *, puff: float = PUFFED, subset: bool = False, odd: dict[float, float] | None = None
+    path: Path,
+    *,
+    puff: float = PUFFED,
+    subset: bool = False,
+    odd: dict[float, float] | None = None,
+    default: bool = True,
+    times: Sequence[float] = TIMES,
 ) -> str:
-    """A sleeve whose default points are a plain tube and whose animation is puffed; ``odd`` scales some samples."""
+    """A sleeve whose default points, if any, are a plain tube and whose animation is puffed; ``odd`` scales samples."""
     stage = new_stage(path)
     mesh = UsdGeom.Mesh.Define(stage, SLEEVE)
     ids = np.arange(AROUND * ROWS).reshape(ROWS, AROUND)
@@ -44,8 +53,10 @@ def puffed_shot(
     quads = np.stack([ids[:-1], ids[1:], across[1:], across[:-1]], axis=-1).reshape(-1, 4)
     mesh.CreateFaceVertexCountsAttr([4] * len(quads))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(quads.ravel().astype(np.int32)))
-    mesh.CreatePointsAttr(vec3(tube(1.0)))
-    for time in TIMES:
+    mesh.CreatePointsAttr()
+    if default:
+        mesh.GetPointsAttr().Set(vec3(tube(1.0)))
+    for time in times:
         mesh.GetPointsAttr().Set(vec3((odd or {}).get(time, 1.0) * tube(puff, bend=0.03 * time)), time)
     if subset:
         upper = Vt.IntArray.FromNumpy(np.arange(len(quads) // 2, len(quads)).astype(np.int32))
@@ -71,6 +82,24 @@ def test_stretched_parts_are_told_with_place_amount_and_remedy(tmp_path: Path):
     assert f"<{SLEEVE}>" in said
     assert "(default points)" in said
     assert f"{part['area_ratio']:.0%} of its area on {part['faces']} faces in its upper part" in said
+    assert "--rest auto" in found["command"]
+
+
+@pytest.mark.parametrize(("default", "asked"), [(False, None), (True, "auto"), (False, 4.0)])
+def test_cloth_in_its_own_size_is_not_warned_of(tmp_path: Path, default: bool, asked: str | float | None):
+    found = inspect_shot(puffed_shot(tmp_path / "a.usda", default=default), rest_frame=asked)
+    assert found["garments"][0]["strained"] == []
+    assert not [warning for warning in found["warnings"] if "rest" in warning]
+    assert "command" not in found
+
+
+def test_a_fitted_shape_that_is_not_the_clothes_is_not_to_be_fitted_again():
+    part = StrainedPart("all over it", 9, 1.5, 1.0)
+    (said,) = of_strain(SLEEVE, f"{FITTED}: something", [part])
+    assert "--rest auto" not in said
+    assert "--rest FRAME" in said
+    assert not rest_options([(f"{FITTED}: something", [part])])
+    assert rest_options([("default points", [part])]) == ["--rest", "auto"]
 
 
 def test_a_part_is_named_by_height_and_axes():
@@ -107,31 +136,42 @@ def test_a_puffed_sleeve_stays_puffed_with_rest_auto(tmp_path: Path):
     report = refine(shot, auto, rest_frame="auto", **asked)
     assert not [warning for warning in report.warnings if "--rest" in warning]
     assert report.garments[0]["strained"] == []
-    assert report.garments[0]["sources"]["rest"].startswith("auto: median edge lengths of 7 time codes")
+    assert report.garments[0]["sources"]["rest"].startswith(f"{FITTED}: median edge lengths of 7 time codes")
     assert sample_times(auto, SLEEVE) == TIMES
     deflated, kept = (radius(fine(shot, layer, 4.0, prim=SLEEVE)) for layer in (plain, auto))
     assert deflated < 1.15 * RADIUS
     assert kept == pytest.approx(PUFFED * RADIUS, rel=0.03)
 
 
-def test_rest_auto_has_the_median_lengths_and_no_single_frames(tmp_path: Path):
-    shot = puffed_shot(tmp_path / "a.usda", odd={3.0: 2.0, 6.0: 0.5})
-    rest = open_shot(shot, rest_frame="auto").scene.garments[0].rest.reshape(ROWS, AROUND, 3)
+@pytest.mark.parametrize("odd", [{1.0: 2.0, 6.0: 0.5}, {1.0: 100.0}, dict.fromkeys(TIMES[:5], 0.0)])
+def test_a_fitted_shape_has_the_median_lengths_and_no_single_frames(tmp_path: Path, odd: dict[float, float]):
+    shot = puffed_shot(tmp_path / "a.usda", default=False, odd=odd)
+    rest = open_shot(shot).scene.garments[0].rest.reshape(ROWS, AROUND, 3)
     wanted = tube(PUFFED).reshape(ROWS, AROUND, 3)
     around, expected = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (rest, wanted))
     np.testing.assert_allclose(around, expected, rtol=0.02)
 
 
-def test_rest_auto_does_not_depend_on_the_frames_that_are_refined(tmp_path: Path):
-    shot = puffed_shot(tmp_path / "a.usda")
-    whole, part = (open_shot(shot, rest_frame="auto", frames=f).scene.garments[0].rest for f in (None, (6.0, 7.0)))
-    np.testing.assert_array_equal(whole, part)
+def test_a_fitted_shape_does_not_depend_on_the_frames_that_are_refined(tmp_path: Path):
+    shot = puffed_shot(tmp_path / "a.usda", default=False)
+    whole, *parts = (open_shot(shot, frames=f).scene.garments[0].rest for f in (None, (1.0, 2.0), (6.0, 7.0)))
+    for part in parts:
+        np.testing.assert_array_equal(whole, part)
 
 
-def test_rest_auto_of_cloth_that_is_a_point_most_of_the_time_is_refused(tmp_path: Path):
-    shot = puffed_shot(tmp_path / "a.usda", odd=dict.fromkeys(TIMES[1:], 0.0))
-    with pytest.raises(GarmentError, match=r"all points of the rest shape \(auto: .*\) are at one place"):
-        open_shot(shot, rest_frame="auto")
+def test_a_cache_that_begins_later_has_the_same_size(tmp_path: Path):
+    """Its lengths are medians of fewer poses, its pose another one's."""
+    shots = [puffed_shot(tmp_path / f"{n}.usda", default=False, times=TIMES[n:]) for n in (0, 3)]
+    whole, cut = (open_shot(shot).scene.garments[0].rest.reshape(ROWS, AROUND, 3) for shot in shots)
+    for axis in (0, 1):
+        a, b = (np.linalg.norm(np.diff(x, axis=axis), axis=2) for x in (whole, cut))
+        np.testing.assert_allclose(a, b, rtol=0.03)
+
+
+def test_cloth_that_is_always_a_point_is_refused(tmp_path: Path):
+    shot = puffed_shot(tmp_path / "a.usda", odd=dict.fromkeys(TIMES, 0.0), default=False)
+    with pytest.raises(GarmentError, match=r"all points of the rest shape \(.*\) are at one place"):
+        open_shot(shot)
 
 
 def test_a_fit_comes_near_medians_that_no_pose_has():

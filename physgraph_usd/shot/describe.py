@@ -16,7 +16,7 @@ from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects
 from ..solver.resolution import LevelChoice, choose_levels, sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
-from ..solver.strain import strained_parts
+from ..solver.strain import StrainedPart, strained_parts
 from ..usd.read.reader import Shot
 from ..usd.read.survey import survey
 from ..usd.stage import GarmentSource
@@ -25,7 +25,7 @@ from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
 from .options import RefineOptions
 from .report import RefineReport, of_a_kind
-from .untagged import bodies_beside, command_of, proposal
+from .untagged import bodies_beside, command_of, proposal, rest_options
 from .warnings import of_levels, of_strain, of_unfelt
 
 
@@ -55,8 +55,8 @@ def begin_report(
     ]
     crowding = _crowding(opened, frames, options) if before_a_run else ()
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=crowding).plain()
-    known = of_levels([garment.path for garment in opened.scene.garments], choices)
-    known += _strained(opened, report, frames)
+    known = _strained(opened, report, frames)
+    known += of_levels([garment.path for garment in opened.scene.garments], choices)
     known += _unfelt(opened, report, frames) if options.contact != "off" else []
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
@@ -128,11 +128,14 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
 
 
 def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
-    """The command with what the garments touch and do not feel, where they do."""
+    """The command with what the garments touch and do not feel, and the rest shape that they need, where they do."""
     unfelt = dict.fromkeys(path for garment in report.garments for path in garment.get("unfelt", ()))
-    if not unfelt:
+    strained = [(g["sources"]["rest"], [StrainedPart(**part) for part in g["strained"]]) for g in report.garments]
+    rest = rest_options(strained)
+    if not (unfelt or rest):
         return {}
-    return {"command": command_of(opened.path, options.garments, [*opened.colliders, *unfelt])}
+    colliders = [*opened.colliders, *unfelt] if unfelt else options.colliders
+    return {"command": command_of(opened.path, options.garments, colliders, rest=rest)}
 
 
 def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> dict[str, Any]:

@@ -139,7 +139,7 @@ class RefineOptions:
     heat_map: bool = _layer(False, "Also write depth inside bodies and crossings as primvars.")
     rest_frame: float | str | None = _scene(
         None,
-        "Rest shape: this frame, or fitted to all.  [default: each garment's own]",
+        "Rest shape: this frame, or fitted to the shot.  [default: the authored one, else fitted]",
         flag="rest",
         metavar="FRAME|auto",
     )

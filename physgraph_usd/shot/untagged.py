@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,9 @@ from ..solver.contact.broad_phase import bounds_of, mean_edge
 from ..solver.mesh.threads import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Frame, Garment
+from ..solver.strain import StrainedPart, strained_parts
 from ..usd.read.reader import Shot, open_shot
+from ..usd.read.rest import FITTED
 from ..usd.read.untagged import meshes_beside
 from ..usd.view import Stage
 
@@ -119,24 +121,46 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
     """
     try:
         with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
-            found = bodies_beside(opened, sample_frames(opened.scene.times, opened.frame))
+            sampled = sample_frames(opened.scene.times, opened.frame)
+            found = bodies_beside(opened, sampled)
             lying = {path for each in found for path in each.shares}
             garments = [garment.path for garment in opened.scene.garments if garment.path in lying]
-            return command_of(opened.path, garments, [each.path for each in found]) if found else ""
+            bodies, rest = [each.path for each in found], rest_options(_strained(opened, sampled, garments))
+            return command_of(opened.path, garments, bodies, rest=rest) if found else ""
     except StageError:
         return ""
 
 
-def command_of(shot: str, garments: Iterable[str], colliders: Iterable[str]) -> str:
-    """The command that refines a shot's garments with colliders."""
+def command_of(shot: str, garments: Iterable[str], colliders: Iterable[str], *, rest: Sequence[str]) -> str:
+    """The command that refines a shot's garments with colliders; ``rest`` as of `rest_options`."""
     out = str(Path(shot).with_suffix(".refined.usdc"))
-    words = ["physgraph-usd", "refine", shot, "-o", out]
+    words = ["physgraph-usd", "refine", shot, "-o", out, *rest]
     return join([*words, *options_of("--garment", garments), *options_of("--collider", colliders)])
+
+
+def rest_options(strained: Iterable[tuple[str, Sequence[StrainedPart]]]) -> list[str]:
+    """``--rest auto`` as words of a command, where a garment needs it.
+
+    Args:
+        strained: For each garment where its rest shape is from, and the parts that are not of its size.
+    """
+    wrong = any(part.needs_rest for source, parts in strained if not source.startswith(FITTED) for part in parts)
+    return ["--rest", "auto"] if wrong else []
 
 
 def options_of(name: str, values: Iterable[str]) -> list[str]:
     """An option for each of some values, as words of a command."""
     return [word for value in values for word in (name, value)]
+
+
+def _strained(
+    shot: Shot, frames: Sequence[Frame], paths: Sequence[str]
+) -> Iterator[tuple[str, Sequence[StrainedPart]]]:
+    """Source of the rest shape of some garments, and their parts that are not of its size."""
+    for index, (garment, source) in enumerate(zip(shot.scene.garments, shot.sources, strict=True)):
+        if garment.path in paths:
+            cages = [frame.garments[index].points for frame in frames]
+            yield source.sources["rest"], strained_parts(garment, cages, source.subsets, up=-shot.scene.gravity)
 
 
 def _smallest_body(garments: Sequence[Garment]) -> float:

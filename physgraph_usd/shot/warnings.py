@@ -14,7 +14,8 @@ from typing import Any
 from ..errors import counted
 from ..solver.folds import EDGES_PER_WAVE
 from ..solver.resolution import FEWEST_EDGES, SHARP_FRACTION, LevelChoice, finer
-from ..solver.strain import SHRUNK, StrainedPart
+from ..solver.strain import StrainedPart
+from ..usd.read.rest import FITTED
 from .report import RefineReport
 from .settled import COLLAPSED, LIMITED, UNSOLVED, Unsettled
 from .untagged import AUTO, NEAR, Beside, options_of
@@ -123,10 +124,9 @@ WARNINGS = {
     ),
     "jumped_from": Kind(
         "jumps from this first frame to the next",
-        "if the first frame is broken: `--frames` without it, and `--rest` for another frame's shape",
+        "if the first frame is broken: `--frames` without it",
         "the garment or a body jumps from this first frame to the next",
-        "if it is broken, leave it out with --frames and take the rest shape from another with --rest FRAME. "
-        "Time code {next:g} starts anew",
+        "if it is broken, leave it out with --frames. Time code {next:g} starts anew",
     ),
     "coarse": Kind(
         "folds may be of the mesh's own size",
@@ -144,9 +144,9 @@ WARNINGS = {
     ),
     "strained": Kind(
         "in most frames the cage has not its rest shape's size",
-        "`--rest auto`, `--rest FRAME` or `primvars:rest`: refined cloth goes to its rest shape's size",
+        "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth goes to its rest shape's size",
         "in most frames the cage has not its rest shape's size ({source}), to which refined cloth goes: {parts}",
-        "give --rest auto or --rest FRAME, or author primvars:rest",
+        "{remedy}",
     ),
     "unfelt": Kind(
         "cloth is inside or near a closed mesh that it does not feel",
@@ -210,10 +210,14 @@ def of_strain(path: str, source: str, parts: Sequence[StrainedPart]) -> list[str
         source: Where its rest shape is from.
         parts: Its strained parts, largest first.
     """
-    large = [part for part in parts if part.area_ratio > 1.0 or part.area_ratio < SHRUNK]
+    large = [part for part in parts if part.needs_rest]
     named = [f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}" for part in large]
     named[MOST_NAMED:] = [counted(len(named) - MOST_NAMED, "smaller part")] if len(named) > MOST_NAMED else []
-    return [WARNINGS["strained"](path, source=source, parts=", ".join(named))] if named else []
+    fitted = "give --rest FRAME of a frame in which they have their size, or author primvars:rest"
+    remedy = (
+        fitted if source.startswith(FITTED) else "give --rest auto, or author primvars:rest in the cloth's own size"
+    )
+    return [WARNINGS["strained"](path, source=source, parts=", ".join(named), remedy=remedy)] if named else []
 
 
 def of_unfelt(found: Sequence[Beside]) -> list[str]:

@@ -47,6 +47,11 @@ class StrainedPart:
     area_ratio: float
     share: float
 
+    @property
+    def needs_rest(self) -> bool:
+        """Whether refining spoils the part: cloth that is larger shrinks, and far smaller cloth has another's shape."""
+        return self.area_ratio > 1.0 or self.area_ratio < SHRUNK
+
 
 def strained_parts(
     garment: Garment, frames: Sequence[np.ndarray], subsets: Mapping[str, np.ndarray], *, up: np.ndarray

@@ -126,7 +126,7 @@ def origin_of(
         gap: Whether the time between samples is too long.
     """
     near_by = {"near": near, "edge": edge}
-    broken, jumped = _broken(part, frame, memories, **near_by), _jumped(part, frame, memories, **near_by)
+    broken, jumped = _broken(part, frame, memories, **near_by), jumped_from(part, frame, memories, **near_by)
     frames = tuple(each.last if broken is None else each.before for each in memories)
     frames = frames if jumped is None else (None,) * len(part)
     known = [each for each in frames if each is not None]
@@ -148,7 +148,7 @@ def _broken(
     return None
 
 
-def _jumped(
+def jumped_from(
     part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the first frame, if garments' input jumped from there to the second and stays there."""

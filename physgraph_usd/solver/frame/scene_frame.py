@@ -19,7 +19,7 @@ from ..mesh.topology import edges_of
 from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
-from .history import Memory, SolvedFrame, is_same, origin_of
+from .history import Memory, SolvedFrame, is_same, jumped_from, origin_of
 from .recovery import RunawayError, solve_soundly
 from .settings import SolveSettings
 from .values import FrameInput, split
@@ -175,7 +175,8 @@ class SceneFrame:
         unsolved = dict[tuple[int, ...], SolveError]()
         for part in self.cloth.parts_of(self.frame, self.settings):
             near = self.cloth.near(part, [self.frame.garments[index] for index in part], self.settings)
-            same = is_same(part, self.frame, [self.memories[index] for index in part], near)
+            memories = [self.memories[index] for index in part]
+            same = is_same(part, self.frame, memories, near) and not self._jumped(part, near)
             for index in part:
                 reused[index] = same and self.memories[index].solved
             if not any(asked[index] for index in part):
@@ -215,8 +216,7 @@ class SceneFrame:
         """Solve garments together; bodies that the cloth reaches only as it is solved are taken up."""
         frames, memories = [self.frame.garments[index] for index in part], [self.memories[index] for index in part]
         group = self.cloth.group(part, self.settings)
-        edge = float(group.levels[0].spacing.mean())
-        origin = origin_of(part, self.frame, memories, near=near, edge=edge, gap=self.gap)
+        origin = origin_of(part, self.frame, memories, near=near, edge=self._edge(part), gap=self.gap)
         cage = None if origin.state is not None else self._cage_walked(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         while True:
@@ -245,6 +245,15 @@ class SceneFrame:
             before = memory.last if origin.broken is None else origin.frames[place]
             found.append(Answer(points, entry, Memory(now, before)))
         return found
+
+    def _jumped(self, part: tuple[int, ...], near: tuple[int, ...]) -> bool:
+        """Whether the last frame, which garments would be taken over from, started from a first one unlike it."""
+        memories = [self.memories[index] for index in part]
+        return jumped_from(part, self.frame, memories, near=near, edge=self._edge(part)) is not None
+
+    def _edge(self, part: tuple[int, ...]) -> float:
+        """Mean edge of the cages of garments [m]."""
+        return float(self.cloth.group(part, self.settings).levels[0].spacing.mean())
 
     def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
         """Telemetry of what garments were solved with: bodies, where they feel any, and one another."""

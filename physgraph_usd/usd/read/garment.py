@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
-from ...errors import GarmentError, SchemaError
-from ...solver.mesh.topology import PolygonMesh, edges_of
+from ...errors import SchemaError
+from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import Garment, GarmentFrame
 from ..lookup import Found, Override, check_limits, find_value
 from ..schema import GARMENT
@@ -23,12 +21,10 @@ from .cage import PointReader, read_cage
 from .grain import read_grain
 from .materials import Values, find_values
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
-from .rest import AUTO, Rest, checked, read_rest, rests_bent
+from .rest import Animation, Rest, read_rest, rests_bent
 from .skinning import Bake
 
 _SMALL, _LARGE = 0.01, 100.0
-_MEDIAN_FRAMES = 9
-"""Time codes that `--rest auto` takes medians of: an edge that is odd in four of them does not count."""
 _THICK = 10.0
 """Fraction (one over it) of its size beyond which cloth keeps no distance: where all of it is near all of it, there are
 V^2 pairs, and cloth that is pushed out by more than it measures has no shape of the shot."""
@@ -45,7 +41,7 @@ class Request:
         frames: First and last time code, or None.
         level: Number of subdivisions for all, -1 for auto, or None.
         overrides: Values of ``--set``.
-        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to all, or None.
+        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
         assumed_units: Whether metersPerUnit is not authored.
     """
 
@@ -112,12 +108,9 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     edges = cage.mesh.half_edges.edges
     placement = check_placement(prim, request.units.metres, times)
     matrix = to_metres(prim, request.units.metres, first)
-    start = place(points.read(first, edges)[0], matrix)
-    if request.rest_frame is None:
-        rest = _rest_on_stage(prim, matrix, request, edges=edges, start=start, first=first)
-    else:
-        rest = _rest_asked(prim, points, request, mesh=cage.mesh, every=every)
-    rest, (bent, odd) = checked(prim, edges, rest, first=start), rests_bent(prim)
+    animation = _animation(prim, points, request, edges=edges, every=every, times=times)
+    rest = _rest(prim, cage.mesh, animation, request, matrix=matrix)
+    bent, odd = rests_bent(prim)
     notices = [*cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     self_contact, layer, raises, level = _constants(prim, request)
@@ -132,7 +125,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         raises_bending=bool(raises.at(None)),
         **painted,
     )
-    notices += [*rest.notices, *_size_notices(garment.path, start, request), *_unit_notices(prim, matrix, request)]
+    size = _size_notices(garment.path, animation.first, request)
+    notices += [*rest.notices, *size, *_unit_notices(prim, matrix, request)]
     sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
     sources |= {"grain": lies, "refine:raiseBending": raises.source}
     source = GarmentSource(
@@ -146,6 +140,25 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices])
 
 
+def _animation(
+    prim: Usd.Prim,
+    points: PointReader,
+    request: Request,
+    *,
+    edges: np.ndarray,
+    every: Sequence[float],
+    times: Sequence[float],
+) -> Animation:
+    """A garment's points over the shot, given its time codes and those that are refined; each is read once."""
+
+    @cache
+    def read(time: float | None) -> tuple[np.ndarray, tuple[Notice, ...]]:
+        local, notices = points.read(time, edges)
+        return place(local, to_metres(prim, request.units.metres, time)), notices
+
+    return Animation(every, read(times[0] if times else None)[0], read)
+
+
 def _constants(prim: Usd.Prim, request: Request) -> list[Found]:
     """Self-collision, layer, whether bending is raised, and level, which never change over a shot."""
     names = ("contact:selfCollision", "contact:layer", "refine:raiseBending", "refine:level")
@@ -153,35 +166,6 @@ def _constants(prim: Usd.Prim, request: Request) -> list[Found]:
     if request.level is not None and level.source != "--set":
         level = Found(level.row, "--level", None, request.level)
     return [*others, level]
-
-
-def _rest_asked(
-    prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
-) -> Rest:
-    """Rest shape of ``--rest``: the points at a time code, or one fitted to all."""
-    if request.rest_frame == AUTO:
-        return _rest_auto(prim, points, request, mesh=mesh, every=every)
-    time = float(request.rest_frame or 0.0)
-    local, notices = points.read(time, mesh.half_edges.edges)
-    placed = place(local, to_metres(prim, request.units.metres, time))
-    return Rest(placed, f"points at time code {time:g} (--rest)", notices)
-
-
-def _rest_auto(
-    prim: Usd.Prim, points: PointReader, request: Request, *, mesh: PolygonMesh, every: Sequence[float]
-) -> Rest:
-    """Rest shape fitted to the median lengths of the edges over the whole shot, whatever part is refined."""
-    poses: dict[float | None, np.ndarray] = {}
-    picks = np.linspace(0, len(every) - 1, min(_MEDIAN_FRAMES, len(every))).round().astype(int)
-    for time in [every[pick] for pick in picks] or [None]:
-        with contextlib.suppress(GarmentError):  # Refining a broken frame names its fault.
-            local = points.read(time, mesh.half_edges.edges)[0]
-            poses[time] = place(local, to_metres(prim, request.units.metres, time))
-    found = list(poses.values())
-    shape, nearest = median_shape(edges_of(mesh.triangulate(found[0]).triangles, mesh.vertex_count).vertices, found)
-    at = [*poses][nearest]
-    message = f"median edge lengths of {len(poses)} time codes" + ("" if at is None else f", from the points at {at:g}")
-    return Rest(shape, f"auto: {message} (--rest)")
 
 
 def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
@@ -194,15 +178,14 @@ def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
     return subsets
 
 
-def _rest_on_stage(
-    prim: Usd.Prim, matrix: np.ndarray, request: Request, *, edges: np.ndarray, start: np.ndarray, first: float | None
-) -> Rest:
-    """Rest shape on the stage; a skinned one is placed by its bind transform in place of the mesh's."""
-    bound = matrix
+def _rest(prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray) -> Rest:
+    """Rest shape; authored points of a skinned mesh are placed by its bind transform in place of the mesh's matrix."""
+    bound, first = matrix, animation.times[0] if animation.times else None
     if prim.GetPath() in request.bake.skinned:
         rows = request.bake.rest_transform(prim.GetPath(), first)
         bound = check_matrix(prim, rows, request.units.metres, time=first)
-    return read_rest(prim, edges, start, place=lambda local: place(local, bound), baked=request.bake.layer)
+    placed = partial(place, matrix=bound)
+    return read_rest(prim, mesh, request.rest_frame, animation, place=placed, baked=request.bake.layer)
 
 
 def _painted(
@@ -298,47 +281,3 @@ def _primvar(prim: Usd.Prim, name: str) -> UsdGeom.Primvar | None:
         if primvar and primvar.HasAuthoredValue():
             return primvar
     return None
-
-
-STEPS = 40
-"""After these the edges of no shot tried came nearer to their medians by more than a thousandth of their length."""
-HOLD = 1e-6
-"""Stiffness that ties the shape to its place, in mean stiffnesses: enough for a factor, nothing to a length."""
-SHORTEST = 1e-3
-"""In mean edges; shorter ones pull no harder."""
-
-
-def median_shape(edges: np.ndarray, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
-    """Fit a shape to the median length of each edge: sum of (l - m)^2 / m over the edges, least by majorization.
-
-    A single pose has its own stretch; medians belong to none, yet cloth comes near them nearly everywhere.
-    The method is SMACOF (de Leeuw 1977): each step solves a Laplace equation with the edges' present directions.
-
-    Args:
-        edges: End vertices, shape (E, 2).
-        poses: Positions of the same vertices, each of shape (V, 3), at least one.
-
-    Returns:
-        The shape, (V, 3), and which pose was nearest to the medians; the fit starts there.
-    """
-    lengths = np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses])
-    median = np.median(lengths, axis=0)
-    nearest = int(np.abs(lengths - median).sum(axis=1).argmin())
-    shape = np.array(poses[nearest], np.float64)
-    if not median.any():
-        return shape, nearest
-    weight = 1.0 / np.maximum(median, max(SHORTEST * float(median.mean()), np.finfo(float).tiny))
-    rows = np.arange(len(edges))
-    ends = np.concatenate([edges[:, 0], edges[:, 1]])
-    signs = np.repeat([1.0, -1.0], len(edges))
-    spans = sparse.csr_matrix((signs, (np.tile(rows, 2), ends)), shape=(len(edges), len(shape)))
-    pull = sparse.csr_matrix(spans.T @ sparse.diags(weight))
-    stiffness = pull @ spans
-    hold = HOLD * float(stiffness.diagonal().mean())
-    solve = splu(sparse.csc_matrix(stiffness + hold * sparse.identity(len(shape)))).solve
-    for _ in range(STEPS):
-        span = spans @ shape
-        length = np.linalg.norm(span, axis=1)
-        wanted = span * (median / np.maximum(length, np.finfo(float).tiny))[:, None]
-        shape = solve(pull @ wanted + hold * shape)
-    return shape, nearest

@@ -45,7 +45,7 @@ from .find import felt_by, find_colliders, find_garments, instance_roots, read_a
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .materials import find_values
 from .placement import to_metres
-from .rest import AUTO
+from .rest import AUTO, has_rest
 from .skinning import Bake
 
 
@@ -196,7 +196,7 @@ def open_shot(
         level: Number of subdivisions, -1 for auto; None: each garment's own.
         overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
         rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to all of
-            the shot; it goes before authored rest shapes.
+            the shot; both go before authored rest shapes. Without one a shape is fitted where none is authored.
         skip_invisible: Leave out garments that are invisible at all their time codes.
 
     Returns:
@@ -314,7 +314,9 @@ def _read(
     notices += [_left_out(prim, "is disabled") for prim in prims if prim not in on]
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in on}
     # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
-    whole = request.rest_frame is not None or any(_is_auto(prim, request) for prim in on)
+    whole = request.rest_frame is not None or any(
+        _is_auto(prim, request) or not has_rest(prim, request.bake.layer) for prim in on
+    )
     frames = None if request.frames is None or whole else (-math.inf, request.frames[1])
     notices += request.bake.add([*roots], frames, bodies=bodies)
     readers, every = [], []

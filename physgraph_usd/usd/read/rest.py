@@ -1,26 +1,44 @@
 """A garment's rest shape in metres, and its source.
 
-The first of these: ``--rest`` (a frame, or "auto": the shape fitted to the median length that each edge has over the
-shot), ``physics:restShapePoints``, ``primvars:rest``, ``primvars:Pref``, the points' default value, the points' first
-sample. It is placed in the world as the garment at its first time code, or by a skinned garment's bind transform.
+The first of these: the points at the time code of ``--rest``, ``physics:restShapePoints``, ``primvars:rest``,
+``primvars:Pref``, the points' default value, a shape fitted to the median length that each edge has over the shot.
+``--rest auto`` asks for the fitted shape whatever is authored. Authored shapes are placed in the world as the garment
+at its first time code, or by a skinned garment's bind transform.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from ...errors import GarmentError
+from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import out_of_bounds
+from ...solver.strain import COLLAPSED
 from ..lookup import nearest, source_name
 from ..stage import Notice
 from .cage import as_points, repair
 
 AUTO = "auto"
-"""A rest shape fitted to the animation, in place of a time code."""
+"""Asks for the fitted rest shape where another one is authored, in place of a time code."""
+FITTED = "fitted to the shot"
+"""First words of the source of a fitted rest shape."""
+MOST_FITTED = 50
+"""Most time codes that a rest shape is fitted to, spread over the shot. Medians of 25 time codes are within 0.2 to 1.3%
+of those of all 24 to 60 on five real shots, those of 9 within 0.6 to 4.3%."""
+STEPS = 100
+"""Steps of a fit. On five real shots lengths then are within 0.1 to 0.6% of their medians (root mean square), as after
+400 to 1,500 steps without momentum."""
+HOLD = 1e-6
+"""Stiffness that ties a fitted shape to its place, in mean stiffnesses: enough for a factor, nothing to a length."""
+SHORTEST = 1e-3
+"""In mean edges; shorter ones pull no harder."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
 _BENT = ("restShape", "restShapeDefault")
 _TINY = 1e-9
@@ -42,45 +60,92 @@ class Rest:
     notices: tuple[Notice, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """A garment's points over the shot.
+
+    Attributes:
+        times: Every authored time code, whatever part of the shot is refined.
+        first: Positions at the first time code that is refined, or at the default [m], shape (V, 3).
+        read: Positions at a time code, or at the default [m], shape (V, 3), and notices of repairs.
+    """
+
+    times: Sequence[float]
+    first: np.ndarray
+    read: Callable[[float | None], tuple[np.ndarray, tuple[Notice, ...]]]
+
+
 def read_rest(
     prim: Usd.Prim,
-    edges: np.ndarray,
-    first: np.ndarray,
+    mesh: PolygonMesh,
+    asked: float | str | None,
+    animation: Animation,
     *,
     place: Callable[[np.ndarray], np.ndarray],
     baked: Sdf.Layer,
 ) -> Rest:
-    """Find the rest shape on the stage, still to be `checked`.
+    """Find or fit the rest shape.
 
     Args:
         prim: Mesh prim.
-        edges: Edges of the cage, shape (E, 2).
-        first: Positions at the points' first sample, or the default [m], shape (V, 3).
+        mesh: Faces of the cage.
+        asked: Time code whose points are the rest shape, `AUTO`, or None.
+        animation: Points over the shot.
         place: From local rest points to metres, (V, 3) to (V, 3).
         baked: Layer of baked skinning, whose points are no rest shape.
 
     Raises:
-        GarmentError: When an authored rest shape does not fit the mesh.
+        GarmentError: When an authored rest shape does not fit the mesh, or the rest shape cannot be used.
     """
-    path, count = str(prim.GetPath()), len(first)
-    authored = _authored(prim, count)
-    if authored is not None:
-        return Rest(place(authored[0]), authored[1])
-    default = _default_points(prim, baked)
-    if default is None:
-        return Rest(first, "first sample of points")
-    if len(default) != count:
-        message = f"the default points are {len(default)}, the mesh has {count}; the first sample is the rest shape"
-        return Rest(first, "first sample of points", (Notice(path, None, message),))
-    points = place(default)
-    notices: tuple[Notice, ...] = ()
-    if not np.isfinite(points).all():
-        points = repair(points, edges, first)
-        notices = (Notice(path, None, "the default points have NaN or infinite values, repaired for the rest shape"),)
-    return Rest(points, "default points", notices)
+    edges, first = mesh.half_edges.edges, animation.first
+    if asked == AUTO:
+        rest = _fitted(mesh, animation, by=" (--rest)")
+    elif asked is not None:
+        points, notices = animation.read(float(asked))
+        rest = Rest(points, f"points at time code {float(asked):g} (--rest)", notices)
+    elif (authored := _authored(prim, len(first))) is not None:
+        rest = Rest(place(authored[0]), authored[1])
+    elif (default := _default_points(prim, baked)) is None:
+        rest = _fitted(mesh, animation)
+    elif len(default) != len(first):
+        rest = _fitted(mesh, animation)
+        message = f"the default points are {len(default)}, the mesh has {len(first)}; the rest shape is {rest.source}"
+        rest = replace(rest, notices=(Notice(str(prim.GetPath()), None, message),))
+    else:
+        rest = _from_default(prim, edges, place(default), first=first)
+    return _checked(prim, edges, rest, first=first)
 
 
-def checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray) -> Rest:
+def has_rest(prim: Usd.Prim, baked: Sdf.Layer) -> bool:
+    """Whether a rest shape is authored on a mesh prim; ``baked`` as for `read_rest`."""
+    authored = (prim.GetAttribute(name) for name in _AUTHORED)
+    return any(each and each.HasAuthoredValue() for each in authored) or _default_points(prim, baked) is not None
+
+
+def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, first: np.ndarray) -> Rest:
+    """Rest shape of the points' default value [m], repaired from the first sample."""
+    if np.isfinite(points).all():
+        return Rest(points, "default points")
+    message = "the default points have NaN or infinite values, repaired for the rest shape"
+    return Rest(repair(points, edges, first), "default points", (Notice(str(prim.GetPath()), None, message),))
+
+
+def _fitted(mesh: PolygonMesh, animation: Animation, *, by: str = "") -> Rest:
+    """Rest shape fitted to the median lengths of the edges over the whole shot; ``by`` ends its source."""
+    every, poses = animation.times, dict[float | None, np.ndarray]()
+    picks = np.linspace(0, len(every) - 1, min(MOST_FITTED, len(every))).round().astype(int)
+    for time in [every[pick] for pick in picks] or [None]:
+        with contextlib.suppress(GarmentError):  # Refining a broken frame names its fault.
+            poses[time] = animation.read(time)[0]
+    found = list(poses.values())
+    if len(found) < 2:
+        return Rest(found[0] if found else animation.first, f"the only sample of points{by}")
+    shape, nearest = median_shape(_braced(mesh), found)
+    message = f"median edge lengths of {len(poses)} time codes, from the points at {[*poses][nearest]:g}"
+    return Rest(shape, f"{FITTED}: {message}{by}")
+
+
+def _checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray) -> Rest:
     """A rest shape with notices of edges without length, and of a size that differs from the animation's.
 
     Points at one place are sewn together where the animation has them at one place, too; the faces between them are no
@@ -158,3 +223,57 @@ def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:
             value = spec.default
             return None if isinstance(value, Sdf.ValueBlock) else as_points(value, str(prim.GetPath()), "points")
     return None
+
+
+def _braced(mesh: PolygonMesh) -> np.ndarray:
+    """Pairs of vertices, shape (E, 2), whose distances make a mesh's metric: its edges, and of faces with more than
+    three corners each corner with the next but one."""
+    corner, after = np.arange(len(mesh.indices)), mesh.next_corner[mesh.next_corner]
+    diagonal = mesh.next_corner[after] != corner
+    pairs = np.stack([mesh.indices[corner], mesh.indices[after]], axis=1)[diagonal]
+    return np.unique(np.sort(np.concatenate([mesh.half_edges.edges, pairs]), axis=1), axis=0)
+
+
+def median_shape(edges: np.ndarray, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
+    """Fit a shape to the median length of each edge: sum of (l - m)^2 / m over the edges, least by majorization.
+
+    A single pose has its own stretch; medians belong to none, yet cloth comes near them nearly everywhere. Poses that
+    have collapsed are left out, for garments are hidden by scaling them to nothing.
+    The method is SMACOF (de Leeuw 1977): each step solves a Laplace equation with the edges' present directions, with
+    the momentum of Nesterov (1983), which starts anew where the sum grows (O'Donoghue and Candes 2015).
+
+    Args:
+        edges: End vertices, shape (E, 2).
+        poses: Positions of the same vertices, each of shape (V, 3), at least one.
+
+    Returns:
+        The shape, (V, 3), and which pose was nearest to the medians; the fit starts there.
+    """
+    lengths = np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses])
+    total = lengths.sum(axis=1)
+    whole = total > COLLAPSED * np.sort(total)[-2:][0]  # One of them may be blown up.
+    median = np.median(lengths[whole] if whole.any() else lengths, axis=0)
+    nearest = int(np.abs(lengths - median).sum(axis=1).argmin())
+    shape = np.array(poses[nearest], np.float64)
+    if not median.any():
+        return shape, nearest
+    weight = 1.0 / np.maximum(median, max(SHORTEST * float(median.mean()), np.finfo(float).tiny))
+    rows = np.arange(len(edges))
+    ends = np.concatenate([edges[:, 0], edges[:, 1]])
+    signs = np.repeat([1.0, -1.0], len(edges))
+    spans = sparse.csr_matrix((signs, (np.tile(rows, 2), ends)), shape=(len(edges), len(shape)))
+    pull = sparse.csr_matrix(spans.T @ sparse.diags(weight))
+    stiffness = pull @ spans
+    hold = HOLD * float(stiffness.diagonal().mean())
+    solve = splu(sparse.csc_matrix(stiffness + hold * sparse.identity(len(shape)))).solve
+    ahead, pace, error = shape, 1.0, np.inf
+    for _ in range(STEPS):
+        span = spans @ ahead
+        length = np.linalg.norm(span, axis=1)
+        wanted = span * (median / np.maximum(length, np.finfo(float).tiny))[:, None]
+        last, shape = shape, solve(pull @ wanted + hold * ahead)
+        before, error = error, float((weight * (length - median) ** 2).sum())
+        last_pace = 1.0 if error > before else pace
+        pace = 0.5 + np.sqrt(0.25 + last_pace**2)
+        ahead = shape + (last_pace - 1.0) / pace * (shape - last)
+    return shape, nearest
