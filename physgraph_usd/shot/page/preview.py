@@ -40,7 +40,7 @@ def preview(
     shot: Path | str | None = None,
     times: Sequence[float] | None = None,
     size: tuple[int, int] = (1280, 640),
-    camera: tuple[float, float] = CAMERA,
+    camera: tuple[float, float] | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Draw the smoothly subdivided input beside the refined cloth, or a plain shot alone.
@@ -51,7 +51,7 @@ def preview(
         shot: The shot under the layer; found in the layer's own record when None.
         times: Time codes to draw; the last sample for a PNG and all samples for a GIF when None.
         size: Width and height [pixels].
-        camera: Azimuth and elevation [degrees].
+        camera: Azimuth and elevation [degrees]; `CAMERA` when None.
         overwrite: Whether a picture that is there may be replaced.
 
     Returns:
@@ -73,9 +73,9 @@ def preview(
     check_targets([("the picture", out)], files_of(layer) | (files_of(below) if below else set()))
     check_place(out)
     prepare_target(out, overwrite=overwrite)
-    pictures = Pictures(layer, below, size, times)
+    pictures = Pictures(layer, below, size, codes=times)
     codes = [float(time) for time in times] if times is not None else pictures.times or [None]
-    drawn = pictures.draw(codes[-1:] if suffix == STILL else codes, camera)
+    drawn = pictures.draw(codes[-1:] if suffix == STILL else codes, camera or CAMERA)
     temporary = temporary_path(out, suffix=out.suffix)
     try:
         with make_file(temporary) as stream:
@@ -102,7 +102,7 @@ class Pictures:
     """
 
     def __init__(
-        self, layer: Path, shot: Path | None, size: tuple[int, int], codes: Sequence[float] | None = None
+        self, layer: Path, shot: Path | None, size: tuple[int, int], *, codes: Sequence[float] | None = None
     ) -> None:
         """Open the stages.
 

@@ -104,7 +104,7 @@ def _pictures(report: RefineReport, shot: Shot) -> str:
     times = [written[0], written[-1]][: len(written)]
     worst = worst_place(report, shot)
     try:
-        pictures = kind(report.out, Path(report.shot), SIZE, [time for time in written if time is not None])
+        pictures = kind(report.out, Path(report.shot), SIZE, codes=[time for time in written if time is not None])
         close = "" if worst is None else _figure(pictures.draw_close(worst), f"The worst place: {worst.reason}")
         drawn = pictures.draw(times) if times else []
     except (StageError, LayerError) as error:
