@@ -106,7 +106,7 @@ def _folds(frame: dict[str, Any]) -> float:
 
 
 def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """1 at each vertex of a garment that crosses or is inside a body, shape (V,) each."""
+    """Of each vertex 1 if it is inside a body, and 1 if its edges or faces cross, summed; shape (V,) for each garment."""
     cloth = SceneCloth(shot.scene, _levels(report), dtype=torch.float32, device="cpu", threads=1)
     cloth.bodies.pose(shot.frame(time).colliders)
     level, origin = _finest(report, shot), np.concatenate(points).mean(axis=0)
@@ -115,7 +115,7 @@ def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequen
     crossing = np.zeros(level.vertex_count, bool)
     crossing[level.edges.numpy()[found.edge.numpy()]] = True
     heat = [cloth.heat(i, each, crossing[span]) for i, (each, span) in enumerate(zip(points, level.spans, strict=True))]
-    return [((each["penetration"] > 0) | (each["crossing"] > 0)).astype(float) for each in heat]
+    return [(each["penetration"] > 0) + 1.0 * (each["crossing"] > 0) for each in heat]
 
 
 def _angles(report: RefineReport, shot: Shot, points: Sequence[np.ndarray]) -> list[np.ndarray]:
