@@ -92,7 +92,7 @@ def test_the_close_picture_is_of_cloth_in_a_body(tmp_path: Path):
         centre = opened_shot.to_metres(0, worst.time)[:3, :3] @ np.asarray(corner, float)
     assert points is not None
     assert worst.path == CLOTH
-    assert np.linalg.norm(points[worst.vertex] - centre) < EDGE
+    assert np.linalg.norm(points[worst.vertex] - centre) < 2.0 * EDGE  # The radius and a fine edge's length.
     assert "inside bodies" in worst.reason
     assert verdict(report).startswith(worst.reason.partition(" edges")[0].partition(" vertices")[0])
 

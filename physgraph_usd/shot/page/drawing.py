@@ -28,10 +28,10 @@ KEY, KEY_WIDTH = np.array([-0.62, 0.62, 0.48]), 0.16
 BACKGROUND = np.array([0.80, 0.80, 0.79])
 """Linear colour of the studio."""
 
-SKY_MAPS, SKY_SIZE = 16, 256
+SKY_MAPS, SKY_SIZE = 12, 256
 """Depth maps of the sky, each for a direction and its opposite, and their width [pixels]."""
 
-KEY_MAPS, KEY_SIZE = 8, 512
+KEY_MAPS, KEY_SIZE = 6, 512
 """Depth maps of the key light, and their width [pixels]: its shadows have edges, those of the sky have none."""
 
 GROUND_CELLS, GROUND_BLUR = 84, 5

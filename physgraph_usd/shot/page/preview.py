@@ -218,7 +218,7 @@ def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lin
         pen.text((left, place), line, FAINT, font, anchor="ls")
 
 
-def _save_loop(pictures: list[Image.Image], stream: BinaryIO, rate: float, codes: list[float | None]) -> None:
+def _save_loop(pictures: list[Image.Image], stream: BinaryIO, rate: float, codes: Sequence[float | None]) -> None:
     """Write a GIF with one palette for all frames and the shot's own speed."""
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, 4).astype(int)]
     strip = Image.new("RGB", (chosen[0].width, sum(p.height for p in chosen)))

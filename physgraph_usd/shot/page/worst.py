@@ -106,7 +106,7 @@ def _folds(frame: dict[str, Any]) -> float:
 
 
 def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Of each vertex 1 if it is inside a body, and 1 if its edges or faces cross, summed; shape (V,) for each garment."""
+    """For each garment: 1 at vertices inside bodies, and 1 more where edges or faces cross, shape (V,)."""
     cloth = SceneCloth(shot.scene, _levels(report), dtype=torch.float32, device="cpu", threads=1)
     cloth.bodies.pose(shot.frame(time).colliders)
     level, origin = _finest(report, shot), np.concatenate(points).mean(axis=0)
