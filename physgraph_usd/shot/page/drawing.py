@@ -137,7 +137,7 @@ def draw(surfaces: Sequence[Surface | DrawnMesh], view: View, *, size: tuple[int
         if len(visible):
             shade = _shade(solid, ground, view, visible)
             seen[len(solid.points) :, 2] = 0.0
-            _rasterize(seen, drawn.triangles, _depths(*picture.shape[:2]), (shade, drawn.colors, picture))
+            _rasterize(seen, drawn.triangles, _depths(*picture.shape[:2]), colored=(shade, drawn.colors, picture))
     rows = picture[::2] + picture[1::2]
     return _encode((rows[:, ::2] + rows[:, 1::2]) / 4.0)
 
@@ -231,6 +231,7 @@ def _rasterize(
     seen: np.ndarray,
     triangles: np.ndarray,
     depths: tuple[np.ndarray, np.ndarray],
+    *,
     colored: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
 ) -> None:
     """Draw triangles one after another, on one thread, so that pixels need no locks.

@@ -26,7 +26,7 @@ CAMERA = (25.0, 10.0)
 ELEVATIONS = (-30.0, 45.0)
 """Elevations of a close picture's camera [degrees]."""
 
-COMPRESSION = {"compress_level": 3}
+COMPRESSION = {"compress_level": 1}
 """Of a PNG: the most that Pillow offers takes as long as drawing and saves a tenth."""
 
 INK, FAINT = (38, 40, 44), (112, 114, 118)

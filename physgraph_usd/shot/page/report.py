@@ -116,7 +116,7 @@ def _pictures(report: RefineReport, shot: Shot) -> str:
 def _figure(picture: Any, caption: str) -> str:
     """A picture inside the page."""
     stream = io.BytesIO()
-    picture.save(stream, "PNG", compress_level=3)
+    picture.save(stream, "PNG", compress_level=1)
     data = base64.b64encode(stream.getvalue()).decode("ascii")
     return (
         f"<figure><img alt='input beside refined, {html.escape(caption)}' width='{SIZE[0]}' height='{SIZE[1]}' "
