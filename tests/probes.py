@@ -112,32 +112,27 @@ def plane_stiffness(level: Level, forces: Sequence[Force]) -> np.ndarray:
     stiffness = np.sum([hessian(force, level.rest, [0, 1]) for force in forces], axis=0)
     held = np.repeat(rim(level, 1.2 * float(level.spacing.mean())), 2)
     u = relaxed(stiffness, modes, held)
-    return u.T @ stiffness @ u / float(level.triangle_area.sum())
+    return u.T @ stiffness @ u / float(level.vertex_area.sum())
 
 
 def bending_stiffness(level: Level, rigidity: float) -> np.ndarray:
     """Bending stiffness [N m], shape (3, 3), for curvatures (k11, k22, 2 k12).
 
-    Only triangles away from the rim count, each with its share of its three hinges.
+    The energy is weighed by a bump that vanishes near the rim.
     """
     p, edge = level.rest.numpy(), float(level.spacing.mean())
     modes = 0.5 * np.stack([p[:, 0] ** 2, p[:, 1] ** 2, p[:, 0] * p[:, 1]], axis=1)
     bending = Bending(level, torch.tensor([rigidity]))
     u = relaxed(hessian(bending, level.rest, [2]), modes, rim(level, 2.2 * edge))
-    centre = p[level.triangles.numpy()].mean(axis=1)[:, :2]
-    inside = ((centre > p.min(axis=0)[:2] + 3.2 * edge) & (centre < p.max(axis=0)[:2] - 3.2 * edge)).all(axis=1)
-    area = level.triangle_area.numpy()
-    first, second = hinge_triangles(level)
-    share = (area[first] * inside[first] + area[second] * inside[second]) / (area[first] + area[second])
-    bending.weight.mul_(torch.as_tensor(share))
-    return u.T @ hessian(bending, level.rest, [2]) @ u / float((area * inside).sum())
+    low, high = p.min(axis=0)[:2] + 2.7 * edge, p.max(axis=0)[:2] - 2.7 * edge
 
+    def bump(at: np.ndarray) -> np.ndarray:
+        return (np.sin(np.pi * np.clip((at[:, :2] - low) / (high - low), 0.0, 1.0)) ** 2).prod(axis=1)
 
-def hinge_triangles(level: Level) -> tuple[np.ndarray, np.ndarray]:
-    """The two triangles of each hinge."""
-    number = {frozenset(t): n for n, t in enumerate(level.triangles.tolist())}
-    pairs = [(number[frozenset((i, j, k))], number[frozenset((i, j, m))]) for i, j, k, m in level.hinges.tolist()]
-    return tuple(np.array(pairs).T)
+    weight = bump(p[level.hinges.numpy()[:, :2]].mean(axis=1))
+    weighed = replace(level, bend_scale=level.bend_scale * torch.as_tensor(weight))
+    stiffness = hessian(Bending(weighed, torch.tensor([rigidity])), level.rest, [2])
+    return u.T @ stiffness @ u / float((level.vertex_area.numpy() * bump(p)).sum())
 
 
 def turned(stiffness: np.ndarray, angle: float) -> np.ndarray:
@@ -186,7 +181,7 @@ def tensile_test(level: Level, forces: Sequence[Force]) -> tuple[float, float]:
     inside = np.abs(p[:, 0] - p[:, 0].mean()) < 0.3 * np.ptp(p[:, 0])
     fit = np.column_stack([p[inside, 0], p[inside, 1], np.ones(inside.sum())])
     slope = np.linalg.lstsq(fit, u.reshape(-1, 2)[inside], rcond=None)[0]
-    pulled = u @ stiffness @ u / (float(level.triangle_area.sum()) * float(slope[0, 0]) * strain)
+    pulled = u @ stiffness @ u / (float(level.vertex_area.sum()) * float(slope[0, 0]) * strain)
     return float(pulled), float(-slope[1, 1] / slope[0, 0])
 
 
@@ -198,7 +193,7 @@ def cylinder_rigidity(level: Level, radius: float, angle: float) -> float:
     across = p[:, 1] * np.cos(angle) - p[:, 0] * np.sin(angle)
     rolled = np.stack([radius * np.sin(along / radius), across, radius * np.cos(along / radius)], axis=1)
     energy = float(bending.add_force(torch.as_tensor(rolled), torch.zeros_like(level.rest)))
-    return 2 * energy * radius**2 / float(level.hinge_area.sum())
+    return 2 * energy * radius**2 / float(level.vertex_area.sum())
 
 
 def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int = 400) -> torch.Tensor:
@@ -225,7 +220,7 @@ def clamped(level: Level) -> Level:
     A hinge stands for the halves of two triangles; of one of them the clamp leaves nothing to bend.
     """
     held = ~level.free[:, 0][level.hinges.long()]
-    at_clamp = held[:, :2].all(dim=1) & (held[:, 2] ^ held[:, 3])
+    at_clamp = held[:, :2].all(dim=1) & (held[:, 2:4].all(dim=1) ^ held[:, 4:].all(dim=1))
     return replace(level, bend_scale=torch.where(at_clamp, 2.0, 1.0) * level.bend_scale)
 
 

@@ -112,7 +112,7 @@ def quads_one_way(length: float, width: float, edge: float) -> Sheet:
 KINDS: dict[str, Callable[[float, float, float], Sheet]] = {
     "equilateral": equilateral,
     "irregular": irregular,
-    "quads, alternating": quads_refined,
+    "quads": quads_refined,
     "quads, one way": quads_one_way,
 }
 """Sheets of a length, a width and an edge length, by the name of their mesh kind."""
@@ -136,7 +136,7 @@ def level_of_kind(
         warp: Direction of the warp, for triangles.
     """
     shift = np.array([start, 0.0, 0.0])
-    if kind != "quads, alternating":
+    if kind != "quads":
         points, triangles = KINDS[kind](*size)
         points = points + shift
         pin = np.zeros(len(points)) if pinned is None else pinned(points) * 1.0

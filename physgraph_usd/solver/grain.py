@@ -27,23 +27,23 @@ class LevelGrain:
     """The grain of one level's elements; tensors on its device.
 
     Attributes:
-        edge: Squared cosines of each edge with warp and weft, mean over its triangles, shape (E, 2).
+        spring: Squared cosines of each spring with warp and weft, mean over its triangles, shape (S, 2).
         hinge: cos 2a of each hinge, a from the warp to the direction in which it bends, shape (H,).
-        edge_scale, triangle_scale: Painted multiplier of the ease, shapes (E,) and (T,).
-        edge_gather, triangle_gather: Painted length more along the weft, as a fraction, shapes (E,) and (T,).
+        spring_scale, membrane_scale: Painted multiplier of the ease, shapes (S,) and (M,).
+        spring_gather, membrane_gather: Painted length more along the weft, as a fraction, shapes (S,) and (M,).
     """
 
-    edge: Float[Tensor, "edges 2"]
+    spring: Float[Tensor, "springs 2"]
     hinge: Float[Tensor, " hinges"]
-    edge_scale: Float[Tensor, " edges"]
-    triangle_scale: Float[Tensor, " triangles"]
-    edge_gather: Float[Tensor, " edges"]
-    triangle_gather: Float[Tensor, " triangles"]
+    spring_scale: Float[Tensor, " springs"]
+    membrane_scale: Float[Tensor, " membrane"]
+    spring_gather: Float[Tensor, " springs"]
+    membrane_gather: Float[Tensor, " membrane"]
 
     @property
     def gathers(self) -> bool:
         """Whether anything is gathered."""
-        return bool((self.triangle_gather != 0).any())
+        return bool((self.membrane_gather != 0).any())
 
 
 def axes(rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

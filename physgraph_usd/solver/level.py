@@ -17,21 +17,18 @@ from torch import Tensor
 from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
 from .mesh.defects import FLAT
+from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
 from .mesh.lengths import ANGLES, LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, on_triangles, smooth, subdivide_times
-from .mesh.topology import TriangleSplit, edges_of, find_edges, hinges_of, quad_edges
+from .mesh.topology import TriangleSplit, edges_of, find_edges
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
 """Cap of l0^2 / (A1 + A2): 1.15 on equilateral triangles, unbounded on slivers."""
 
-QUAD_SPRING = (0.75, 1.5)
-"""Factors of the springs along a quad's sides and diagonal: with them squares whose diagonals alternate, as subdivision
-splits them, are isotropic with nu = 1/3; else Y varies from 0.75 to 1.2 with direction (docs/notes/calibration.md)."""
-
-QUAD_HINGE = (1.28, 0.64)
-"""Such factors of hinges: D is then 1 in all directions instead of 0.86 to 1.36."""
+OWNED = {"spring": "springs", "membrane": "membrane", "hinge": "hinges"}
+"""Names of elements in the level's fields, and the arrays of `ElasticElements` that hold them."""
 
 PIN_MARGIN = 1e-6
 """A pin within this of 1 is exact."""
@@ -53,25 +50,26 @@ class Level:
     Attributes:
         index: 0 is the cage.
         spans: Vertex range of each garment.
-        rest: Rest positions [m], shape (V, 3).
-        triangles: Corner vertices, shape (T, 3).
-        edges: End vertices, shape (E, 2).
-        hinges: Edge i-j, then the opposite vertices k and l, shape (H, 4).
-        rest_length: [m], shape (E,).
-        edge_area: A third of the adjacent triangles' areas [m^2], shape (E,).
-        edge_factor: `QUAD_SPRING` on edges of quads, 1 on edges of triangles, shape (E,).
-        hinge_shape: l0^2 / (A1 + A2), clamped, shape (H,).
-        hinge_factor: `QUAD_HINGE` on edges of quads, 1 on edges of triangles, shape (H,).
+        rest: Rest positions [m], shape (V, 3): the cage's, smoothly subdivided. Lengths and areas of the cloth are
+            those of this surface, scaled to the area that the cage has there.
+        triangles: Corner vertices of the surface that collides; a quad is two, shape (T, 3).
+        edges: Their sides, shape (E, 2).
+        springs: End vertices of the elastic springs, every edge among them, shape (S, 2).
+        edge_spring: The spring along each edge, shape (E,).
+        spring_length: Rest length [m], shape (S,).
+        spring_area: A third of the adjacent triangles' areas [m^2], times `QUAD_SPRING` in quads, shape (S,).
+        membrane: Corner vertices of the elastic triangles, shape (M, 3): all those of both splits of a quad.
+        membrane_area: Rest area that each stands for [m^2], shape (M,): half of its own in a quad.
+        membrane_inverse: Inverse of the rest sides in the material's axes [1/m], rows (a, b, c, d) of [[a, b], [c, d]],
+            shape (M, 4); zero where a triangle has no area.
+        hinges: Edge i-j and the corners opposite to it: k and k' of one face, l and l' of the other, shape (H, 6).
+        hinge_shape: Bending stiffness of a hinge over the fabric's, as `rest_shape` gives it, shape (H,).
         hinge_area: A third of the two triangles' areas [m^2], shape (H,).
         rest_angle: [rad], shape (H,).
-        vertex_area: A third of the incident triangles' areas [m^2], shape (V,).
-        spacing: Mean rest length of the incident edges [m], shape (V,).
-        triangle_area: Rest area [m^2], shape (T,).
-        triangle_inverse: Inverse of the rest sides in the material's axes [1/m], rows (a, b, c, d) of [[a, b], [c, d]],
-            shape (T, 4); zero where a triangle has no area.
-        edge_garment, hinge_garment, vertex_garment, triangle_garment: Garment number of each element.
-        stretch_scale: Painted multiplier, shape (E,).
-        triangle_scale: The same multiplier for triangles, shape (T,).
+        vertex_area: A third of the areas of the incident elastic triangles [m^2], shape (V,).
+        spacing: Mean rest length of the incident springs [m], shape (V,).
+        spring_garment, hinge_garment, vertex_garment, membrane_garment: Garment number of each element.
+        spring_scale, membrane_scale: Painted multiplier of the stretch stiffness, shapes (S,) and (M,).
         bend_scale: Painted multiplier, shape (H,).
         pin: Painted pin weight, shape (V,); fixed where it is 1.
         from_coarse: Linear map from the cage, shape (V, C).
@@ -88,24 +86,25 @@ class Level:
     rest: Float[Tensor, "vertices 3"]
     triangles: Int[Tensor, "triangles 3"]
     edges: Int[Tensor, "edges 2"]
-    hinges: Int[Tensor, "hinges 4"]
-    rest_length: Float[Tensor, " edges"]
-    edge_area: Float[Tensor, " edges"]
-    edge_factor: Float[Tensor, " edges"]
+    springs: Int[Tensor, "springs 2"]
+    edge_spring: Int[Tensor, " edges"]
+    spring_length: Float[Tensor, " springs"]
+    spring_area: Float[Tensor, " springs"]
+    membrane: Int[Tensor, "membrane 3"]
+    membrane_area: Float[Tensor, " membrane"]
+    membrane_inverse: Float[Tensor, "membrane 4"]
+    hinges: Int[Tensor, "hinges 6"]
     hinge_shape: Float[Tensor, " hinges"]
-    hinge_factor: Float[Tensor, " hinges"]
     hinge_area: Float[Tensor, " hinges"]
     rest_angle: Float[Tensor, " hinges"]
     vertex_area: Float[Tensor, " vertices"]
     spacing: Float[Tensor, " vertices"]
-    triangle_area: Float[Tensor, " triangles"]
-    triangle_inverse: Float[Tensor, "triangles 4"]
-    edge_garment: Int[Tensor, " edges"]
+    spring_garment: Int[Tensor, " springs"]
     hinge_garment: Int[Tensor, " hinges"]
     vertex_garment: Int[Tensor, " vertices"]
-    triangle_garment: Int[Tensor, " triangles"]
-    stretch_scale: Float[Tensor, " edges"]
-    triangle_scale: Float[Tensor, " triangles"]
+    membrane_garment: Int[Tensor, " membrane"]
+    spring_scale: Float[Tensor, " springs"]
+    membrane_scale: Float[Tensor, " membrane"]
     bend_scale: Float[Tensor, " hinges"]
     pin: Float[Tensor, " vertices"]
     from_coarse: sp.csr_matrix
@@ -121,22 +120,27 @@ class Level:
         if self.grain is None or not (self.grain.gathers or any(each.is_eased for each in fabrics)):
             return self
         ease = self.rest.new_tensor([[each.warp_ease, each.weft_ease] for each in fabrics])
-        at_edges, at_triangles = (
+        at_springs, at_membrane = (
             (1.0 + scale.unsqueeze(1) * ease[owner.long()] + torch.stack([0.0 * gather, gather], dim=1)).clamp_min(
                 SHORTEST
             )
             for scale, gather, owner in (
-                (self.grain.edge_scale, self.grain.edge_gather, self.edge_garment),
-                (self.grain.triangle_scale, self.grain.triangle_gather, self.triangle_garment),
+                (self.grain.spring_scale, self.grain.spring_gather, self.spring_garment),
+                (self.grain.membrane_scale, self.grain.membrane_gather, self.membrane_garment),
             )
         )
         return replace(
             self,
-            rest_length=self.rest_length * (self.grain.edge * at_edges**2).sum(dim=1).sqrt(),
-            edge_area=self.edge_area * at_edges.prod(dim=1),
-            triangle_area=self.triangle_area * at_triangles.prod(dim=1),
-            triangle_inverse=self.triangle_inverse / at_triangles.repeat(1, 2),
+            spring_length=self.spring_length * (self.grain.spring * at_springs**2).sum(dim=1).sqrt(),
+            spring_area=self.spring_area * at_springs.prod(dim=1),
+            membrane_area=self.membrane_area * at_membrane.prod(dim=1),
+            membrane_inverse=self.membrane_inverse / at_membrane.repeat(1, 2),
         )
+
+    @cached_property
+    def rest_length(self) -> Float[Tensor, " edges"]:
+        """Rest lengths of the edges [m]."""
+        return self.spring_length[self.edge_spring.long()]
 
     @property
     def dtype(self) -> torch.dtype:
@@ -239,11 +243,10 @@ class _GarmentLevel:
 
     vertex_count: int
     rest: np.ndarray
+    size: np.ndarray
     triangles: np.ndarray
     edges: np.ndarray
-    hinges: np.ndarray
-    edge_factor: np.ndarray
-    hinge_factor: np.ndarray
+    elements: ElasticElements
     bent_rest: bool
     vertex_values: dict[str, np.ndarray]
     warp: np.ndarray | None
@@ -267,32 +270,56 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         mesh, face = refinement.mesh, face[refinement.parent_face]
     if index > len(chain):
         linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
-    rest = np.asarray(linear @ np.asarray(garment.rest, dtype=np.float64))
-    split = _sound(mesh.triangulate(rest if not chain else None), rest)
-    triangles, hinges = split.triangles, hinges_of(split.triangles)
-    edges = edges_of(triangles, mesh.vertex_count).vertices
-    from_quad, diagonal = quad_edges(split, mesh.counts, edges)
-    edge_factor, at_edge = (1.0 + from_quad * (np.where(diagonal, f[1], f[0]) - 1.0) for f in (QUAD_SPRING, QUAD_HINGE))
+    bilinear, rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
+    split = _sound(mesh.triangulate(bilinear if not chain else None), bilinear)
+    elements = elastic_elements(mesh, split, bilinear)
     painted = {name: getattr(garment, name) for name in ("stretch_scale", "bend_scale", "pin")}
     if garment.grain is not None:
         painted |= {"ease_scale": garment.grain.ease_scale, "gather": garment.grain.gather}
     return _GarmentLevel(
         vertex_count=mesh.vertex_count,
         rest=rest,
-        triangles=triangles,
-        edges=edges,
-        hinges=hinges,
-        edge_factor=edge_factor,
-        hinge_factor=at_edge[find_edges(edges, hinges[:, :2])],
+        size=_size(linear, elements, bilinear, rest),
+        triangles=split.triangles,
+        edges=edges_of(split.triangles, mesh.vertex_count).vertices,
+        elements=elements,
         bent_rest=garment.bent_rest,
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
-        warp=None if garment.grain is None else garment.grain.warp[face[split.face]],
+        warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
         linear=linear,
         smooth=smoothing,
         linear_step=linear_step,
         smooth_step=smooth_step,
         flat_step=flat_step,
     )
+
+
+def _size(linear: sp.csr_matrix, elements: ElasticElements, bilinear: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Lengths of the cloth over those of its smooth rest surface, shape (V,).
+
+    Smooth subdivision makes a curved cage smaller. Round each cage vertex the cloth has the area of the cage.
+
+    Args:
+        linear: Linear map from the cage, shape (V, C).
+        elements: Elastic elements.
+        bilinear: The cage's rest positions on the mesh, linearly [m], shape (V, 3).
+        rest: The same smoothly [m].
+    """
+    round_cage, smoothed = (linear.T @ vertex_areas(x, elements.membrane, elements.share) for x in (bilinear, rest))
+    known = smoothed > 0
+    return np.asarray(linear @ np.sqrt(np.where(known, round_cage / np.where(known, smoothed, 1.0), 1.0)))
+
+
+def vertex_areas(x: np.ndarray, triangles: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """A third of the areas that the triangles at each vertex stand for [m^2], shape (V,)."""
+    area = share * triangle_areas(x, triangles)
+    return np.bincount(triangles.ravel(), np.repeat(area, 3) / 3.0, len(x))
+
+
+def triangle_areas(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Area of each triangle [m^2], shape (T,)."""
+    corners = x[triangles]
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
 def _sound(split: TriangleSplit, rest: np.ndarray) -> TriangleSplit:
@@ -319,14 +346,18 @@ def _join(
     counts = [part.vertex_count for part in parts]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     elements = {
-        name: np.concatenate([getattr(part, name) + start for part, start in zip(parts, starts, strict=False)])
-        for name in ("triangles", "edges", "hinges")
+        name: np.concatenate([each + start for each, start in zip(found, starts, strict=False)])
+        for name, found in (
+            *((name, [getattr(part, name) for part in parts]) for name in ("triangles", "edges")),
+            *((name, [getattr(part.elements, name) for part in parts]) for name in ("springs", "membrane", "hinges")),
+        )
     }
     owners = {"vertex_garment": counts}
-    owners |= {f"{name[:-1]}_garment": [len(getattr(part, name)) for part in parts] for name in elements}
+    owners |= {f"{name}_garment": [len(getattr(p.elements, f)) for p in parts] for name, f in OWNED.items()}
     whole = elements | {name: np.repeat(np.arange(len(parts)), sizes) for name, sizes in owners.items()}
+    whole["edge_spring"] = find_edges(elements["springs"], elements["edges"])
     warp, grain = _grain(parts, elements)
-    real = _measured(parts, elements["triangles"], elements["edges"], hinges=elements["hinges"], warp=warp)
+    real = _measured(parts, elements, warp=warp)
     tensors = {n: torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device) for n, a in grain.items()}
     return Level(
         index=index,
@@ -344,94 +375,109 @@ def _join(
 
 
 def _grain(parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The warp's direction on each triangle, shape (T, 3), 0 where unknown, and the fields of `LevelGrain`, if any."""
-    triangles, edges, hinges = (elements[name] for name in ("triangles", "edges", "hinges"))
+    """The warp's direction on each membrane triangle, shape (M, 3), 0 where unknown, and `LevelGrain`'s fields."""
+    triangles, springs, hinges = (elements[name] for name in ("membrane", "springs", "hinges"))
     if all(part.warp is None for part in parts):
         return np.zeros((len(triangles), 3)), {}
     rest = np.concatenate([part.rest for part in parts])
-    warp = np.concatenate([np.zeros((len(p.triangles), 3)) if p.warp is None else p.warp for p in parts])
-    cosines = edge_cosines(rest, triangles, edges, warp=warp)
+    warp = np.concatenate([np.zeros((len(p.elements.membrane), 3)) if p.warp is None else p.warp for p in parts])
+    cosines = edge_cosines(rest, triangles, springs, warp=warp)
     scale, gather = (
         np.concatenate([part.vertex_values.get(name, np.full(part.vertex_count, none)) for part in parts])
         for name, none in (("ease_scale", 1.0), ("gather", 0.0))
     )
-    along = cosines[find_edges(edges, hinges[:, :2])]
+    along = cosines[find_edges(springs, hinges[:, :2])]
     return warp, {
-        "edge": cosines,
+        "spring": cosines,
         "hinge": along[:, 1] - along[:, 0],  # A hinge bends across its edge.
-        "edge_scale": scale[edges].mean(axis=1),
-        "triangle_scale": scale[triangles].mean(axis=1),
-        "edge_gather": gather[edges].mean(axis=1),
-        "triangle_gather": gather[triangles].mean(axis=1),
+        "spring_scale": scale[springs].mean(axis=1),
+        "membrane_scale": scale[triangles].mean(axis=1),
+        "spring_gather": gather[springs].mean(axis=1),
+        "membrane_gather": gather[triangles].mean(axis=1),
     }
 
 
 def _measured(
-    parts: Sequence[_GarmentLevel], triangles: np.ndarray, edges: np.ndarray, *, hinges: np.ndarray, warp: np.ndarray
+    parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray], *, warp: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Every real-valued field of a level, under its name there."""
-    rest = np.concatenate([part.rest for part in parts])
-    bent = np.repeat([part.bent_rest for part in parts], [len(part.hinges) for part in parts])
-    area, inverse = triangle_shape(rest, triangles, warp)
+    springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
+    rest, size = (np.concatenate([getattr(part, name) for part in parts]) for name in ("rest", "size"))
+    share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))
+    bent = np.repeat([part.bent_rest for part in parts], [len(part.elements.hinges) for part in parts])
+    inverse = triangle_inverse(rest, triangles, warp)
     stretch, bend, pin = (
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
-    return rest_shape(rest, triangles, edges, hinges, bent=bent) | {
+    shape = rest_shape(rest, springs, triangles, share=share, hinges=hinges, twists=twists, bent=bent, size=size)
+    return shape | {
         "rest": rest,
-        "edge_factor": np.concatenate([part.edge_factor for part in parts]),
-        "hinge_factor": np.concatenate([part.hinge_factor for part in parts]),
-        "triangle_area": area,
-        "triangle_inverse": inverse,
-        "stretch_scale": stretch[edges].mean(axis=1),
-        "triangle_scale": stretch[triangles].mean(axis=1),
+        "membrane_inverse": inverse / size[triangles].mean(axis=1, keepdims=True),
+        "spring_scale": stretch[springs].mean(axis=1),
+        "membrane_scale": stretch[triangles].mean(axis=1),
         "bend_scale": bend[hinges[:, :2]].mean(axis=1),
         "pin": pin,
     }
 
 
 def rest_shape(
-    rest: np.ndarray, triangles: np.ndarray, edges: np.ndarray, hinges: np.ndarray, *, bent: np.ndarray
+    rest: np.ndarray,
+    springs: np.ndarray,
+    membrane: np.ndarray,
+    *,
+    share: np.ndarray,
+    hinges: np.ndarray,
+    twists: np.ndarray,
+    bent: np.ndarray,
+    size: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Lengths, areas and angles of the rest shape, under the names of `Level`'s fields.
 
+    The bending energy of a sheet is D/2 (k1^2 + k2^2) by its principal curvatures. A hinge at an edge l between
+    triangles of areas A1 and A2 bends across l: D l^2 / (A1 + A2) times half its angle squared. On a grid of rectangles
+    these leave out D k12^2, the twist along the sides. Round the diagonal l of a rectangle of area A the angle is
+    k12 l, so each of both diagonals has D A / l^2.
+
     Args:
-        rest: Rest positions [m], shape (V, 3), float64.
-        triangles: Shape (T, 3).
-        edges: Shape (E, 2).
-        hinges: Shape (H, 4).
+        rest: Positions [m], shape (V, 3), float64.
+        springs: Shape (S, 2).
+        membrane: Shape (M, 3).
+        share: Fraction of the area that a triangle stands for, shape (M,).
+        hinges: Shape (H, 6).
+        twists: Whether a hinge is a quad's diagonal, shape (H,).
         bent: True where a hinge rests at the rest shape's angle, shape (H,).
+        size: Lengths of the cloth over those of the rest positions, shape (V,).
 
     Returns:
-        rest_length, edge_area, hinge_shape, hinge_area, rest_angle, vertex_area, spacing.
+        spring_length, spring_area, membrane_area, hinge_shape, hinge_area, rest_angle, vertex_area, spacing.
     """
     count = len(rest)
-    corners = rest[triangles]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    length = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
-    edge_of_side = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]])
-    edge_area = np.bincount(edge_of_side, np.repeat(area, 3) / 3.0, len(edges)) if len(edges) else np.zeros(0)
-    vertex_area = np.bincount(triangles.ravel(), np.repeat(area, 3) / 3.0, count)
-    degree = np.bincount(edges.ravel(), minlength=count)
-    spacing = np.bincount(edges.ravel(), np.repeat(length, 2), count) / np.maximum(degree, 1)
+    area = share * triangle_areas(rest, membrane) * size[membrane].mean(axis=1) ** 2
+    length = np.linalg.norm(rest[springs[:, 1]] - rest[springs[:, 0]], axis=1) * size[springs].mean(axis=1)
+    side = find_edges(springs, membrane[:, [[0, 1], [1, 2], [2, 0]]])
+    factor = np.where((share < 1.0)[:, None], np.array(QUAD_SPRING)[[0, 0, 1]], 1.0)
+    spring_area = np.bincount(side, (factor * area[:, None] / 3.0).ravel(), len(springs)) if len(springs) else length
+    degree = np.bincount(springs.ravel(), minlength=count)
+    spacing = np.bincount(springs.ravel(), np.repeat(length, 2), count) / np.maximum(degree, 1)
     fallback = float(length.mean()) if len(length) else 1.0
     angle, first, second, hinge_length = hinge_geometry(rest, hinges)
     with np.errstate(divide="ignore", invalid="ignore"):
-        hinge_shape = np.minimum(hinge_length**2 / (first + second), HINGE_SHAPE_LIMIT)
+        ratio = hinge_length**2 / (first + second)
+        hinge_shape = np.where(twists, 1.0 / ratio, np.minimum(ratio, HINGE_SHAPE_LIMIT))
     return {
-        "rest_length": np.maximum(length, 1e-9 * fallback),
-        "edge_area": edge_area,
+        "spring_length": np.maximum(length, 1e-9 * fallback),
+        "spring_area": spring_area,
+        "membrane_area": area,
         "hinge_shape": np.nan_to_num(hinge_shape, nan=0.0),
         "hinge_area": (first + second) / 3.0,
         "rest_angle": np.where(bent, angle, 0.0),
-        "vertex_area": vertex_area,
+        "vertex_area": np.bincount(membrane.ravel(), np.repeat(area, 3) / 3.0, count),
         "spacing": np.where(spacing > 0, spacing, fallback),
     }
 
 
-def triangle_shape(
-    rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Area of each triangle and its sides' inverse in the material's axes, which are warp and weft (`axes`).
+def triangle_inverse(rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray | None = None) -> np.ndarray:
+    """Inverse of each triangle's sides in the material's axes, which are warp and weft (`axes`).
 
     Args:
         rest: Rest positions [m], shape (V, 3), float64.
@@ -439,7 +485,7 @@ def triangle_shape(
         warp: Direction of the warp on each triangle, shape (T, 3), 0 where unknown; None where it is on all.
 
     Returns:
-        Areas [m^2], shape (T,), and the rows of the inverse [1/m], shape (T, 4), zero where there is no area.
+        Rows of the inverse [1/m], shape (T, 4), zero where there is no area.
     """
     corners = rest[triangles]
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -449,12 +495,18 @@ def triangle_shape(
     sides = (first**2).sum(axis=1, keepdims=True) + (second**2).sum(axis=1, keepdims=True)
     whole = double > 1e-12 * sides
     adjugate = np.stack([d, -b, -c, a], axis=1)
-    return 0.5 * double[:, 0], np.where(whole, adjugate / np.where(whole, double, 1.0), 0.0)
+    return np.where(whole, adjugate / np.where(whole, double, 1.0), 0.0)
+
+
+def hinge_corners(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions of each hinge's edge, i and j, and of the middles k and l of what is opposite to it, shapes (H, 3)."""
+    i, j, k, other_k, ell, other_l = (x[hinges[:, corner]] for corner in range(6))
+    return i, j, 0.5 * (k + other_k), 0.5 * (ell + other_l)
 
 
 def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Signed angle [rad], both triangle areas [m^2] and edge length [m] of each hinge."""
-    i, j, k, ell = (x[hinges[:, corner]] for corner in range(4))
+    i, j, k, ell = hinge_corners(x, hinges)
     axis = j - i
     n1, n2 = np.cross(axis, k - i), np.cross(ell - i, axis)
     length = np.linalg.norm(axis, axis=1)

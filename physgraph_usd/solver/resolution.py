@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import StageError
 from .folds import EDGES_PER_WAVE, raised_by
-from .level import Level, hinge_geometry
+from .level import Level
 from .mesh.subdivide import fine_count
 from .mesh.topology import edges_of
 from .scene import Frame, Garment, GarmentFrame, Scene
@@ -164,23 +164,8 @@ def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame])
 
 
 def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
-    """Fraction of the hinges that fold by more than 45 degrees; every fourth hinge is measured."""
-    hinges = level.hinges[::4]
-    if not len(hinges):
-        return 0.0
-    if x.is_cuda:
-        return float((_angles(x.double(), hinges.long()).abs() > SHARP_FOLD).double().mean())
-    angle = hinge_geometry(x.double().numpy(), hinges.numpy())[0]
-    return float((np.abs(angle) > SHARP_FOLD).mean())
-
-
-def _angles(x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges 4"]) -> Float[Tensor, " hinges"]:
-    """Signed angle of each hinge [rad], as `hinge_geometry` has it, found where the positions are."""
-    i, j, k, ell = x[hinges].unbind(dim=1)
-    axis = j - i
-    n1, n2 = torch.linalg.cross(axis, k - i), torch.linalg.cross(ell - i, axis)
-    length = axis.norm(dim=1).clamp_min(torch.finfo(x.dtype).tiny)
-    return torch.atan2((torch.linalg.cross(n1, n2) * axis).sum(dim=1) / length, (n1 * n2).sum(dim=1))
+    """Fraction of the hinges that fold by more than 45 degrees."""
+    return float((level.angles(x).abs() > SHARP_FOLD).double().mean()) if len(level.hinges) else 0.0
 
 
 def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:

@@ -57,7 +57,7 @@ def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray, 
 def _carried(level: Level, fabrics: Sequence[Fabric], raised: Sequence[bool]) -> Tensor:
     """The bending stiffness that hinges of raised garments have at least [N m], shape (H,); 0 where none bends."""
     owner, ends = level.hinge_garment.long(), level.hinges[:, :2]
-    painted = level.stretch_scale[find_edges(level.edges.cpu().numpy(), ends.cpu().numpy())]
+    painted = level.spring_scale[find_edges(level.springs.cpu().numpy(), ends.cpu().numpy())]
     edge = level.spacing[ends.long()].mean(dim=1)
     least = torch.zeros_like(edge)
     for index, (fabric, wanted) in enumerate(zip(fabrics, raised, strict=True)):

@@ -1,19 +1,19 @@
 """Bending: dihedral angles at the edges.
 
-    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D c_h l0^2 / (A1 + A2)   (potential="continuum")
-                                                w_h = k_b a_h / A              (potential="paper")
+    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D s_h         (potential="continuum")
+                                                w_h = k_b a_h / A   (potential="paper")
 
 | symbol | here | meaning |
 |---|---|---|
 | D | ``rigidity`` | bending stiffness [N m] |
 | theta | atan2(n1 x n2 . e, n1 . n2) | signed angle between the triangles' normals [rad] |
-| l0^2 / (A1 + A2) | ``level.hinge_shape`` | clamped on slivers |
-| c_h | ``level.hinge_factor`` | 1 on triangles; makes alternately split quads isotropic |
+| s_h | ``level.hinge_shape`` | l0^2 / (A1 + A2) at edges, A / l0^2 at both diagonals of a quad (`level.rest_shape`) |
 | | `grain.bending_factor` | where warp and weft differ: D by the direction in which a hinge bends |
 | k_b | 3.46 D | the paper's constant [N m] for the same D on an equilateral lattice (docs/fabrics.md) |
 
-theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is continuous wherever a hinge turns: a hem
-pressed to theta0 = 3 may pass pi. Its force changes sign half a turn from theta0.
+At an edge of a quad the normal is that of the triangle from the edge to the middle of the opposite side, the mean over
+both splits of the quad. theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is continuous wherever
+a hinge turns: a hem pressed to theta0 = 3 may pass pi. Its force changes sign half a turn from theta0.
 Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
 """
 
@@ -22,6 +22,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ PAPER_HINGE = 3.46
 TURN = 2.0 * math.pi
 """A full turn [rad]."""
 PER_TURN = 1.0 / TURN
+_SIX = wp.types.vector(length=6, dtype=wp.int32)
 
 
 @wp.func
@@ -82,6 +84,32 @@ def _angle(y: wp.float64, x: wp.float64) -> wp.float64:
     return wp.atan2(y, x)
 
 
+@wp.func
+def _bent(axis: Any, ik: Any, il: Any, weight: Any, rest_angle: Any):
+    """Energy [J] of a hinge and the forces [N] on j, k and l, by its sides from i."""
+    one = type(weight)(1.0)
+    n1 = wp.cross(axis, ik)
+    n2 = wp.cross(il, axis)
+    square = wp.dot(axis, axis)
+    # The floors are relative to the hinge's own size: they act on collapsed triangles only.
+    tiny = type(weight)(1.0e-12) * (square + wp.dot(ik, ik) + wp.dot(il, il))
+    square = _larger(square, tiny + type(weight)(1.0e-30))
+    length = wp.sqrt(square)  # pyright: ignore[reportArgumentType]
+    floor = tiny * square + type(weight)(1.0e-37)
+    s1 = _larger(wp.dot(n1, n1), floor)
+    s2 = _larger(wp.dot(n2, n2), floor)
+    # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
+    theta = _angle(-length * wp.dot(n1, il), wp.dot(n1, n2))
+    bent = theta - rest_angle
+    bent = bent - type(weight)(TURN) * wp.rint(bent * type(weight)(PER_TURN))
+    moment = weight * bent * length
+    at_k = n1 * (moment / s1)
+    at_l = n2 * (moment / s2)
+    per_square = one / square
+    at_j = at_k * (wp.dot(ik, axis) * per_square) + at_l * (wp.dot(il, axis) * per_square)
+    return type(weight)(0.5) * weight * bent * bent, -at_j, at_k, at_l
+
+
 @wp.kernel
 def _bending(
     first: wp.int32,
@@ -93,39 +121,60 @@ def _bending(
     corner_force: wp.array(dtype=Any),
 ):
     h = first + wp.tid()
-    one = weight.dtype(1.0)
     corner = corners[h]
     xi = x[corner[0]]
-    axis = x[corner[1]] - xi
-    ik = x[corner[2]] - xi
-    il = x[corner[3]] - xi
-    n1 = wp.cross(axis, ik)
-    n2 = wp.cross(il, axis)
-    square = wp.dot(axis, axis)
-    # The floors are relative to the hinge's own size: they act on collapsed triangles only.
-    tiny = weight.dtype(1.0e-12) * (square + wp.dot(ik, ik) + wp.dot(il, il))
-    square = _larger(square, tiny + weight.dtype(1.0e-30))
-    length = wp.sqrt(square)  # pyright: ignore[reportArgumentType]
-    floor = tiny * square + weight.dtype(1.0e-37)
-    s1 = _larger(wp.dot(n1, n1), floor)
-    s2 = _larger(wp.dot(n2, n2), floor)
-    # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
-    theta = _angle(-length * wp.dot(n1, il), wp.dot(n1, n2))
-    bent = theta - rest_angle[h]
-    bent = bent - weight.dtype(TURN) * wp.rint(bent * weight.dtype(PER_TURN))
-    energy[h] = weight.dtype(0.5) * weight[h] * bent * bent
-    moment = weight[h] * bent * length
-    at_k = n1 * (moment / s1)
-    at_l = n2 * (moment / s2)
-    per_square = one / square
-    at_j = at_k * (wp.dot(ik, axis) * per_square) + at_l * (wp.dot(il, axis) * per_square)
-    corner_force[4 * h] = at_j - at_k - at_l
-    corner_force[4 * h + 1] = -at_j
+    axis, ik, il = x[corner[1]] - xi, x[corner[2]] - xi, x[corner[3]] - xi
+    stored, at_j, at_k, at_l = _bent(axis, ik, il, weight[h], rest_angle[h])
+    energy[h] = stored
+    corner_force[4 * h] = -at_j - at_k - at_l
+    corner_force[4 * h + 1] = at_j
     corner_force[4 * h + 2] = at_k
     corner_force[4 * h + 3] = at_l
 
 
+@wp.kernel
+def _bending_of_quads(
+    first: wp.int32,
+    x: wp.array(dtype=Any),
+    corners: wp.array(dtype=_SIX),
+    weight: wp.array(dtype=Any),
+    rest_angle: wp.array(dtype=Any),
+    energy: wp.array(dtype=Any),
+    corner_force: wp.array(dtype=Any),
+):
+    h = first + wp.tid()
+    half = weight.dtype(0.5)
+    corner = corners[h]
+    xi = x[corner[0]]
+    axis = x[corner[1]] - xi
+    ik, il = (x[corner[2]] + x[corner[3]]) * half - xi, (x[corner[4]] + x[corner[5]]) * half - xi
+    stored, at_j, at_k, at_l = _bent(axis, ik, il, weight[h], rest_angle[h])
+    energy[h] = stored
+    corner_force[6 * h] = -at_j - at_k - at_l
+    corner_force[6 * h + 1] = at_j
+    corner_force[6 * h + 2] = at_k * half
+    corner_force[6 * h + 3] = at_k * half
+    corner_force[6 * h + 4] = at_l * half
+    corner_force[6 * h + 5] = at_l * half
+
+
 _KERNELS = element_overloads(_bending, width=4, parameters=2)
+_KERNELS_OF_QUADS = element_overloads(_bending_of_quads, width=6, parameters=2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """Hinges with the same number of corners.
+
+    Attributes:
+        which: Their numbers among the level's, shape (K,).
+        corners: Corner vertices, shape (K, 4) between triangles and in quads, (K, 6) at edges of quads.
+        elements: Their launches.
+    """
+
+    which: Int[Tensor, " hinges"]
+    corners: Int[Tensor, "hinges corners"]
+    elements: Elements
 
 
 class Bending:
@@ -165,9 +214,20 @@ class Bending:
         if potential == "paper":
             self.weight = PAPER_HINGE * scaled * level.hinge_area / garment_area(level)[owner]
         else:
-            self.weight = scaled * level.hinge_factor * level.hinge_shape
+            self.weight = scaled * level.hinge_shape
         self._level, self.rest_angle = level, level.rest_angle
-        self._elements = Elements(_KERNELS, level.hinges, [self.weight, level.rest_angle], level=level)
+        narrow = (level.hinges[:, 2] == level.hinges[:, 3]) & (level.hinges[:, 4] == level.hinges[:, 5])
+        self._kinds = [
+            _Kind(
+                which, corners, Elements(kernels, corners, [self.weight[which], level.rest_angle[which]], level=level)
+            )
+            for which, columns, kernels in (
+                (torch.nonzero(narrow)[:, 0], [0, 1, 2, 4], _KERNELS),
+                (torch.nonzero(~narrow)[:, 0], [0, 1, 2, 3, 4, 5], _KERNELS_OF_QUADS),
+            )
+            for corners in (level.hinges[which][:, columns],)
+            if len(which)
+        ]
 
     def resting_at(self, rest_angle: Float[Tensor, " hinges"]) -> Bending:
         """These springs with other angles at rest [rad], which are read anew at each evaluation."""
@@ -177,17 +237,27 @@ class Bending:
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(x, force, {1: argument(self.rest_angle)})
+        energy = torch.zeros((), dtype=torch.float64, device=x.device)
+        for each in self._kinds:
+            angle = self.rest_angle if len(self._kinds) == 1 else self.rest_angle[each.which]
+            energy = energy + each.elements.evaluate(x, force, {1: argument(angle)})
+        return energy
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each hinge [J] where the force was added last, and its garment."""
-        return self._elements.energy, self._level.hinge_garment
+        energy = torch.zeros_like(self.weight)
+        for each in self._kinds:
+            energy[each.which] = each.elements.energy
+        return energy, self._level.hinge_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of w (dtheta/dx)(dtheta/dx)^T at each corner [N/m]."""
-        jacobian = hinge_jacobian(x, self._level.hinges)
-        value = self.weight.unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
-        return add_at(torch.zeros_like(self._level.spacing), self._level.hinges.long().reshape(-1), value.reshape(-1))
+        total = torch.zeros_like(self._level.spacing)
+        for each in self._kinds:
+            jacobian = hinge_jacobian(x, each.corners)
+            value = self.weight[each.which].unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
+            add_at(total, each.corners.long().reshape(-1), value.reshape(-1))
+        return total
 
     def rest_matrix(self) -> sp.csr_matrix:
         """The Hessian of the rest shape's pattern, each hinge unfolded flat [N/m]: w row^T row (Bergou et al. 2006).
@@ -195,17 +265,20 @@ class Bending:
         A row is the derivative of the angle by the corners' heights above the flat hinge; constants are in its null
         space, and on a flat rest shape so is every linear function.
         """
-        hinges = self._level.hinges.cpu().numpy()
-        row = flat_rows(self._level.rest.double().cpu().numpy(), hinges)
-        blocks = self.weight.double().cpu().numpy()[:, None, None] * row[:, :, None] * row[:, None, :]
-        rows, columns = np.repeat(hinges, 4, axis=1).ravel(), np.tile(hinges, (1, 4)).ravel()
-        count = self._level.vertex_count
-        return sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
+        count, rest = self._level.vertex_count, self._level.rest.double().cpu().numpy()
+        total = sp.csr_matrix((count, count))
+        for each in self._kinds:
+            hinges, weight = each.corners.cpu().numpy(), self.weight[each.which].double().cpu().numpy()
+            row, width = flat_rows(rest, hinges), hinges.shape[1]
+            blocks = weight[:, None, None] * row[:, :, None] * row[:, None, :]
+            rows, columns = np.repeat(hinges, width, axis=1).ravel(), np.tile(hinges, (1, width)).ravel()
+            total = total + sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
+        return sp.csr_matrix(total)
 
 
 def flat_rows(rest: np.ndarray, hinges: np.ndarray) -> np.ndarray:
-    """dtheta/dz of each hinge laid flat [1/m], shape (H, 4); zero where a triangle has no area."""
-    xi, xj, xk, xl = (rest[hinges[:, corner]] for corner in range(4))
+    """dtheta/dz of each hinge laid flat [1/m], in the shape of its corners; zero at triangles without area."""
+    xi, xj, xk, xl = (rest[hinges[:, columns]].mean(axis=1) for columns in _places(hinges.shape[1]))
     axis, ik, il = xj - xi, xk - xi, xl - xi
     square = (axis**2).sum(axis=1)
     size = square + (ik**2).sum(axis=1) + (il**2).sum(axis=1)
@@ -215,12 +288,17 @@ def flat_rows(rest: np.ndarray, hinges: np.ndarray) -> np.ndarray:
     inverse_height = np.where(whole, np.sqrt(square)[:, None] / np.where(whole, double, 1.0), 0.0)
     foot = np.stack([(side * axis).sum(axis=1) / square for side in (ik, il)], axis=1)
     at_i, at_j = -(inverse_height * (1.0 - foot)).sum(axis=1), -(inverse_height * foot).sum(axis=1)
-    return np.stack([at_i, at_j, inverse_height[:, 0], inverse_height[:, 1]], axis=1)
+    at = (at_i, at_j, inverse_height[:, 0], inverse_height[:, 1])
+    places = _places(hinges.shape[1])
+    return np.stack([each / len(columns) for each, columns in zip(at, places, strict=True) for _ in columns], axis=1)
 
 
-def hinge_jacobian(x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges 4"]) -> Float[Tensor, "hinges 4 3"]:
-    """dtheta/dx at the four corners of each hinge [1/m]; zero rows where a triangle has no area."""
-    xi, xj, xk, xl = (x[hinges[:, corner].long()] for corner in range(4))
+def hinge_jacobian(
+    x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges corners"]
+) -> Float[Tensor, "hinges corners 3"]:
+    """dtheta/dx at the four or six corners of each hinge [1/m]; zero rows where a triangle has no area."""
+    places = _places(hinges.shape[1])
+    xi, xj, xk, xl = (x[hinges[:, columns].long()].mean(dim=1) for columns in places)
     axis, ik, il = xj - xi, xk - xi, xl - xi
     n1, n2 = torch.linalg.cross(axis, ik), torch.linalg.cross(il, axis)
     square = (axis**2).sum(dim=1, keepdim=True)
@@ -232,4 +310,10 @@ def hinge_jacobian(x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges 4
     t1 = (ik * axis).sum(dim=1, keepdim=True) / square
     t2 = (il * axis).sum(dim=1, keepdim=True) / square
     at_i, at_j = -(at_k * (1 - t1) + at_l * (1 - t2)), -(at_k * t1 + at_l * t2)
-    return torch.stack([at_i, at_j, at_k, at_l], dim=1)
+    at = (at_i, at_j, at_k, at_l)
+    return torch.stack([each / len(columns) for each, columns in zip(at, places, strict=True) for _ in columns], dim=1)
+
+
+def _places(width: int) -> tuple[list[int], list[int], list[int], list[int]]:
+    """The columns of a hinge's four or six corners that make up i, j, k and l."""
+    return ([0], [1], [2], [3]) if width == 4 else ([0], [1], [2, 3], [4, 5])

@@ -12,7 +12,7 @@
 | f1, f2 | columns of F | where the deformation takes unit vectors along warp and weft |
 | s | | sine of the angle by which they are sheared, rounded off where one vanishes |
 | e | ``limit`` | strain from which the cloth stiffens |
-| A_t | ``level.triangle_area`` | rest area [m^2] |
+| A_t | ``level.membrane_area`` | rest area [m^2] |
 
 Warp and weft stretch as springs do, and shear counts by angle, after Baraff and Witkin, "Large Steps in Cloth
 Simulation", 1998; the coupling makes the sheet orthotropic, nu^2 the product of its two Poisson's ratios. For small
@@ -153,12 +153,12 @@ class Membrane:
             limit: Strain from which each garment's cloth stiffens; None where none does.
             potential: "continuum" or "paper".
         """
-        owner = level.triangle_garment.long()
-        weight = level.triangle_scale * level.triangle_area
+        owner = level.membrane_garment.long()
+        weight = level.membrane_scale * level.membrane_area
         if potential == "paper":
-            weight = weight * 2.0 * level.triangle_area / garment_area(level)[owner]
+            weight = weight * 2.0 * level.membrane_area / garment_area(level)[owner]
         # A triangle without area has no rest shape to strain from; a sliver is strained by the mesh, not by the cloth.
-        weight = weight * level.triangle_inverse.any(dim=1) * sliver_weight(level)
+        weight = weight * level.membrane_inverse.any(dim=1) * sliver_weight(level)
         self.warp_stiffness, self.weft_stiffness = (
             weight * each.to(level.rest)[owner] / (1.0 - POISSON**2)
             for each in (youngs, youngs if weft is None else weft)
@@ -168,8 +168,8 @@ class Membrane:
         limits = torch.full_like(youngs, NO_LIMIT) if limit is None else limit
         self._level = level
         stiffness = torch.stack(self._stiffnesses, dim=1)
-        parameters = [level.triangle_inverse.contiguous(), stiffness, limits.to(level.rest)[owner]]
-        self._elements = Elements(_KERNELS, level.triangles, parameters, level=level)
+        parameters = [level.membrane_inverse.contiguous(), stiffness, limits.to(level.rest)[owner]]
+        self._elements = Elements(_KERNELS, level.membrane, parameters, level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
@@ -177,7 +177,7 @@ class Membrane:
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each triangle [J] where the force was added last, and its garment."""
-        return self._elements.energy, self._level.triangle_garment
+        return self._elements.energy, self._level.membrane_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each corner's block, limits left out, geometric part only where it stiffens [N/m].
@@ -186,9 +186,9 @@ class Membrane:
         by f_i and s_i the stress along f_i: trace = C11 g1^2 + C22 g2^2 + 2 C12 g1 g2 d1.d2 + G |g1 r1 + g2 r2|^2
         + 2 sum_i max(0, s_i / |f_i|) g_i^2.
         """
-        corners = x[self._level.triangles.long()]
+        corners = x[self._level.membrane.long()]
         sides = corners[:, 1:] - corners[:, :1]
-        f = torch.einsum("tsc,tsm->tmc", sides, self._level.triangle_inverse.reshape(-1, 2, 2))
+        f = torch.einsum("tsc,tsm->tmc", sides, self._level.membrane_inverse.reshape(-1, 2, 2))
         length = f.norm(dim=2).clamp_min(1e-6)
         reach = (length**2 + ROUNDING**2).sqrt().unsqueeze(2)
         u = f / reach
@@ -204,14 +204,14 @@ class Membrane:
         stress = torch.cat([c11 * e1 + c12 * e2, c22 * e2 + c12 * e1], dim=1)
         value = (value + 2.0 * (g**2 * (stress / length).clamp_min(0.0).unsqueeze(1)).sum(dim=2)) / 3.0
         total = torch.zeros_like(self._level.spacing)
-        return add_at(total, self._level.triangles.long().reshape(-1), value.reshape(-1))
+        return add_at(total, self._level.membrane.long().reshape(-1), value.reshape(-1))
 
     def rest_matrix(self) -> sp.csr_matrix:
         """The trace of each block of the Hessian at rest [N/m]: C11 + C66 along the warp, C22 + C66 along the weft.
 
         On an equilateral mesh with G = 0.375 Y it equals the springs' matrix.
         """
-        triangles = self._level.triangles.cpu().numpy()
+        triangles = self._level.membrane.cpu().numpy()
         gradient = shape_gradients(self._level).double().cpu().numpy()
         c11, c22, _, c66 = (each.double().cpu().numpy() for each in self._stiffnesses)
         stiffness = np.stack([c11 + c66, c22 + c66], axis=1)
@@ -233,12 +233,12 @@ def sliver_weight(level: Level) -> Float[Tensor, " triangles"]:
     an equilateral triangle's, without bound of a sliver's.
     """
     gradient = shape_gradients(level).square().sum(dim=2).amax(dim=1)
-    return (STIFFEST / (level.triangle_area * gradient).clamp_min(1e-12)).clamp_max(1.0)
+    return (STIFFEST / (level.membrane_area * gradient).clamp_min(1e-12)).clamp_max(1.0)
 
 
 def shape_gradients(level: Level) -> Float[Tensor, "triangles 3 2"]:
     """Gradients of the corners' shape functions along warp and weft [1/m]."""
-    others = level.triangle_inverse.reshape(-1, 2, 2)
+    others = level.membrane_inverse.reshape(-1, 2, 2)
     return torch.cat([-others.sum(dim=1, keepdim=True), others], dim=1)
 
 

@@ -1,14 +1,13 @@
-"""Stretch: springs along the edges.
+"""Stretch: springs along the edges of faces and both diagonals of quads.
 
-    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y c_e a_e / l0_e^2  (potential="continuum")
-                                        k_e = k_s a_e / A           (potential="paper")
+    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y a_e / l0_e^2  (potential="continuum")
+                                        k_e = k_s a_e / A       (potential="paper")
 
 | symbol | here | meaning |
 |---|---|---|
 | Y | ``youngs`` | 2D Young's modulus [N/m] |
-| a_e | ``level.edge_area`` | a third of the adjacent triangles' areas [m^2] |
-| c_e | ``level.edge_factor`` | 1 on triangles; makes alternately split quads isotropic |
-| l0 | ``level.rest_length`` | rest length [m] |
+| a_e | ``level.spring_area`` | a third of the adjacent triangles' areas [m^2], weighted so that quads are isotropic |
+| l0 | ``level.spring_length`` | rest length [m] |
 | k_s | 2.598 Y | the paper's spring constant [N/m] for the same Y on an equilateral lattice (docs/fabrics.md) |
 | A | total rest area of the garment [m^2] |
 
@@ -62,10 +61,10 @@ _KERNELS = element_overloads(_stretch, width=2, parameters=2)
 
 
 class Stretch:
-    """Edge springs of one level.
+    """Springs of one level.
 
     Attributes:
-        stiffness: Spring constants [N/m], shape (E,).
+        stiffness: Spring constants [N/m], shape (S,).
     """
 
     name = "stretch"
@@ -78,34 +77,34 @@ class Stretch:
             youngs: 2D Young's modulus of each garment [N/m].
             potential: "continuum" or "paper".
         """
-        modulus = youngs.to(level.rest)[level.edge_garment.long()] * level.stretch_scale
+        modulus = youngs.to(level.rest)[level.spring_garment.long()] * level.spring_scale
         if potential == "paper":
-            area = garment_area(level)[level.edge_garment.long()]
-            self.stiffness = PAPER_SPRING * modulus * level.edge_area / area
+            area = garment_area(level)[level.spring_garment.long()]
+            self.stiffness = PAPER_SPRING * modulus * level.spring_area / area
         else:
-            self.stiffness = 3.0 * modulus * level.edge_factor * level.edge_area / level.rest_length**2
+            self.stiffness = 3.0 * modulus * level.spring_area / level.spring_length**2
         self._level = level
-        self._elements = Elements(_KERNELS, level.edges, [self.stiffness, level.rest_length], level=level)
+        self._elements = Elements(_KERNELS, level.springs, [self.stiffness, level.spring_length], level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         return self._elements.evaluate(x, force)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each edge [J] where the force was added last, and its garment."""
-        return self._elements.energy, self._level.edge_garment
+        """Energy of each spring [J] where the force was added last, and its garment."""
+        return self._elements.energy, self._level.spring_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of k (u u^T + max(0, 1 - l0/l) (I - u u^T)), summed at both ends [N/m]."""
-        ends = self._level.edges.long()
+        ends = self._level.springs.long()
         length = (x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1)
-        lateral = (1.0 - self._level.rest_length / length.clamp_min(1e-12)).clamp_min(0.0)
+        lateral = (1.0 - self._level.spring_length / length.clamp_min(1e-12)).clamp_min(0.0)
         value = self.stiffness * (1.0 + 2.0 * lateral) / 3.0
         return add_at(torch.zeros_like(self._level.spacing), ends.T.reshape(-1), value.repeat(2))
 
     def rest_matrix(self) -> sp.csr_matrix:
         """Graph Laplacian of the springs [N/m]."""
-        ends = self._level.edges.cpu().numpy()
+        ends = self._level.springs.cpu().numpy()
         k = self.stiffness.double().cpu().numpy()
         rows = np.concatenate([ends[:, 0], ends[:, 1], ends[:, 0], ends[:, 1]])
         columns = np.concatenate([ends[:, 0], ends[:, 1], ends[:, 1], ends[:, 0]])

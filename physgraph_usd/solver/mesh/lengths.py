@@ -14,6 +14,7 @@ from .stencil import SCALAR, VECTOR, overloads, vectors
 from .threads import Launch, start_warp
 
 wp.set_module_options({"enable_backward": False})
+_SIX = wp.types.vector(length=6, dtype=wp.int32)
 
 
 @wp.kernel
@@ -42,20 +43,21 @@ def _normals(
 @wp.kernel
 def _angles(
     first: wp.int32,
-    hinges: wp.array(dtype=wp.vec4i),
+    hinges: wp.array(dtype=_SIX),
     x: wp.array(dtype=Any),
     angle: wp.array(dtype=Any),
 ):
     h = first + wp.tid()
     xi = x[hinges[h][0]]
     axis = x[hinges[h][1]] - xi
-    il = x[hinges[h][3]] - xi
-    n1 = wp.cross(axis, x[hinges[h][2]] - xi)
+    half = angle.dtype(0.5)
+    il = (x[hinges[h][4]] + x[hinges[h][5]]) * half - xi
+    n1 = wp.cross(axis, (x[hinges[h][2]] + x[hinges[h][3]]) * half - xi)
     angle[h] = wp.atan2(-wp.length(axis) * wp.dot(n1, il), wp.dot(n1, wp.cross(il, axis)))
 
 
 LENGTHS, NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
-ANGLES = overloads(_angles, wp.vec4i, VECTOR, SCALAR)
+ANGLES = overloads(_angles, _SIX, VECTOR, SCALAR)
 """Of edges [m], of triangles, twice their areas long [m^2], and of hinges [rad]: kernels for `ElementValues`."""
 
 

@@ -270,58 +270,6 @@ def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
     return Edges(vertices, count.astype(np.int32))
 
 
-def quad_edges(split: TriangleSplit, counts: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tell the edges that splitting quads made from those that quads had.
-
-    Args:
-        split: The triangulation.
-        counts: Vertices of each face that was split, shape (F,).
-        edges: Edges of the triangles, lexicographic, shape (E, 2).
-
-    Returns:
-        The fraction of an edge's triangles that come from quads, shape (E,), float64, and whether the edge is a quad's
-        diagonal, shape (E,), bool.
-    """
-    sides = split.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    edge = find_edges(edges, sides)
-    face = np.repeat(split.face, 3)[edge >= 0]
-    edge = edge[edge >= 0]
-    count = np.bincount(edge, minlength=len(edges))
-    from_quad = np.bincount(edge, counts[face] == 4, len(edges)) / np.maximum(count, 1)
-    first, last = np.full(len(edges), np.iinfo(np.int32).max), np.full(len(edges), -1)
-    np.minimum.at(first, edge, face)
-    np.maximum.at(last, edge, face)
-    return from_quad, (count == 2) & (first == last) & (from_quad == 1.0)
-
-
-def hinges_of(triangles: np.ndarray) -> np.ndarray:
-    """Find the pairs of triangles that share an edge with no third one.
-
-    The sign of the angle does not depend on the winding when the normals are taken as
-    ``n1 = (xj - xi) x (xk - xi)`` and ``n2 = (xl - xi) x (xj - xi)``: flat is zero even where windings disagree.
-
-    Args:
-        triangles: Vertices, shape (T, 3). Triangles that repeat a vertex are passed over.
-
-    Returns:
-        Hinges (i, j, k, l), shape (H, 4), int32, in lexicographic order of the shared edge: the edge i-j as the first
-        triangle (i, j, k) runs through it, and l, the corner of the second triangle opposite that edge. Pairs with
-        k == l, which are one triangle twice, are left out.
-    """
-    here, there, opposite, proper = _triangle_sides(triangles)
-    here, there, opposite = here[proper], there[proper], opposite[proper]
-    if len(here) == 0:
-        return np.empty((0, 4), np.int32)
-    keys = np.minimum(here, there) * (int(max(here.max(), there.max())) + 1) + np.maximum(here, there)
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    first = first[np.diff(np.append(first, len(ordered))) == 2]
-    one, two = order[first], order[first + 1]
-    hinges = np.stack([here[one], there[one], opposite[one], opposite[two]], axis=1).astype(np.int32)
-    return hinges[hinges[:, 2] != hinges[:, 3]]
-
-
 def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
     """The piece of each of some vertices, by the edges that hold them together, shape (V,)."""
     graph = sparse.coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
