@@ -13,7 +13,7 @@ from ...solver.collide.crossings import crossings
 from ...solver.collide.parts import Parts
 from ...solver.frame.scene_frame import SceneCloth
 from ...solver.level import Level, build_levels, hinge_geometry, refine_garments
-from ...solver.mesh.topology import hinges_of
+from ...solver.mesh.elements import hinges_of
 from ...solver.scene import recentred
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
