@@ -23,8 +23,8 @@ from PIL import Image, ImageDraw
 from benchmarks.rows import say
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.page.preview import label, surface_of
-from physgraph_usd.shot.page.raycast import BACKGROUND, View, draw, encode_color, fit_view
+from physgraph_usd.shot.page.drawing import BACKGROUND, Surface, View, draw, encode_color, fit_view
+from physgraph_usd.shot.page.preview import label
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.contact.bodies import FrameBodies
@@ -34,7 +34,7 @@ from physgraph_usd.solver.contact.frame import FrameContact
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.level import build_levels, refine_garments
 from physgraph_usd.solver.scene import recentred
-from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage, refined_in
+from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
 from physgraph_usd.usd.read.reader import open_shot
 
 LEVEL, PREROLL = 2, 6
@@ -120,21 +120,20 @@ def picture(name: str, shown: Shown, folder: Path, out: Path) -> Path:
     for layer, options in zip(layers, shown.forms.values(), strict=True):
         frames = (max(shown.time - PREROLL, 1.0), shown.time)
         refine_shot(shot, layer, replace(options, frames=frames, level=LEVEL, heat_map=True))
-    garments = refined_in(layers[0])
     meshes = [DrawnStage(shot).meshes(shown.time)]
     meshes += [DrawnStage(shot, layer).meshes(shown.time) for layer in layers]
     titles = ["Coarse input", *shown.forms]
     notes = [_said(each) for each in measured(shot, shown.time, meshes[1:])]
     for title, note in zip(titles, notes, strict=True):
         say(f"{name} {shown.time:g}, {title}: {', '.join(note)}")
-    drawn = _draw(meshes, shown, lined=garments)
+    drawn = _draw(meshes, shown)
     if shown.section:
         wider = PANEL[0] / PANEL[1] * shown.size[1] / shown.size[0]
         titles = [f"{each}: section, {wider:.1f} times as wide" for each in titles]
     _save(out, drawn, titles, notes=notes)
     if shown.heat:
         heated = [meshes[0], *(_heated(layers[place - 1], meshes[place], shown.time) for place in shown.heat)]
-        drawn = _draw(heated, shown, lined=())[1:]
+        drawn = _draw(heated, shown)[1:]
         _save(
             out.with_name("contact_heat.png"),
             drawn,
@@ -203,12 +202,12 @@ def _said(sums: dict[str, int]) -> list[str]:
     return [*lines, f"{sums['cloth']:,} crossings of cloth and cloth"]
 
 
-def _heated(layer: Path, meshes: Sequence[DrawnMesh], time: float) -> list[DrawnMesh]:
+def _heated(layer: Path, meshes: Sequence[DrawnMesh], time: float) -> list[DrawnMesh | Surface]:
     """The meshes in the colours of their heat maps, where they have one."""
     from pxr import Usd, UsdGeom  # noqa: PLC0415
 
     stage = Usd.Stage.Open(str(layer))
-    out = []
+    out: list[DrawnMesh | Surface] = []
     for mesh in meshes:
         prim = stage.GetPrimAtPath(mesh.path)
         if prim:
@@ -218,24 +217,21 @@ def _heated(layer: Path, meshes: Sequence[DrawnMesh], time: float) -> list[Drawn
             value = np.maximum(depth / DEEPEST, crossing)[mesh.triangles].max(axis=1).clip(0.0, 1.0)
             at, colors = zip(*MARKS, strict=True)
             shaded = np.stack([np.interp(value, at, channel) for channel in np.array(colors).T], axis=1)
-            mesh = replace(mesh, colors=shaded)  # noqa: PLW2901
-        out.append(mesh)
+            out.append(Surface(mesh.points, mesh.triangles, shaded))
+        else:
+            out.append(mesh)
     return out
 
 
-def _draw(panels: Sequence[Sequence[DrawnMesh]], shown: Shown, *, lined: Sequence[str]) -> list[np.ndarray]:
-    """The pixels of each panel; edges of some meshes show in the first."""
+def _draw(panels: Sequence[Sequence[DrawnMesh | Surface]], shown: Shown) -> list[np.ndarray]:
+    """The pixels of each panel."""
     if shown.section:
         return [_section(meshes, shown) for meshes in panels]  # A slit of millimetres: across is drawn larger than up.
     view, floor = _view(shown), min(float(mesh.points[:, 1].min()) for mesh in panels[0]) - 0.02
-    drawn = []
-    for meshes in panels:
-        surfaces = [surface_of(mesh, lined=meshes is panels[0] and mesh.path in lined) for mesh in meshes]
-        drawn.append(draw(surfaces, view, size=PANEL, floor=floor))
-    return drawn
+    return [draw(meshes, view, size=PANEL, floor=floor) for meshes in panels]
 
 
-def _section(meshes: Sequence[DrawnMesh], shown: Shown) -> np.ndarray:
+def _section(meshes: Sequence[DrawnMesh | Surface], shown: Shown) -> np.ndarray:
     """Lines in which meshes meet the plane through the middle, across and up each filling the panel."""
     size = np.array(PANEL) * FINER
     sheet = Image.new("RGB", tuple(size.tolist()), encode_color(tuple(BACKGROUND)))

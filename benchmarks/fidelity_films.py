@@ -23,8 +23,8 @@ from PIL import Image, ImageDraw
 from benchmarks.fidelity import FABRICS, NEWTON, OURS, RATE, Task, garment_of, level_at, say_rows
 from benchmarks.fidelity_stages import SCENES, Body, Stage
 from benchmarks.rows import say
+from physgraph_usd.shot.page.drawing import Surface, View, draw, fit_view
 from physgraph_usd.shot.page.preview import label
-from physgraph_usd.shot.page.raycast import Surface, View, draw, fit_view
 
 PANEL, QUALITY = (300, 340), 60
 """A side's size [pixels], and the pictures' quality."""

@@ -27,8 +27,8 @@ from benchmarks.rows import say
 from benchmarks.shots import opened, problem_of
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.page.preview import label, surface_of
-from physgraph_usd.shot.page.raycast import View, draw, fit_view
+from physgraph_usd.shot.page.drawing import View, draw, fit_view
+from physgraph_usd.shot.page.preview import label
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
@@ -145,8 +145,7 @@ def pictures(sides: Sequence[tuple[float, Side, Side]], shown: Shown) -> Iterato
         sheet = Image.new("RGB", (2 * PANEL[0], PANEL[1]))
         pen = ImageDraw.Draw(sheet)
         for place, (title, side) in enumerate(zip((shown.title, "Refined"), both, strict=True)):
-            surfaces = [surface_of(mesh, lined=False) for mesh in side]
-            pixels = draw(surfaces, view, size=PANEL, floor=floor)
+            pixels = draw(side, view, size=PANEL, floor=floor)
             sheet.paste(Image.fromarray(pixels), (place * PANEL[0], 0))
             label(pen, (place * PANEL[0], 0), PANEL[1], lines=[title])
         yield time, np.asarray(sheet)

@@ -23,8 +23,8 @@ from benchmarks.loose_garment import lowpass, vertex_area
 from benchmarks.rows import Found, Row, run_alone, table
 from benchmarks.shots import frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import COLD, Problem, with_garments
+from physgraph_usd.shot.page.drawing import Surface, View, draw, fit_view
 from physgraph_usd.shot.page.preview import label
-from physgraph_usd.shot.page.raycast import Surface, View, draw, fit_view
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import method_named

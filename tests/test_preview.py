@@ -17,8 +17,8 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from physgraph_usd.errors import StageError, UsageError
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.page.drawing import Surface, draw, encode_color, fit_view
 from physgraph_usd.shot.page.preview import preview
-from physgraph_usd.shot.page.raycast import Surface, draw, encode_color, fit_view
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.usd.read.meshes import DrawnStage, refined_in, shot_of
 
@@ -100,16 +100,37 @@ def test_ground_is_darker_below_a_thing() -> None:
     assert abs(int((far - near)[:20].max())) <= 2
 
 
-def test_edges_are_drawn_only_where_asked() -> None:
-    plain = square(color=(0.4, 0.4, 0.4))
-    lined = Surface(plain.points, plain.triangles, plain.colors, np.array([[True, False, True], [True, True, False]]))
-    view = fit_view(plain.points, 1.0, azimuth=0.0, elevation=0.0)
-    before, after = (draw([each], view, size=(100, 100), floor=-10.0).astype(int) for each in (plain, lined))
-    darker = (before - after).max(axis=2) > 8
-    assert darker.sum() > 100
-    rows, columns = np.nonzero(darker)
-    inner = (np.abs(rows - 50) < 30) & (np.abs(columns - 50) < 30)
-    assert not inner.any(), "the diagonal is no polygon edge"
+def test_a_sheet_has_light_on_the_side_that_is_seen() -> None:
+    """Turned over in place, it is seen from its back: as bright but for the factor of backs, and never unlit."""
+    front = square(color=(0.5, 0.5, 0.5))
+    back = Surface(front.points, front.triangles[:, ::-1], front.colors)
+    view = fit_view(front.points, 1.0, azimuth=0.0, elevation=0.0)
+    bright, dim = (int(draw([each], view, size=(60, 60), floor=-10.0)[30, 30, 1]) for each in (front, back))
+    assert 0.8 * bright < dim < bright
+
+
+def test_a_shadow_falls_where_light_is_blocked() -> None:
+    wall = square(color=(0.5, 0.5, 0.5))
+    shade = square(0.3, color=(0.5, 0.5, 0.5), depth=0.15)
+    view = fit_view(wall.points, 1.0, azimuth=0.0, elevation=0.0)
+    away = -0.62 / 0.48 * 0.15 * 100 / 1.16  # Pixels that the shadow lies beside what casts it, to the right.
+    split = finer(wall)
+    open_, shaded = (draw(each, view, size=(100, 100), floor=-10.0).astype(int) for each in ([split], [split, shade]))
+    darker = (open_ - shaded)[:, :, 1]
+    assert darker[62, int(50 - away)] > 40
+    assert darker[20, 20] <= 2
+
+
+def finer(surface: Surface, times: int = 5) -> Surface:
+    """A surface of quarters of its triangles."""
+    points, triangles = surface.points, surface.triangles
+    for _ in range(times):
+        a, b, c = points[triangles].transpose(1, 0, 2)
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+        points, label = np.unique(corners.round(9), axis=0, return_inverse=True)
+        triangles = label.reshape(-1, 3)
+    return Surface(points, triangles, np.tile(surface.colors[:1], (len(triangles), 1)))
 
 
 def test_nothing_to_draw_leaves_the_studio() -> None:

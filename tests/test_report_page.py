@@ -15,13 +15,15 @@ import pytest
 pytest.importorskip("pxr", reason="shots are read with usd-core")
 
 from browser import opened
-from shots import CLOTH, TIMES, cloth_shot, refine
+from pxr import Gf, Usd, UsdGeom
+from shots import CLOTH, EDGE, TIMES, cloth_shot, refine
 
 from physgraph_usd.errors import LayerError, UsageError
 from physgraph_usd.shot.options import json_of
 from physgraph_usd.shot.page.plot import plot
 from physgraph_usd.shot.page.report import page
 from physgraph_usd.shot.page.series import add_jerk, read_series, third_difference
+from physgraph_usd.shot.page.worst import verdict, worst_place
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.read.meshes import RefinedLayer
 from physgraph_usd.usd.read.reader import open_shot
@@ -63,6 +65,52 @@ def test_what_was_left_out_and_why(made: tuple[Path, Path, RefineReport]):
 def test_pictures_are_in_the_page(made: tuple[Path, Path, RefineReport]):
     pytest.importorskip("PIL", reason="pictures are written with Pillow")
     assert text_of(made).count("src='data:image/png;base64,") == 3
+
+
+def test_the_page_begins_with_a_verdict_and_ends_its_times_with_the_report(made: tuple[Path, Path, RefineReport]):
+    text = text_of(made)
+    assert re.search(
+        r"</h1><p id='verdict'>1 of 8 frames could not be solved; 7 frames refined, nothing crosses, ", text
+    )
+    assert f"<tr><td>report</td><td class=number>{made[2].seconds['report']:.2f}</td></tr>" in text
+    assert made[2].seconds["total"] > made[2].seconds["frames"] + made[2].seconds["report"] > 0.0
+
+
+def test_the_close_picture_is_of_cloth_in_a_body(tmp_path: Path):
+    shot, layer = cloth_shot(tmp_path / "sheet.usda", times=(1.0, 2.0)), tmp_path / "fine.usdc"
+    stage = Usd.Stage.Open(str(shot))
+    corner = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(2.0)[0]
+    ball = UsdGeom.Sphere.Define(stage, "/World/Ball")
+    ball.CreateRadiusAttr(1.0)
+    UsdGeom.XformCommonAPI(ball).SetTranslate(Gf.Vec3d(*map(float, corner)))
+    stage.Save()
+    report = refine(shot, layer, colliders=["/World/Ball"], contact="off", report=tmp_path / "report")
+    with closing(open_shot(str(shot), garments=[CLOTH], colliders=["/World/Ball"])) as opened_shot:
+        worst = worst_place(report, opened_shot)
+        assert worst is not None
+        points = RefinedLayer(layer).points(opened_shot, 0, worst.time)
+        centre = opened_shot.to_metres(0, worst.time)[:3, :3] @ np.asarray(corner, float)
+    assert points is not None
+    assert worst.path == CLOTH
+    assert np.linalg.norm(points[worst.vertex] - centre) < 2.0 * EDGE  # The radius and a fine edge's length.
+    assert "inside bodies" in worst.reason
+    assert verdict(report).startswith(worst.reason.partition(" edges")[0].partition(" vertices")[0])
+
+
+def test_a_verdict_says_first_what_is_wrong():
+    def frame(time: float, inside: int, crossings: int) -> dict[str, object]:
+        after = {"inside": inside, "crossings": crossings}
+        return {"time": time, "garments": [{"contact": {"bodies": {"/Body": {"after": after}}}}]}
+
+    report = RefineReport("shot.usda", None, {}, garments=[{"path": CLOTH}], seconds={"frames": 2.5})
+    report.frames = [frame(1.0, 0, 0), frame(2.0, 0, 0)]
+    assert verdict(report) == "2 frames refined, nothing crosses, nothing is inside a body, 1.2 s a frame."
+    report.frames = [frame(1.0, 3, 0), frame(2.0, 7, 0)]
+    report.unsettled = [{"path": CLOTH, "time": 2.0}]
+    assert verdict(report) == (
+        "7 vertices are inside bodies at time code 2, the worst frame; 1 frame did not settle; "
+        "2 frames refined, nothing crosses, 1.2 s a frame."
+    )
 
 
 def test_jerk_is_told_where_four_samples_in_a_row_are_there(made: tuple[Path, Path, RefineReport]):

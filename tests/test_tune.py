@@ -24,6 +24,7 @@ from physgraph_usd.cli import main
 from physgraph_usd.errors import PhysGraphError, UsageError
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.studio import solver
 from physgraph_usd.studio.loop import SolveLoop
 from physgraph_usd.studio.session import Shown, TuneSession
 from physgraph_usd.studio.values import TUNABLES, painted_on
@@ -75,6 +76,19 @@ def test_a_value_is_solved_from_where_the_cloth_was(session: TuneSession):
     assert after.telemetry[0]["start"] == "warm"
     assert np.abs(points(after) - points(before)).max() > 1e-5
     assert session.solve() is after
+
+
+@pytest.mark.parametrize("level", [1, 3])
+def test_a_slider_moves_the_cloth_though_no_time_is_left(
+    session: TuneSession, level: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(solver, "BUDGET_MS", 1e-6)
+    session.set_level(CLOTH, level)
+    before = session.solve()
+    session.set_value(CLOTH, "guide:stiffness", 100.0)
+    after = session.solve()
+    assert sum(each["steps"] for each in after.telemetry[0]["levels"]) == 1
+    assert np.abs(points(after) - points(before)).max() > 1e-5
 
 
 def test_at_rest_it_is_what_the_saved_layer_gives(session: TuneSession):

@@ -164,7 +164,7 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 @click.option("--camera", type=(float, float), metavar="AZIMUTH ELEVATION", help="Where to look from, in degrees.")
 @overwrite_option
 def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
-    """Draw the coarse cloth beside the fine cloth of LAYER and print the picture's path.
+    """Draw the smoothly subdivided input beside the cloth of LAYER and print the picture's path.
 
     A PNG shows one time code, a GIF all of them.
     """

@@ -91,7 +91,7 @@ class RefineOptions:
     tolerance: float = _solver(
         2e-3, "Stop when the cloth would move less, RMS, in local edge lengths.", metavar="T", least=0
     )
-    budget_ms: float | None = _solver(None, "Stop after this time per frame.", metavar="MS", above=0)
+    budget_ms: float | None = _solver(None, "Stop a frame when its steps took this time.", metavar="MS", above=0)
     frame_limit: float | None = _solver(
         None,
         "A frame that takes longer stops where it stands and counts as not settled.  [default: 20 times what the "

@@ -124,13 +124,16 @@ class RefineReport:
 
     def _crossed(self, side: str) -> list[int]:
         """Edges through faces of each measurement, "before" or "after"."""
-        paths = [garment["path"] for garment in self.garments]
-        entries = [pair for frame in self.frames for pair in zip(paths, frame.get("garments", ()), strict=False)]
-        # Garments that are solved together have one measurement, which each of them tells.
-        alone = [entry for path, entry in entries if entry.get("together", [path])[0] == path]
-        found = [entry["contact"] for entry in alone if "contact" in entry]
+        found = [contact for frame in self.frames for contact in self.measured(frame)]
         measured = [each for contact in found for each in (contact.get("cloth"), *contact.get("bodies", {}).values())]
         return [each[side]["crossings"] for each in measured if each]
+
+    def measured(self, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """Measurements of contact in a frame: garments that are solved together have one."""
+        paths = [garment["path"] for garment in self.garments]
+        entries = list(zip(paths, frame.get("garments", ()), strict=False))
+        alone = [entry for path, entry in entries if (entry.get("together") or [path])[0] == path]
+        return [entry["contact"] for entry in alone if entry.get("contact")]
 
     def warn(self, *warnings: str) -> None:
         """Take warnings that are not there yet, those of a kind about many prims as one, and log them."""

@@ -16,7 +16,7 @@ from ..solver.scene import State
 from ..usd.read.reader import Shot
 
 BUDGET_MS = 1000.0
-"""Milliseconds of a quick solve after which no step begins: with contact a large change asks for more."""
+"""Milliseconds after which a quick solve begins no step but its first: with contact a large change asks for more."""
 FINER = 0.1
 """Tolerance of a quick solve, over a run's: within that, cloth would not answer to a slider that is moved a little."""
 

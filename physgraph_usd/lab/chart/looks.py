@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ...shot.page.raycast import Surface, draw, fit_view
+from ...shot.page.drawing import Surface, draw, fit_view
 from ...solver.integrate import METHODS
 from ...solver.scene import Frame
 from .measure import find_curves

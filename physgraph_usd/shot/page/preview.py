@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,26 +14,23 @@ from ...errors import LayerError, StageError, UsageError
 from ...usd.files import check_targets, files_of
 from ...usd.read.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
 from ...usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
-from .raycast import BACKGROUND, Surface, View, draw, encode_color, fit_view
+from .drawing import BACKGROUND, View, draw, encode_color, fit_view, vertex_normals
+from .worst import CLOSE, Worst
 
 STILL, LOOP = ".png", ".gif"
 """Formats by suffix."""
 
-LIGHT_VERTICES = 6_000
-"""A mesh with fewer vertices is split for drawing, flat, so that its light is as fine as its neighbour's."""
+CAMERA = (25.0, 10.0)
+"""Azimuth and elevation [degrees]."""
+
+ELEVATIONS = (-30.0, 45.0)
+"""Elevations of a close picture's camera [degrees]."""
+
+COMPRESSION = {"compress_level": 1}
+"""Of a PNG: the most that Pillow offers takes as long as drawing and saves a tenth."""
 
 INK, FAINT = (38, 40, 44), (112, 114, 118)
 """Colours of the labels."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Panel:
-    """One side of the picture."""
-
-    title: str
-    stage: DrawnStage
-    garments: tuple[str, ...]
-    lined: bool
 
 
 def preview(
@@ -46,7 +43,7 @@ def preview(
     camera: tuple[float, float] | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Draw coarse beside fine, or a plain shot alone.
+    """Draw the smoothly subdivided input beside the refined cloth, or a plain shot alone.
 
     Args:
         layer: A refined layer, or a shot.
@@ -54,7 +51,7 @@ def preview(
         shot: The shot under the layer; found in the layer's own record when None.
         times: Time codes to draw; the last sample for a PNG and all samples for a GIF when None.
         size: Width and height [pixels].
-        camera: Azimuth and elevation [degrees]; (25, 10) when None.
+        camera: Azimuth and elevation [degrees]; `CAMERA` when None.
         overwrite: Whether a picture that is there may be replaced.
 
     Returns:
@@ -67,25 +64,25 @@ def preview(
         StageError: When a stage cannot be opened or shows no mesh.
     """
     layer, out = Path(layer), Path(out)
-    if out.suffix.lower() not in {STILL, LOOP}:
+    suffix = out.suffix.lower()
+    if suffix not in {STILL, LOOP}:
         raise UsageError(f"cannot draw {out.name!r}; known suffixes: {STILL}, {LOOP}")
+    if times is not None and suffix == STILL and len(times) != 1:
+        raise UsageError(f"a {STILL} shows one time code, not {len(times)}; write a {LOOP} for several")
     below = shot_of(layer) if shot is None else Path(shot)
     check_targets([("the picture", out)], files_of(layer) | (files_of(below) if below else set()))
     check_place(out)
     prepare_target(out, overwrite=overwrite)
-    panels = _panels(layer, below)
-    codes = _times(panels, times, out.suffix.lower())
-    for panel in panels:
-        panel.stage.bake(tuple(code for code in codes if code is not None))
-    views = _frame(panels, codes, size, camera or (25.0, 10.0))
-    pictures = [_compose(panels, code, size, views) for code in codes]
+    pictures = Pictures(layer, below, size, codes=times)
+    codes = [float(time) for time in times] if times is not None else pictures.times or [None]
+    drawn = pictures.draw(codes[-1:] if suffix == STILL else codes, camera or CAMERA)
     temporary = temporary_path(out, suffix=out.suffix)
     try:
         with make_file(temporary) as stream:
-            if out.suffix.lower() == STILL:
-                pictures[0].save(stream, "PNG", optimize=True)
+            if suffix == STILL:
+                drawn[0].save(stream, "PNG", **COMPRESSION)
             else:
-                _save_loop(pictures, stream, panels[0].stage.rate, codes)
+                _save_loop(drawn, stream, pictures.rate, codes)
         publish(temporary, out)
     except OSError as error:
         raise LayerError(f"cannot write {out}: {error.strerror or error}") from error
@@ -94,115 +91,111 @@ def preview(
     return out
 
 
-def _panels(layer: Path, shot: Path | None) -> list[_Panel]:
-    """Compose what stands on each side."""
-    if shot is None:
-        stage = DrawnStage(layer)
-        return [_Panel("", stage, stage.garments(), True)]
-    coarse, fine = DrawnStage(shot), DrawnStage(shot, layer)
-    refined = refined_in(layer)
-    source = tuple(path for path in refined if path in coarse.paths()) or coarse.garments()
-    return [_Panel("Coarse input", coarse, source, True), _Panel("Refined", fine, refined, False)]
+class Pictures:
+    """A refined layer beside the shot it was made from, or a plain shot alone.
 
+    Both sides are drawn in the same way; the input is subdivided smoothly into as many faces as the refined cloth has.
 
-def _times(panels: list[_Panel], times: Sequence[float] | None, suffix: str) -> list[float | None]:
-    """Choose the time codes to draw."""
-    if times is not None:
-        if suffix == STILL and len(times) != 1:
-            raise UsageError(f"a {STILL} shows one time code, not {len(times)}; write a {LOOP} for several")
-        return [float(time) for time in times]
-    found = panels[-1].stage.times(panels[-1].garments)
-    if not found:
-        return [None]
-    return [found[-1]] if suffix == STILL else list(found)
-
-
-def _frame(
-    panels: list[_Panel], codes: list[float | None], size: tuple[int, int], camera: tuple[float, float]
-) -> tuple[View, float]:
-    """One view for every panel and time, and the height of the ground."""
-    spread = codes if len(codes) > 1 else _extremes(panels[0], codes)
-    clouds: list[np.ndarray] = []
-    for code in spread:
-        meshes = panels[0].stage.meshes(code)
-        if not meshes:
-            continue
-        wanted = [mesh.points for mesh in meshes if mesh.path in panels[0].garments]
-        wanted = wanted or [mesh.points for mesh in meshes]
-        clouds += wanted + [_near(mesh.points, np.concatenate(wanted)) for mesh in meshes]
-    if not clouds:
-        raise StageError("nothing to draw: the stage shows no mesh")
-    points = np.concatenate(clouds)
-    floor = float(points[:, 1].min())
-    aspect = size[0] / len(panels) / size[1]
-    drop = 0.03 * float(np.ptp(points, axis=0).max())
-    return fit_view(points, aspect, azimuth=camera[0], elevation=camera[1]), floor - drop
-
-
-def _near(points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The points in a box a little larger than what must be seen, so that a collider shows around its garment."""
-    low, high = wanted.min(axis=0), wanted.max(axis=0)
-    margin = 0.25 * float((high - low).max())
-    return points[((points > low - margin) & (points < high + margin)).all(axis=1)]
-
-
-def _extremes(panel: _Panel, codes: list[float | None]) -> list[float | None]:
-    """The drawn time with some others, so that stills of one shot share their framing."""
-    found = panel.stage.times(panel.garments)
-    return codes + [found[i] for i in np.linspace(0, len(found) - 1, 5).astype(int)] if found else codes
-
-
-def _compose(panels: list[_Panel], code: float | None, size: tuple[int, int], views: tuple[View, float]) -> Image.Image:
-    """Draw all panels at one time and label them."""
-    width = size[0] // len(panels)
-    picture = Image.new("RGB", size, encode_color(tuple(BACKGROUND)))
-    pen = ImageDraw.Draw(picture)
-    for i, panel in enumerate(panels):
-        meshes = panel.stage.meshes(code)
-        surfaces = [surface_of(mesh, lined=panel.lined and _is_refined(mesh, panel)) for mesh in meshes]
-        pixels = draw(surfaces, views[0], size=(width, size[1]), floor=views[1])
-        picture.paste(Image.fromarray(pixels), (i * width, 0))
-        shown = [mesh for mesh in meshes if mesh.path in panel.garments] or meshes
-        count = f"{sum(len(mesh.points) for mesh in shown):,} vertices"
-        label(pen, (i * width, 0), size[1], lines=[panel.title, count])
-    if code is not None:
-        place = (size[0] - size[1] // 36, size[1] - size[1] // 24)
-        pen.text(place, f"{code:g}", FAINT, ImageFont.load_default(max(size[1] // 40, 8)), anchor="rs")
-    return picture
-
-
-def _is_refined(mesh: DrawnMesh, panel: _Panel) -> bool:
-    """Whether a mesh is what the picture is about; all are where none is named."""
-    return mesh.path in panel.garments or not panel.garments
-
-
-def surface_of(mesh: DrawnMesh, *, lined: bool) -> Surface:
-    """Prepare a mesh for drawing.
-
-    Args:
-        mesh: The mesh.
-        lined: Whether its edges show.
+    Attributes:
+        times: Time codes with samples.
+        rate: Time codes a second.
     """
-    surface = Surface(mesh.points, mesh.triangles, mesh.colors, mesh.edges if lined else None)
-    while len(surface.points) < LIGHT_VERTICES and len(surface.triangles):
-        surface = _split(surface)
-    return surface
 
+    def __init__(
+        self, layer: Path, shot: Path | None, size: tuple[int, int], *, codes: Sequence[float] | None = None
+    ) -> None:
+        """Open the stages.
 
-def _split(surface: Surface) -> Surface:
-    """Quarter every triangle without changing the shape."""
-    triangles = surface.triangles
-    sides = np.sort(np.stack([np.roll(triangles, -1, axis=1), np.roll(triangles, -2, axis=1)], axis=2), axis=2)
-    pairs, which = np.unique(sides.reshape(-1, 2), axis=0, return_inverse=True)
-    middle = len(surface.points) + which.reshape(-1, 3)  # middle[:, k] halves the edge opposite corner k
-    points = np.concatenate([surface.points, surface.points[pairs].mean(axis=1)])
-    (a, b, c), (p, q, r) = triangles.T, middle.T
-    quarters = np.stack([np.stack(t, axis=1) for t in ((a, r, q), (r, b, p), (q, p, c), (p, q, r))], axis=1)
-    edges = None
-    if surface.edges is not None:
-        keep = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 0, 0]], bool)
-        edges = (surface.edges[:, None, :] & keep).reshape(-1, 3)
-    return Surface(points, quarters.reshape(-1, 3), np.repeat(surface.colors, 4, axis=0), edges)
+        Args:
+            layer: A refined layer, or a plain shot.
+            shot: The shot under the layer; None for a plain shot.
+            size: Width and height of a picture [pixels].
+            codes: Time codes that may be drawn, for which skinned meshes are skinned; all when None.
+
+        Raises:
+            StageError: A stage cannot be opened.
+        """
+        self._stages = [DrawnStage(layer)] if shot is None else [DrawnStage(shot), DrawnStage(shot, layer)]
+        self._refined = () if shot is None else refined_in(layer)
+        named = set(self._refined) & set(self._stages[0].paths())
+        self._garments = tuple(sorted(named)) or self._stages[0].garments()
+        self._titles = ("",) if shot is None else ("Input, subdivided", "Refined")
+        self._panel, self._size = (size[0] // len(self._stages), size[1]), size
+        self.rate = self._stages[-1].rate
+        self.times: list[float | None] = list(self._stages[-1].times(self._refined or self._garments))
+        for stage in self._stages:
+            stage.bake(tuple(code for code in (codes or self.times) if code is not None))
+
+    def draw(self, codes: Sequence[float | None], camera: tuple[float, float] = CAMERA) -> list[Image.Image]:
+        """Draw some time codes as one camera sees them.
+
+        Raises:
+            StageError: A stage shows no mesh.
+        """
+        some = [self.times[i] for i in np.linspace(0, len(self.times) - 1, 5).astype(int)] if self.times else []
+        spread = codes if len(codes) > 1 else [*codes, *some]  # Stills of one shot share their framing.
+        clouds = [self._in_picture(self._stages[0].meshes(code)) for code in spread]
+        if not any(map(len, clouds)):
+            raise StageError("nothing to draw: the stage shows no mesh")
+        points = np.concatenate(clouds)
+        view = fit_view(points, self._panel[0] / self._panel[1], azimuth=camera[0], elevation=camera[1])
+        floor = float(points[:, 1].min() - 0.03 * np.ptp(points, axis=0).max())
+        return [self._compose(self._sides(code), code, view, floor) for code in codes]
+
+    def draw_close(self, worst: Worst) -> Image.Image:
+        """Draw both sides about a place in refined cloth, from where its outer side faces.
+
+        Raises:
+            StageError: The stage does not show the mesh.
+        """
+        sides = self._sides(worst.time)
+        mesh = next((each for each in sides[-1] if each.path == worst.path), None)
+        if mesh is None:
+            raise StageError(f"nothing to draw: <{worst.path}> is not shown")
+        place, middle = mesh.points[worst.vertex], mesh.points.mean(axis=0)
+        outward = vertex_normals(mesh)[worst.vertex]
+        outward *= 1.0 if outward @ (place - middle) >= 0 else -1.0
+        radius = CLOSE * float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
+        azimuth, elevation = np.degrees([np.arctan2(outward[0], outward[2]), np.arcsin(np.clip(outward[1], -1.0, 1.0))])
+        ball = place + radius * np.concatenate([np.eye(3), -np.eye(3)])
+        angles = {"azimuth": float(azimuth), "elevation": float(np.clip(elevation, *ELEVATIONS))}
+        view = fit_view(ball, self._panel[0] / self._panel[1], **angles)
+        view = replace(view, nearest=float(np.linalg.norm(place - view.eye)) - 2.0 * radius)
+        return self._compose(sides, worst.time, view, -np.inf)
+
+    def _in_picture(self, meshes: Sequence[DrawnMesh]) -> np.ndarray:
+        """Points in a box a little larger than the garments, so that a body shows around them."""
+        if not meshes:
+            return np.zeros((0, 3))
+        points = np.concatenate([mesh.points for mesh in meshes])
+        garments = np.concatenate([mesh.points for mesh in meshes if mesh.path in self._garments] or [points])
+        low, high = garments.min(axis=0), garments.max(axis=0)
+        margin = 0.25 * float((high - low).max())
+        return points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
+
+    def _sides(self, code: float | None) -> list[list[DrawnMesh]]:
+        """The meshes of each panel at a time code."""
+        sides = [stage.meshes(code) for stage in self._stages]
+        faces = {mesh.path: mesh.mesh.face_count for mesh in sides[-1] if mesh.path in self._refined}
+        coarse = [mesh.subdivided(faces.get(mesh.path, faces.get(f"{mesh.path}_refined", 0))) for mesh in sides[0]]
+        return [coarse, *sides[1:]]
+
+    def _compose(
+        self, sides: Sequence[Sequence[DrawnMesh]], code: float | None, view: View, floor: float
+    ) -> Image.Image:
+        """Draw all panels at one time and label them."""
+        picture = Image.new("RGB", self._size, encode_color(tuple(BACKGROUND)))
+        pen = ImageDraw.Draw(picture)
+        for i, (title, meshes) in enumerate(zip(self._titles, sides, strict=True)):
+            pixels = draw(meshes, view, size=self._panel, floor=floor)
+            picture.paste(Image.fromarray(pixels), (i * self._panel[0], 0))
+            shown = [mesh for mesh in meshes if mesh.path in (*self._garments, *self._refined)] or meshes
+            count = f"{sum(len(mesh.points) for mesh in shown):,} vertices"
+            label(pen, (i * self._panel[0], 0), self._panel[1], lines=[title, count])
+        if code is not None:
+            place = (self._size[0] - self._size[1] // 36, self._size[1] - self._size[1] // 24)
+            pen.text(place, f"{code:g}", FAINT, ImageFont.load_default(max(self._size[1] // 40, 8)), anchor="rs")
+        return picture
 
 
 def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lines: Sequence[str]) -> None:
@@ -225,7 +218,7 @@ def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lin
         pen.text((left, place), line, FAINT, font, anchor="ls")
 
 
-def _save_loop(pictures: list[Image.Image], stream: BinaryIO, rate: float, codes: list[float | None]) -> None:
+def _save_loop(pictures: list[Image.Image], stream: BinaryIO, rate: float, codes: Sequence[float | None]) -> None:
     """Write a GIF with one palette for all frames and the shot's own speed."""
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, 4).astype(int)]
     strip = Image.new("RGB", (chosen[0].width, sum(p.height for p in chosen)))

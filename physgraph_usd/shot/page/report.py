@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import html
 import importlib
-import tempfile
+import io
+import time as clock
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,9 +20,8 @@ from ..report import RefineReport
 from .document import document, table
 from .plot import SCRIPT, plot
 from .series import Series, add_jerk, read_series
+from .worst import verdict, worst_place
 
-PICTURES = 3
-"""Time codes that are drawn, at most."""
 SIZE = (1280, 640)
 PLOTS = (
     ("energy", "Energy by term [mJ]"),
@@ -45,21 +45,26 @@ def write_folder(report: RefineReport, folder: Path, shot: Shot) -> None:
     Raises:
         LayerError: It cannot be written.
     """
-    report.write(folder / REPORT_NAME)
+    began = clock.perf_counter()
     series = [read_series(report, index) for index in range(len(report.garments))]
     assert report.out is not None
     add_jerk(series, report, shot, report.out)
-    write_text(folder / PAGE_NAME, page(report, series))
+    pictures = _pictures(report, shot)
+    report.seconds["report"] = clock.perf_counter() - began
+    report.seconds["total"] += report.seconds["report"]
+    report.write(folder / REPORT_NAME)
+    write_text(folder / PAGE_NAME, page(report, series, pictures))
 
 
-def page(report: RefineReport, series: Sequence[Series]) -> str:
+def page(report: RefineReport, series: Sequence[Series], pictures: str = "") -> str:
     """The page as HTML.
 
     Args:
         report: The report.
         series: Lines of every garment.
+        pictures: The pictures, as HTML.
     """
-    parts = [_head(report), _warnings(report), _pictures(report), _model(report), _garments(report)]
+    parts = [_head(report), pictures, _warnings(report), _model(report), _garments(report), _times(report)]
     times = [frame["time"] for frame in report.frames]
     for index, garment in enumerate(series):
         parts.append(f"<h2>&lt;{html.escape(garment.path)}&gt; over time</h2>")
@@ -73,14 +78,11 @@ def page(report: RefineReport, series: Sequence[Series]) -> str:
 
 
 def _head(report: RefineReport) -> str:
-    count, failed = len(report.frames), len(report.failed)
-    done = f"{count - failed} of {count} time codes" if failed else f"{count} time code{'s' if count != 1 else ''}"
-    seconds = report.seconds.get("total", 0.0)
-    each = f", {1e3 * report.seconds.get('frames', 0.0) / count:.0f} ms each" if count else ""
-    memory = "" if report.peak_memory_mb is None else f"; peak memory {report.peak_memory_mb:.0f} MB"
+    memory = "" if report.peak_memory_mb is None else f" Peak memory {report.peak_memory_mb:.0f} MB."
     return (
         f"<h1>{html.escape(Path(report.shot).name)}</h1>"
-        f"<p id='summary'>{done} written to {html.escape(str(report.out))} in {seconds:.1f} s{each}{memory}.</p>"
+        f"<p id='verdict'>{html.escape(verdict(report))}</p>"
+        f"<p class='note'>Written to {html.escape(str(report.out))}.{memory}</p>"
     )
 
 
@@ -92,31 +94,40 @@ def _warnings(report: RefineReport) -> str:
     return f"<h2>Warnings</h2><ul class='warnings' id='warnings'>{lines}</ul>"
 
 
-def _pictures(report: RefineReport) -> str:
-    """Coarse beside fine at a few time codes."""
+def _pictures(report: RefineReport, shot: Shot) -> str:
+    """The worst place from near, and coarse beside fine at a few time codes."""
     title = "<h2>Before and after</h2>"
     if find_spec("PIL") is None:
         return f"{title}<p class='note'>No pictures: PIL is missing; pip install 'physgraph-usd[preview]'</p>"
+    kind = importlib.import_module(".preview", __package__).Pictures  # Needs an extra that a report can do without.
     written = [frame["time"] for frame in report.frames if "garments" in frame]
-    picks = sorted({round(i * (len(written) - 1) / (PICTURES - 1)) for i in range(PICTURES)}) if written else []
+    times = [written[0], written[-1]][: len(written)]
+    worst = worst_place(report, shot)
     try:
-        return title + "".join(_picture(report, written[i]) for i in picks)
-    except (StageError, LayerError, OSError) as error:  # a full temporary disk too
+        pictures = kind(report.out, Path(report.shot), SIZE, codes=[time for time in written if time is not None])
+        close = "" if worst is None else _figure(pictures.draw_close(worst), f"The worst place: {worst.reason}")
+        drawn = pictures.draw(times) if times else []
+    except (StageError, LayerError) as error:
         return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"
+    captions = ["the only frame" if time is None else f"time code {time:g}" for time in times]
+    return close + title + "".join(map(_figure, drawn, captions))
 
 
-def _picture(report: RefineReport, time: float | None) -> str:
-    """One picture inside the page."""
-    draw = importlib.import_module(".preview", __package__).preview  # Needs an extra that a report can do without.
-    times = None if time is None else [time]
-    with tempfile.TemporaryDirectory() as folder:
-        file = draw(report.out, Path(folder) / "picture.png", shot=report.shot, times=times, size=SIZE)
-        data = base64.b64encode(file.read_bytes()).decode("ascii")
-    caption = "the only frame" if time is None else f"time code {time:g}"
+def _figure(picture: Any, caption: str) -> str:
+    """A picture inside the page."""
+    stream = io.BytesIO()
+    picture.save(stream, "PNG", compress_level=1)
+    data = base64.b64encode(stream.getvalue()).decode("ascii")
     return (
-        f"<figure><img alt='coarse beside refined, {caption}' width='{SIZE[0]}' height='{SIZE[1]}' "
-        f"src='data:image/png;base64,{data}'><figcaption>{caption}</figcaption></figure>"
+        f"<figure><img alt='input beside refined, {html.escape(caption)}' width='{SIZE[0]}' height='{SIZE[1]}' "
+        f"src='data:image/png;base64,{data}'><figcaption>{html.escape(caption)}</figcaption></figure>"
     )
+
+
+def _times(report: RefineReport) -> str:
+    """Wall time of each stage."""
+    rows = [(name, f"{seconds:.2f}") for name, seconds in report.seconds.items()]
+    return "<h2>Time</h2>" + table("time", ("stage", "seconds"), rows, numbers=[1])
 
 
 def _model(report: RefineReport) -> str:

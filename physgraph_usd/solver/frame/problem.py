@@ -176,8 +176,14 @@ class Problem:
         """Numbers of the levels that are solved; what crosses in a cold frame is untangled at the cage."""
         return range(0 if nested or (not self.warm and self.crossed) else self.finest, self.finest + 1)
 
-    def level(self, index: int, choice: Choice) -> LevelProblem:
-        """One level, by its number."""
+    def level(self, index: int, choice: Choice, *, since: float) -> LevelProblem:
+        """One level.
+
+        Args:
+            index: Its number.
+            choice: How the frame is solved.
+            since: When the frame was ready to be solved [s].
+        """
         lasting, settings = self.forces[index], self.group.settings
         angles = self.creases.rest_angle if self.creases is not None and index == self.finest else None
         module = lasting.module(self.aim, angles)
@@ -185,7 +191,7 @@ class Problem:
         # What is recorded of a level's steps on CUDA serves in the next frame too.
         recorded = lasting.level.device != "cpu"
         alone = lasting.lasting_system(self.aim, tie, rest_angle=angles) if recorded else lasting.system(module, tie)
-        budget = settings.budget(self.finest - index, self.began, more=choice.steps, warm=self.warm)
+        budget = settings.budget(self.finest - index, since, more=choice.steps, warm=self.warm)
         if self.creases is not None and self.start.held:  # What fades is less than the stopping measure sees.
             budget = replace(budget, rest=0.0)
         budget = replace(budget, steps=0) if self.start.rests else budget

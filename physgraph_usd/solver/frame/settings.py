@@ -41,7 +41,7 @@ class SolveSettings:
         method: The integrator and whether it is nested.
         steps: Most steps at the finest level; each level below it may take four times as many.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
-        budget_ms: Milliseconds a frame, or None.
+        budget_ms: Milliseconds of solving a frame, or None.
         frame_limit: Seconds after which a frame stops where it stands; None for a multiple of what frames take.
         temporal: "tether", "warm" or "off".
         tether: Tether stiffness [1/s^2].
@@ -64,11 +64,11 @@ class SolveSettings:
     cancelled: Callable[[], bool] | None = None
 
     def budget(self, below: int, clock: float, *, more: int, warm: bool) -> Budget:
-        """Steps and deadline of a level.
+        """Steps and deadline of a level; the finest makes one step in any case.
 
         Args:
             below: How many levels lie above it.
-            clock: When the frame began [s].
+            clock: When the frame was ready to be solved [s].
             more: How many times its steps the finest level takes.
             warm: Whether it starts from the last frame's result.
         """
@@ -77,6 +77,6 @@ class SolveSettings:
             deadline = clock + 1e-3 * self.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
         if not below:
             rest, extra = (REST, 0) if warm else (1.0, EXTRA * more * self.steps)
-            return Budget(more * self.steps, self.tolerance, deadline, rest, extra, self.cancelled)
+            return Budget(more * self.steps, self.tolerance, deadline, rest, extra, self.cancelled, least=1)
         steps, tolerance = COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance
         return Budget(steps, tolerance, deadline, cancelled=self.cancelled)

@@ -60,7 +60,7 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
         choice = choose(problem, group.settings.method.nested)
         x, reports, module = None, list[LevelReport](), ForceModule(())
         for index in problem.levels(nested=choice.nested):
-            level = problem.level(index, choice)
+            level = problem.level(index, choice, since=prepared)
             x, made, module = solve_one_level(level, *problem.begun(index, x))
             if index < problem.finest:
                 made[-1].energies = module.energies(x)
@@ -138,7 +138,7 @@ def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Pla
     cold, start = level.index == 0, x
     x = view.laid_back(x) if cold else x
     reports: list[LevelReport] = []
-    short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0)
+    short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0, least=0)
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
         if is_over() or not view.comes_apart(x, order=cold):
             break
@@ -190,7 +190,8 @@ def _round_budget(budget: Budget, system: System, *, first: bool, steps: int) ->
     """The budget of a round: what a contact's metric calls a small move is that much smaller."""
     shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
     rest = budget.rest if first else 1.0
-    return replace(budget, steps=min(steps, budget.steps), extra=0, tolerance=shrunk * budget.tolerance, rest=rest)
+    tolerance, least = shrunk * budget.tolerance, budget.least if first else 0
+    return replace(budget, steps=min(steps, budget.steps), extra=0, tolerance=tolerance, rest=rest, least=least)
 
 
 def _smooth_move(system: System, carry: Carry, report: LevelReport) -> float:

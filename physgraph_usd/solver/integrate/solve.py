@@ -26,10 +26,11 @@ class Budget:
     Attributes:
         steps: Most steps at one level.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
-        deadline: `time.perf_counter` value after which no step begins, or None.
+        deadline: `time.perf_counter` value after which no step begins but the first `least`, or None.
         rest: Tolerances under which no step is made from the start: what rests but for a little stays where it is.
         extra: Steps beyond those, while the remaining move is over `FAR` tolerances.
         cancelled: Asked before each step: whether nobody waits for the result any more; or None.
+        least: Steps that the deadline does not prevent.
     """
 
     steps: int
@@ -38,10 +39,11 @@ class Budget:
     rest: float = 1.0
     extra: int = 0
     cancelled: Callable[[], bool] | None = None
+    least: int = 0
 
-    def is_spent(self) -> bool:
-        """Whether no step may begin any more, whatever the cloth's state."""
-        late = self.deadline is not None and time.perf_counter() >= self.deadline
+    def is_spent(self, steps: int) -> bool:
+        """Whether no step may begin after so many, whatever the cloth's state."""
+        late = self.deadline is not None and steps >= self.least and time.perf_counter() >= self.deadline
         return late or is_over() or (self.cancelled is not None and self.cancelled())
 
     def is_far(self, remaining_move: float) -> bool:
@@ -148,7 +150,7 @@ def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) ->
         steps >= budget.steps + budget.extra or not budget.is_far(_remaining_move(system, carry))
     ):
         return "steps"
-    if budget.is_spent():
+    if budget.is_spent(steps):
         return "budget"
     return ""
 

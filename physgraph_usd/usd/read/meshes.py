@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from ...errors import LayerError, StageError
+from ...solver.mesh.subdivide import smooth, subdivide
+from ...solver.mesh.topology import PolygonMesh, TriangleSplit
 from ..provenance import read_record, recorded_shot
 from ..stage import bad_rate, list_meshes, metres_per_unit, open_layer, paths_in, pxr_errors, quiet, timecode, up_vector
 from ..times import garment_times, merge
@@ -30,18 +33,39 @@ class DrawnMesh:
     Attributes:
         path: Prim path.
         points: World positions [m], Y up, shape (V, 3).
-        triangles: Corners, counter-clockwise seen from outside, shape (T, 3).
-        edges: Whether the edge opposite each corner is a polygon's edge, shape (T, 3).
-        colors: Linear RGB per triangle, shape (T, 3).
-        faces: Number of authored polygons.
+        mesh: The polygons, counter-clockwise seen from outside.
+        face_colors: Linear RGB per polygon, shape (F, 3).
     """
 
     path: str
     points: np.ndarray
-    triangles: np.ndarray
-    edges: np.ndarray
-    colors: np.ndarray
-    faces: int
+    mesh: PolygonMesh
+    face_colors: np.ndarray
+
+    @cached_property
+    def _split(self) -> TriangleSplit:
+        return self.mesh.triangulate(self.points)
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """Corners of the triangles, shape (T, 3)."""
+        return self._split.triangles
+
+    @property
+    def colors(self) -> np.ndarray:
+        """Linear RGB per triangle, shape (T, 3)."""
+        return self.face_colors[self._split.face]
+
+    def subdivided(self, faces: int) -> DrawnMesh:
+        """Smooth subdivision into at least so many polygons; vertices at one place are one."""
+        places, label = np.unique(self.points, axis=0, return_inverse=True)
+        mesh = PolygonMesh(self.mesh.counts, label.reshape(-1)[self.mesh.indices], len(places))
+        found = replace(self, points=places, mesh=mesh)
+        while 0 < found.mesh.face_count < faces:
+            step = subdivide(found.mesh)
+            points = smooth(found.mesh, step) @ found.points
+            found = replace(found, points=points, mesh=step.mesh, face_colors=found.face_colors[step.parent_face])
+        return found
 
 
 class DrawnStage:
@@ -144,29 +168,18 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
         return None
     positions = np.asarray(points, dtype=np.float64)
     counts, indices = np.asarray(counts), np.asarray(indices)
-    usable = counts.sum() == len(indices) and indices.min() >= 0 and indices.max() < len(positions)
+    usable = (
+        counts.min() >= 0 and counts.sum() == len(indices) and indices.min() >= 0 and indices.max() < len(positions)
+    )
     if not usable or not np.isfinite(positions).all():
         return None
-    face, triangles, edges = _fan(counts, indices)
     left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
     # By the signs of stretches: a scale's cube can overflow.
     if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
-        triangles, edges = triangles[:, ::-1], edges[:, ::-1]
-    colors = _colors(mesh, code, len(counts))[face]
-    return DrawnMesh(str(mesh.GetPath()), positions, triangles, edges, colors, len(counts))
-
-
-def _fan(counts: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split polygons into fans: face of each triangle, corners, and which edges are polygon edges."""
-    starts = np.cumsum(counts) - counts
-    pieces = np.maximum(counts - 2, 0)
-    face = np.repeat(np.arange(len(counts)), pieces)
-    step = np.arange(len(face)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 1
-    start = starts[face]
-    triangles = np.stack([indices[start], indices[start + step], indices[start + step + 1]], axis=1)
-    last = step + 1 == counts[face] - 1
-    edges = np.stack([np.ones(len(face), bool), last, step == 1], axis=1)
-    return face, triangles, edges
+        ends = np.cumsum(counts)
+        indices = indices[np.repeat(2 * ends - counts - 1, counts) - np.arange(len(indices))]
+    polygons = PolygonMesh(counts, indices, len(positions))
+    return DrawnMesh(str(mesh.GetPath()), positions, polygons, _colors(mesh, code, len(counts)))
 
 
 def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
@@ -216,11 +229,15 @@ class RefinedLayer:
         self._layer = layer
         self.targets = tuple(str(each) for each in record.get("garments", ()))
 
+    def target(self, shot: Shot, index: int) -> str | None:
+        """Path of a garment's fine mesh by number; None in a chunk without a sample of it."""
+        coarse = str(shot.sources[index].path)
+        return next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
+
     def points(self, shot: Shot, index: int, time: float | None) -> np.ndarray | None:
         """World positions [m] of a garment's fine mesh by number, shape (V, 3), or None where it has no sample."""
-        coarse = str(shot.sources[index].path)
-        target = next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
-        if target is None:  # a chunk without a sample of it
+        target = self.target(shot, index)
+        if target is None:
             return None
         path = Sdf.Path(target).AppendProperty("points")
         if time is None:
