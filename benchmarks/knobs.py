@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -52,20 +52,19 @@ class Shown:
     Attributes:
         prim: Its path.
         first: Its first time code here.
-        file: Its shot below the folder of real shots, or "" for a sample or one of `benchmarks.quad_garments`.
-        colliders: Bodies that the shot does not name.
+        file: Its shot below the folder of real shots, or "" for a sample or one of `benchmarks.quad_garments`. Bodies
+            of real shots, which they do not name, are left out.
     """
 
     prim: str
     first: float
     file: str = ""
-    colliders: Sequence[str] = ()
 
 
 SHOWN = {
     "dancer": Shown("/DancerShot/Dress", 30.0),
     "swatch": Shown("/SwatchShot/Swatch", 20.0),
-    "shorts": Shown("/shot/char/shorts", 20.0, "02_makehuman_usdskel_dm.usdc", ["/shot/char/body"]),
+    "shorts": Shown("/shot/char/shorts", 20.0, "02_makehuman_usdskel_dm.usdc"),
     "flag": Shown("/shot/flag", 20.0, "07_flag_quads_nocollider.usda"),
     "cape": Shown("/CapeShot/Cape", 12.0),
     "trousers": Shown("/TrousersShot/Trousers", 10.0),
@@ -140,8 +139,7 @@ def refined_knobs(name: str, way: str, folder: Path, *, frames: int, level: int)
         return None
     layer = folder / f"{name}_{way}.usdc"
     span = (shown.first, shown.first + frames - 1.0)
-    given = {"garments": (shown.prim,), "colliders": shown.colliders, "frames": span}
-    refine_shot(shot, layer, RefineOptions(**(_changed(WAYS[way]) | given), level=level, overwrite=True))
+    refine_shot(shot, layer, replace(WAYS[way], garments=(shown.prim,), frames=span, level=level, overwrite=True))
     return knobs_of(shot, layer, shown.prim)
 
 
@@ -250,12 +248,6 @@ def _area(mesh: PolygonMesh, points: np.ndarray) -> float:
 def _ratio(kinds: dict[str, float]) -> float:
     """The largest over the smallest."""
     return max(kinds.values()) / min(kinds.values())
-
-
-def _changed(options: RefineOptions) -> dict:
-    """The fields that are not at their defaults."""
-    plain = RefineOptions()
-    return {name: value for name, value in vars(options).items() if value != getattr(plain, name)}
 
 
 if __name__ == "__main__":
