@@ -210,7 +210,11 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 def pose(body: Rig, time: float) -> np.ndarray:
     """Matrices that take joints from rest to a time since a turn began [s], shape (J, 4, 4); the right foot stays."""
-    angles = motion(time)
+    return turned(body, motion(time))
+
+
+def turned(body: Rig, angles: dict[str, np.ndarray]) -> np.ndarray:
+    """Matrices of joints turned by rotation vectors [degrees], shape (J, 4, 4); the right foot stays."""
     matrices = np.tile(np.eye(4), (len(body.names), 1, 1))
     for i, (name, parent, place) in enumerate(zip(body.names, body.parents, body.places, strict=True)):
         turn = rotation(np.radians(angles.get(name, np.zeros(3))))
