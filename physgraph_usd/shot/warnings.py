@@ -12,8 +12,6 @@ from shlex import join
 from typing import Any
 
 from ..errors import counted
-from ..solver.folds import EDGES_PER_WAVE
-from ..solver.resolution import FEWEST_EDGES, SHARP_FRACTION, LevelChoice, finer
 from ..solver.strain import SHRUNK, StrainedPart
 from .report import RefineReport
 from .settled import COLLAPSED, LIMITED, UNSOLVED, Unsettled
@@ -25,6 +23,16 @@ MOST_NAMED = 3
 """Most prims, parts or time codes that one warning names."""
 Entries = Mapping[float | None, Mapping[str, Any]]
 """A garment's telemetry by time code."""
+
+
+class Warned(str):
+    """The text of a warning of a kind.
+
+    Attributes:
+        kind: Title of its kind.
+    """
+
+    kind = ""
 
 
 @dataclass(frozen=True)
@@ -55,7 +63,9 @@ class Kind:
         place = f"<{path}>" if path else ""
         place += "" if first is None else f" at time code {first:g}"
         parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
-        return (f"{place}: " if place else "") + "; ".join(filter(None, parts))
+        warning = Warned((f"{place}: " if place else "") + "; ".join(filter(None, parts)))
+        warning.kind = self.title
+        return warning
 
 
 _MEND = "cache that frame again, or leave it out with --frames"
@@ -93,15 +103,11 @@ WARNINGS = {
         "{how}; it follows its cage there, not solved",
         _MEND,
     ),
-    "crossings": Kind(
-        "crossings in the cage and refined",
-        _CROSSED,
-        "crossings {where}: {before:,} in the cage, {after:,} refined",
-    ),
-    "inside": Kind(
-        "vertices inside a body",
-        "a wrong side of the body (`physgraph:collider:side`), or cloth that other cloth holds there",
-        "vertices {where}: {before:,} in the cage, {after:,} refined",
+    "contact": Kind(
+        "crossings or vertices inside a body are left",
+        "CONTACT_ADVICE",
+        "contact is not kept: {left}",
+        "CONTACT_REMEDY",
     ),
     "energy": Kind(
         "more energy than the upsampled cage",
@@ -128,20 +134,6 @@ WARNINGS = {
         "if it is broken, leave it out with --frames and take the rest shape from another with --rest FRAME. "
         "Time code {next:g} starts anew",
     ),
-    "coarse": Kind(
-        "folds may be of the mesh's own size",
-        "a finer `--level`, or accept it: the layer is whole",
-        "its fabric can fold in waves of {wave:.1f} mm; level {level} has edges of {edge:.1f} mm, a fifth of a wave is "
-        "{fifth:.1f} mm: folds may be of the mesh's own size{raised}",
-        "{finer}",
-    ),
-    "sharp_folds": Kind(
-        "edges fold by more than 45 degrees",
-        "as above",
-        "{share:.0%} of the edges fold by more than 45 degrees: edges of {edge:.1f} mm, level {level}, are too coarse "
-        "for this fabric and show wrinkles of the mesh's own size",
-        "{finer}",
-    ),
     "strained": Kind(
         "in most frames the cage has not its rest shape's size",
         "`--rest auto`, `--rest FRAME` or `primvars:rest`: refined cloth goes to its rest shape's size",
@@ -153,6 +145,13 @@ WARNINGS = {
         "`--collider auto`, or the command that the warning names",
         "cloth is inside or within {near:.0f} mm of {meshes} that it does not feel, for {why}: {named}",
         "give --collider {auto}, or by name {options}",
+    ),
+    "gravity": Kind(
+        "gravity pulls across it",
+        "the stage's upAxis is not the one along which its body stands: set upAxis right, or give `--gravity -Y` (or "
+        "`-Z`), or author `physgraph:gravity`. Where a body lies down, the same options say that gravity is right",
+        "it and <{body}> inside it stand along {axis}, but gravity is {pull} by {source}",
+        "give --gravity -{axis}, or mend the stage's upAxis",
     ),
     "solved_anew": Kind(
         "finished frames are solved anew",
@@ -180,40 +179,24 @@ def advice_table() -> str:
     return "\n".join(["| it says | do |", "|---|---|", *rows]) + "\n"
 
 
-def of_levels(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[str]:
-    """A warning for each garment that can fold in waves of which its level carries nothing.
-
-    Args:
-        garments: Their paths.
-        choices: Their levels.
-    """
-    return [
-        WARNINGS["coarse"](
-            path,
-            wave=1e3 * choice.wavelength,
-            level=choice.level,
-            edge=1e3 * choice.edge,
-            fifth=1e3 * choice.wavelength / EDGES_PER_WAVE,
-            raised=f", and bending is raised {choice.raised[-1]:.3g} times" if choice.raised[-1:] > (1.0,) else "",
-            finer=choice.advice,
-        )
-        for path, choice in zip(garments, choices, strict=True)
-        if choice.needed > choice.level and choice.wavelength < FEWEST_EDGES * choice.edge
-    ]
-
-
-def of_strain(path: str, source: str, parts: Sequence[StrainedPart]) -> list[str]:
+def of_strain(found: Mapping[str, Sequence[StrainedPart]], source: str) -> list[str]:
     """A warning where parts are larger than their rest shape in most frames, or far smaller.
 
     Args:
-        path: The garment.
-        source: Where its rest shape is from.
-        parts: Its strained parts, largest first.
+        found: Strained parts of each garment, largest first, by its path.
+        source: Where the first one's rest shape is from.
     """
-    large = [part for part in parts if part.area_ratio > 1.0 or part.area_ratio < SHRUNK]
-    named = [f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}" for part in large]
-    named[MOST_NAMED:] = [counted(len(named) - MOST_NAMED, "smaller part")] if len(named) > MOST_NAMED else []
-    return [WARNINGS["strained"](path, source=source, parts=", ".join(named))] if named else []
+    named = {}
+    for path, parts in found.items():
+        large = [part for part in parts if part.area_ratio > 1.0 or part.area_ratio < SHRUNK]
+        named |= {f"<{path}>": f"{large[0].area_ratio:.0%} of its area {large[0].where}"} if large else {}
+    listed = ", ".join(f"{path} {worst}" for path, worst in named.items())
+    return [WARNINGS["strained"](source=source, parts=listed)] if named else []
+
+
+def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) -> str:
+    """A warning of gravity that pulls across a garment and the body inside it, which stand along an axis."""
+    return WARNINGS["gravity"](garment, body=body, axis=axis, pull=pull, source=source)
 
 
 def of_unfelt(found: Sequence[Beside]) -> list[str]:
@@ -235,21 +218,9 @@ def of_frames(report: RefineReport) -> list[str]:
         (garment, {frame["time"]: frame["garments"][index] for frame in report.frames if "garments" in frame})
         for index, garment in enumerate(report.garments)
     ]
-    checks = (of_folds, _of_bodies_that_passed, _of_jumps, of_contact, of_energy)
+    checks = (_of_bodies_that_passed, _of_jumps, of_contact, of_energy)
     found = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
     return [*found, *_of_unsettled(report.unsettled)]
-
-
-def of_folds(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning where a garment's mesh was too coarse for its folds, with its worst frame."""
-    shares = {time: entry.get("sharp_folds", 0.0) for time, entry in entries.items()}
-    worst = max(shares, key=lambda time: shares[time], default=None)
-    if not shares or shares[worst] <= SHARP_FRACTION:
-        return
-    path, level, needed, edge = (garment[name] for name in ("path", "level", "level_needed", "fine_edge_mm"))
-    known = needed > level and garment["wavelength_mm"] < FEWEST_EDGES * edge  # "coarse" has said what to do.
-    remedy = "" if known else finer(level, needed, 1e-3 * edge)
-    yield WARNINGS["sharp_folds"](path, [worst], share=shares[worst], edge=edge, level=level, finer=remedy)
 
 
 def _of_bodies_that_passed(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
@@ -270,17 +241,17 @@ def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
 
 
 def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning for each kind of contact that a garment's result does not keep, with its worst frame."""
-    found: dict[tuple[str, str], dict[float | None, tuple[int, int]]] = {}
-    for time, entry in entries.items():
-        for kind, where, measured, name in _measured(entry.get("contact", {})):
-            before, after = (int(measured.get(side, {}).get(name, 0)) for side in ("before", "after"))
-            if after:
-                found.setdefault((kind, where), {})[time] = before, after
-    for (kind, where), counts in found.items():
-        times = sorted(counts, key=lambda time: -counts[time][1])  # The worst first, then in order.
-        before, after = counts[times[0]]
-        yield WARNINGS[kind](garment["path"], times, where=where, before=before, after=after)
+    """A warning where a garment's result crosses cloth or bodies, or is inside one, with its worst frame."""
+    left = {
+        time: [each for each in _measured(entry.get("contact", {})) if each[1]]
+        for time, entry in entries.items()
+        if _is_first(garment, entry)
+    }
+    left = {time: counts for time, counts in left.items() if counts}
+    if left:
+        times = sorted(left, key=lambda time: -sum(after for _, after, _ in left[time]))  # The worst first.
+        named = [f"{after:,} {what} ({before:,} in the cage)" for what, after, before in left[times[0]]]
+        yield WARNINGS["contact"](garment["path"], times, left=", ".join(named))
 
 
 def of_energy(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
@@ -291,7 +262,7 @@ def of_energy(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
     """
     worse: dict[float | None, tuple[float, float]] = {}
     for time, entry in entries.items():
-        if entry.get("together", [garment["path"]])[0] != garment["path"]:  # Solved together, they have one energy.
+        if not _is_first(garment, entry):
             continue
         before, after = (sum((entry.get("energy_joules") or {}).get(side, {}).values()) for side in ("input", "output"))
         if after > (1.0 + ENERGY_ROUNDING) * before:
@@ -302,13 +273,21 @@ def of_energy(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
         yield WARNINGS["energy"](garment["path"], times, before=before, after=after)
 
 
-def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any], str]]:
-    """Measures of contact: the kind of warning, where, the measurements, and the count's name in them."""
-    yield "crossings", "of cloth", contact.get("cloth") or {}, "crossings"
+def _is_first(garment: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:
+    """Whether a garment is the first of those that a frame solved together: they have one energy and one contact."""
+    return entry.get("together", [garment["path"]])[0] == garment["path"]
+
+
+def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
+    """Measures of contact in words, with the count in the result and in the cage."""
+    measures = [("crossings of cloth", contact.get("cloth") or {}, "crossings")]
     for body, measured in contact.get("bodies", {}).items():
-        yield "crossings", f"with <{body}>", measured, "crossings"
-        yield "inside", f"inside <{body}>", measured, "inside"
-        yield "inside", f"inside <{body}>, which lies between cloth and where the cage has it", measured, "passing"
+        measures.append((f"crossings with <{body}>", measured, "crossings"))
+        measures.append((f"vertices inside <{body}>", measured, "inside"))
+        measures.append((f"vertices on the far side of <{body}>", measured, "passing"))
+    for what, measured, name in measures:
+        after, before = (int(measured.get(side, {}).get(name, 0)) for side in ("after", "before"))
+        yield what, after, before
 
 
 def _of_unsettled(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -99,7 +99,8 @@ def _panels(layer: Path, shot: Path | None) -> list[_Panel]:
     if shot is None:
         stage = DrawnStage(layer)
         return [_Panel("", stage, stage.garments(), True)]
-    coarse, fine = DrawnStage(shot), DrawnStage(shot, layer)
+    fine = DrawnStage(shot, layer)
+    coarse = DrawnStage(shot, turn=fine.turn)
     refined = refined_in(layer)
     source = tuple(path for path in refined if path in coarse.paths()) or coarse.garments()
     return [_Panel("Coarse input", coarse, source, True), _Panel("Refined", fine, refined, False)]

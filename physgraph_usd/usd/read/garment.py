@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,7 +16,7 @@ from scipy.sparse.linalg import splu
 from ...errors import GarmentError, SchemaError
 from ...solver.mesh.topology import PolygonMesh, edges_of
 from ...solver.scene import Garment, GarmentFrame
-from ..lookup import Found, Override, check_limits, find_value
+from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
 from ..times import garment_times, merge, transform_times, within
@@ -27,6 +28,8 @@ from .rest import AUTO, Rest, checked, read_rest, rests_bent
 from .skinning import Bake
 
 _SMALL, _LARGE = 0.01, 100.0
+_WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
+"""A word of a name such as "LeatherBelt_geo1"."""
 _MEDIAN_FRAMES = 9
 """Time codes that `--rest auto` takes medians of: an edge that is odd in four of them does not count."""
 _THICK = 10.0
@@ -141,7 +144,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
-        subsets=_subsets(prim, cage.kept_faces),
+        subsets=(subsets := _subsets(prim, cage.kept_faces)),
+        words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(cage.kept_faces)]),
     )
     return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices])
 
@@ -192,6 +196,14 @@ def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
         members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
         subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
     return subsets
+
+
+def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:
+    """Words, in lower case, in the names of a mesh, the prim above it, their materials, and subsets of the mesh."""
+    prims = [prim, prim.GetParent(), *bound_materials(prim)]
+    for subset in (prim.GetChild(name) for name in subsets):
+        prims += [subset, *bound_materials(subset)]
+    return tuple(word.lower() for each in prims for word in _WORD.findall(each.GetName()))
 
 
 def _rest_on_stage(
