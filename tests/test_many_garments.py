@@ -132,7 +132,7 @@ class TestWarnings:
     def test_of_one_kind_are_one_whatever_they_name(self):
         given = [WARNINGS["contact"](f"/g{index}", [1.0], left=left) for index, left in enumerate(["2 a", "3 b, 4 c"])]
         (said,) = of_a_kind(given)
-        assert said.startswith("</g0>, </g1> at time code 1: contact is not kept: 2 a;")
+        assert said.startswith("</g0>, </g1> at time code 1: 2 a are left;")
 
     def test_of_a_shot_name_all_prims_in_the_report(self, tmp_path: Path):
         shot = tmp_path / "shot.usda"

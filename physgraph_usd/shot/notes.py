@@ -12,10 +12,14 @@ from ..solver.fabric import NAMED
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
 from ..usd.read.reader import Shot
 from ..usd.schema import GARMENT
+from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import options_of
+from .warnings import is_first
 
 EASE = 4
 """Percent of weft ease that the note on slack proposes: of those in docs/fabrics.md, the one that folds every cage."""
+ENERGY_ROUNDING = 1e-3
+"""Part of an energy that counts for nothing: sums are in single precision."""
 MATERIALS = "stretchStiffness", "bendStiffness", "density"
 """Values of a fabric that every preset has."""
 
@@ -53,6 +57,47 @@ def of_fabrics(shot: Shot) -> list[str]:
         tag = ["physgraph-usd", "tag", shot.path, "-o", out, "--preset", preset, *options_of("--garment", words)]
         notes.append(f"named like {preset}: {said}; to refine it so: {join(tag)}")
     return notes
+
+
+def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:
+    """A note of the frames that ended before they were at rest, with the one farthest from it.
+
+    Args:
+        unsettled: A report's frames that did not settle.
+        frames: Number of frames.
+    """
+    moving = [entry for entry in unsettled if entry["stopped"] not in (LIMITED, COLLAPSED, UNSOLVED)]
+    if not moving:
+        return []
+    worst = max(moving, key=lambda entry: entry["remaining_move"])
+    at = "" if worst["time"] is None else f" at time code {worst['time']:g}"
+    count = len({entry["time"] for entry in moving})
+    return [f"{count} of {counted(frames, 'frame')} did not settle, <{worst['path']}>{at} the least: {in_words(worst)}"]
+
+
+def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note of the frames that ended with more energy than their upsampled cage has, with the one that has most more.
+
+    No descent ends above its start, but frames start from the last one's detail, and what is pushed out of bodies or
+    untangled pays for it.
+
+    Args:
+        garments: A report's garments.
+        frames: A report's frames.
+    """
+    above = []
+    for frame in frames:
+        for garment, entry in zip(garments, frame.get("garments", ()), strict=False):
+            sides = (entry.get("energy_joules") or {}) if is_first(garment, entry) else {}
+            before, after = (sum(sides.get(side, {}).values()) for side in ("input", "output"))
+            if after > (1.0 + ENERGY_ROUNDING) * before:
+                above.append((after - before, garment["path"], frame["time"], before, after))
+    if not above:
+        return []
+    _, path, time, before, after = max(above, key=lambda each: each[0])
+    count, at = len({each[2] for each in above}), "" if time is None else f" at time code {time:g}"
+    energies = f"{after:.3g} J, the cage's {before:.3g} J"
+    return [f"{counted(count, 'frame')} ended with more energy than the upsampled cage, <{path}>{at}: {energies}"]
 
 
 def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:

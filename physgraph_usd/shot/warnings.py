@@ -6,19 +6,16 @@ What a stage holds that is odd or repaired is named by its reader, as `usd.stage
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from itertools import groupby
+from dataclasses import dataclass
 from shlex import join
 from typing import Any
 
 from ..errors import counted
 from ..solver.strain import SHRUNK, StrainedPart
 from .report import RefineReport
-from .settled import COLLAPSED, LIMITED, UNSOLVED, Unsettled
+from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import AUTO, NEAR, Beside, options_of
 
-ENERGY_ROUNDING = 1e-3
-"""Part of an energy that counts for nothing: sums are in single precision."""
 MOST_NAMED = 3
 """Most prims, parts or time codes that one warning names."""
 Entries = Mapping[float | None, Mapping[str, Any]]
@@ -68,19 +65,12 @@ class Kind:
         return warning
 
 
-_MEND = "cache that frame again, or leave it out with --frames"
 _CROSSED = "`physgraph:contact:layer` orders garments; mend a cage that crosses itself; `--heat-map` shows where"
 WARNINGS = {
     "failed": Kind(
         "no sample is written at time code",
         "that frame failed, the reason follows; mend the input, run again",
         "no sample is written at time code {name}: {error}",
-    ),
-    "unsettled": Kind(
-        "the frame did not settle",
-        "`--steps 24`; `--strict` makes it exit code 3",
-        "the frame did not settle: {how}",
-        "more --steps may help",
     ),
     LIMITED: Kind(
         "the frame reached its limit of time",
@@ -90,30 +80,18 @@ WARNINGS = {
         "the frame was not solved to its end: it reached its limit of time",
         "see --frame-limit",
     ),
-    COLLAPSED: Kind(
-        "the cage has shrunk",
-        "the animation collapses the garment in that frame; it is upsampled there",
-        "{how}; the frame is upsampled, not solved",
-        _MEND,
-    ),
     UNSOLVED: Kind(
         "it follows its cage there, not solved",
-        "the reason stands before it: a body pushes the garment farther than it is large, or it cannot be solved; mend "
-        "the animation there",
+        "the reason stands before it: the animation collapses the garment, a body pushes it farther than it is large, "
+        "or it cannot be solved; mend the animation there, or leave the frame out with `--frames`",
         "{how}; it follows its cage there, not solved",
-        _MEND,
+        "cache that frame again, or leave it out with --frames",
     ),
     "contact": Kind(
         "crossings or vertices inside a body are left",
         "CONTACT_ADVICE",
-        "contact is not kept: {left}",
+        "{left} are left",
         "CONTACT_REMEDY",
-    ),
-    "energy": Kind(
-        "more energy than the upsampled cage",
-        "`--steps 24`, or a lower `physgraph:guide:stiffness`",
-        "its energy is {after:.3g} J, its upsampled cage's {before:.3g} J",
-        "more --steps may help",
     ),
     "passed_through": Kind(
         "the coarse cloth passes right through a body",
@@ -218,9 +196,9 @@ def of_frames(report: RefineReport) -> list[str]:
         (garment, {frame["time"]: frame["garments"][index] for frame in report.frames if "garments" in frame})
         for index, garment in enumerate(report.garments)
     ]
-    checks = (_of_bodies_that_passed, _of_jumps, of_contact, of_energy)
+    checks = (_of_bodies_that_passed, _of_jumps, of_contact)
     found = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
-    return [*found, *_of_unsettled(report.unsettled)]
+    return [*found, *_of_unsolved(report.unsettled)]
 
 
 def _of_bodies_that_passed(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
@@ -245,64 +223,41 @@ def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
     left = {
         time: [each for each in _measured(entry.get("contact", {})) if each[1]]
         for time, entry in entries.items()
-        if _is_first(garment, entry)
+        if is_first(garment, entry)
     }
     left = {time: counts for time, counts in left.items() if counts}
     if left:
         times = sorted(left, key=lambda time: -sum(after for _, after, _ in left[time]))  # The worst first.
-        named = [f"{after:,} {what} ({before:,} in the cage)" for what, after, before in left[times[0]]]
+        named = [f"{what} ({before:,} in the cage)" for what, _, before in left[times[0]]]
         yield WARNINGS["contact"](garment["path"], times, left=", ".join(named))
 
 
-def of_energy(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning where refined cloth has more energy than its upsampled cage, with the worst frame.
-
-    No descent ends above its start, but warm frames start from the last one's detail, and what is pushed out of bodies
-    or untangled pays for it.
-    """
-    worse: dict[float | None, tuple[float, float]] = {}
-    for time, entry in entries.items():
-        if not _is_first(garment, entry):
-            continue
-        before, after = (sum((entry.get("energy_joules") or {}).get(side, {}).values()) for side in ("input", "output"))
-        if after > (1.0 + ENERGY_ROUNDING) * before:
-            worse[time] = before, after
-    if worse:
-        times = sorted(worse, key=lambda time: worse[time][0] - worse[time][1])
-        before, after = worse[times[0]]
-        yield WARNINGS["energy"](garment["path"], times, before=before, after=after)
-
-
-def _is_first(garment: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:
+def is_first(garment: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:
     """Whether a garment is the first of those that a frame solved together: they have one energy and one contact."""
     return entry.get("together", [garment["path"]])[0] == garment["path"]
 
 
 def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
     """Measures of contact in words, with the count in the result and in the cage."""
-    measures = [("crossings of cloth", contact.get("cloth") or {}, "crossings")]
+    measures = [("crossing", "crossings", "of cloth", contact.get("cloth") or {}, "crossings")]
     for body, measured in contact.get("bodies", {}).items():
-        measures.append((f"crossings with <{body}>", measured, "crossings"))
-        measures.append((f"vertices inside <{body}>", measured, "inside"))
-        measures.append((f"vertices on the far side of <{body}>", measured, "passing"))
-    for what, measured, name in measures:
+        measures.append(("crossing", "crossings", f"with <{body}>", measured, "crossings"))
+        measures.append(("vertex", "vertices", f"inside <{body}>", measured, "inside"))
+        measures.append(("vertex", "vertices", f"on the far side of <{body}>", measured, "passing"))
+    for noun, plural, where, measured, name in measures:
         after, before = (int(measured.get(side, {}).get(name, 0)) for side in ("after", "before"))
-        yield what, after, before
+        yield f"{counted(after, noun, plural)} {where}", after, before
 
 
-def _of_unsettled(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Warnings of each garment: its frame that is farthest from rest, its first that collapsed, and all other ones."""
-    for path, each in groupby(found, key=lambda entry: str(entry["path"])):
-        entries = list(each)
-        kinds = {kind: [e for e in entries if e["stopped"] == kind] for kind in (LIMITED, COLLAPSED, UNSOLVED)}
-        moving = [entry for entry in entries if entry["stopped"] not in kinds]
-        kinds = {"unsettled": sorted(moving, key=lambda entry: -entry["remaining_move"])} | kinds
-        for kind, alike in kinds.items():
-            times = [entry["time"] for entry in alike]
-            for entry in alike[:1]:
-                how = str(Unsettled(**{each.name: entry[each.name] for each in fields(Unsettled)}))
-                place = f"<{path}> at time code {entry['time']:g}: " if entry["time"] is not None else f"<{path}>: "
-                yield WARNINGS[kind](path, times, how=how.removeprefix(place))
+def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Warnings of each garment's frames that reached their limit of time, and of those that follow their cage."""
+    kinds = {LIMITED: LIMITED, COLLAPSED: UNSOLVED, UNSOLVED: UNSOLVED}
+    known = [(str(entry["path"]), kinds[entry["stopped"]], entry) for entry in found if entry["stopped"] in kinds]
+    for path, kind in dict.fromkeys((path, kind) for path, kind, _ in known):
+        entries = [entry for *of, entry in known if of == [path, kind]]
+        how = in_words(entries[0])
+        place = f"<{path}>" + ("" if entries[0]["time"] is None else f" at time code {entries[0]['time']:g}") + ": "
+        yield WARNINGS[kind](path, [entry["time"] for entry in entries], how=how.removeprefix(place))
 
 
 def _also(times: Sequence[float | None]) -> str:
