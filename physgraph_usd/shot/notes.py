@@ -52,10 +52,10 @@ def of_fabrics(shot: Shot) -> list[str]:
             named.setdefault(NAMED[word], {})[str(source.path)] = word
     notes = []
     for preset, words in named.items():
-        said = ", ".join(f"<{path}> ({word})" for path, word in words.items())
+        listed = ", ".join(f"<{path}> ({word})" for path, word in words.items())
         out = str(Path(shot.path).with_suffix(f".{preset}.usda"))
         tag = ["physgraph-usd", "tag", shot.path, "-o", out, "--preset", preset, *options_of("--garment", words)]
-        notes.append(f"named like {preset}: {said}; to refine it so: {join(tag)}")
+        notes.append(f"named like {preset}: {listed}; to refine it so: {join(tag)}")
     return notes
 
 

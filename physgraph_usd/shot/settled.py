@@ -40,7 +40,7 @@ class Unsettled:
 
 
 def in_words(entry: Mapping[str, Any]) -> str:
-    """What an entry of `unsettled_frames` says, in words."""
+    """An entry of `unsettled_frames` in words."""
     return str(Unsettled(**{each.name: entry[each.name] for each in fields(Unsettled)}))
 
 

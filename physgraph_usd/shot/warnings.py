@@ -65,7 +65,6 @@ class Kind:
         return warning
 
 
-_CROSSED = "`physgraph:contact:layer` orders garments; mend a cage that crosses itself; `--heat-map` shows where"
 WARNINGS = {
     "failed": Kind(
         "no sample is written at time code",
@@ -74,24 +73,23 @@ WARNINGS = {
     ),
     LIMITED: Kind(
         "the frame reached its limit of time",
-        "it took over 20 times as long as the shot's other frames (and over two minutes and 10 ms a fine vertex), and "
-        "stands where it was stopped: valid, not at rest, and the one result that depends on the machine's speed. Look "
-        "at that frame's cage and bodies; `--frame-limit SECONDS` sets the limit",
+        "it took over 20 times as long as other frames and stands where it was stopped: valid, not at rest, and "
+        "dependent on the machine's speed. Look at its cage and bodies; `--frame-limit SECONDS` sets the limit",
         "the frame was not solved to its end: it reached its limit of time",
         "see --frame-limit",
     ),
     UNSOLVED: Kind(
         "it follows its cage there, not solved",
-        "the reason stands before it: the animation collapses the garment, a body pushes it farther than it is large, "
-        "or it cannot be solved; mend the animation there, or leave the frame out with `--frames`",
+        "the reason stands before it; mend the animation there, or leave the frame out with `--frames`",
         "{how}; it follows its cage there, not solved",
         "cache that frame again, or leave it out with --frames",
     ),
     "contact": Kind(
         "crossings or vertices inside a body are left",
-        "CONTACT_ADVICE",
+        "`--heat-map` writes where: mend the cage there; `physgraph:contact:layer` orders garments, "
+        "`physgraph:collider:side` mends a wrong side. Some frames come out clean alone (`--frames`)",
         "{left} are left",
-        "CONTACT_REMEDY",
+        "--heat-map shows where, to mend the cage there",
     ),
     "passed_through": Kind(
         "the coarse cloth passes right through a body",
@@ -126,8 +124,7 @@ WARNINGS = {
     ),
     "gravity": Kind(
         "gravity pulls across it",
-        "the stage's upAxis is not the one along which its body stands: set upAxis right, or give `--gravity -Y` (or "
-        "`-Z`), or author `physgraph:gravity`. Where a body lies down, the same options say that gravity is right",
+        "set the stage's `upAxis` right, or give `--gravity` the axis; also where a body lies and gravity is right",
         "it and <{body}> inside it stand along {axis}, but gravity is {pull} by {source}",
         "give --gravity -{axis}, or mend the stage's upAxis",
     ),
@@ -164,12 +161,12 @@ def of_strain(found: Mapping[str, Sequence[StrainedPart]], source: str) -> list[
         found: Strained parts of each garment, largest first, by its path.
         source: Where the first one's rest shape is from.
     """
-    named = {}
+    named = []
     for path, parts in found.items():
         large = [part for part in parts if part.area_ratio > 1.0 or part.area_ratio < SHRUNK]
-        named |= {f"<{path}>": f"{large[0].area_ratio:.0%} of its area {large[0].where}"} if large else {}
-    listed = ", ".join(f"{path} {worst}" for path, worst in named.items())
-    return [WARNINGS["strained"](source=source, parts=listed)] if named else []
+        for part in large[:1]:
+            named.append(f"<{path}> {part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}")
+    return [WARNINGS["strained"](source=source, parts=", ".join(named))] if named else []
 
 
 def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) -> str:

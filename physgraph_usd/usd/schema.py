@@ -182,8 +182,7 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "physgraph:gravity", "token", None, "", None, None,
-        "Axis of the stage along which gravity pulls, the same for all garments of a shot; without it as the physics "
-        "scene says, or against the stage's up axis.",
+        "Axis of the stage along which gravity pulls, one for all garments.",
         "Gravity", REFINEMENT, uniform=True, tokens=AXES,
     ),
     *_material(GARMENT_API, fallbacks=True),

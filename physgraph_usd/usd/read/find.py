@@ -133,8 +133,8 @@ def with_gravity(units: Units, garments: Sequence[Usd.Prim], asked: str | None) 
         return units.pulled(asked, GRAVITY_OPTION)
     found = [(axis, source) for axis, source in (find_token(prim, GARMENT["gravity"]) for prim in garments) if axis]
     if len({axis for axis, _ in found}) > 1:
-        said = ", ".join(f"{source} is {axis}" for axis, source in dict.fromkeys(found))
-        raise SchemaError(f"{said}: a shot has one gravity")
+        listed = ", ".join(f"{source} is {axis}" for axis, source in dict.fromkeys(found))
+        raise SchemaError(f"{listed}: a shot has one gravity")
     return units.pulled(*found[0]) if found else units
 
 

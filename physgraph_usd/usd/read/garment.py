@@ -126,11 +126,10 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     self_contact, layer, raises, level = _constants(prim, request)
     painted, cut = _painted(prim, points.count, notices, values=values)
     grain, lies = read_grain(prim, cage.mesh, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
-    order, subdivisions = layer.at(None), round(level.at(None) or 0.0)
     garment = Garment(
-        *(str(prim.GetPath()), cage.mesh, rest.points, subdivisions, is_flipped(prim, matrix), bent),
+        *(str(prim.GetPath()), cage.mesh, rest.points, round(level.at(None) or 0.0), is_flipped(prim, matrix), bent),
         self_contact=bool(self_contact.at(None)),
-        layer=None if order is None else round(order),
+        layer=None if (order := layer.at(None)) is None else round(order),
         grain=grain,
         raises_bending=bool(raises.at(None)),
         **painted,
