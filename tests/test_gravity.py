@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def worn(path: Path, *, up: str, axis: str, cloth: Soup = SKIRT, body: tuple[flo
     return save(stage)
 
 
-def warned(shot: str, **options: str) -> list[str]:
+def warned(shot: str, **options: Any) -> list[str]:
     return [each for each in inspect_shot(shot, level=0, **options)["warnings"] if "stand along" in each]
 
 

@@ -12,9 +12,9 @@ from ..solver.fabric import NAMED
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
 from ..usd.read.reader import Shot
 from ..usd.schema import GARMENT
+from .report import is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import options_of
-from .warnings import is_first
 
 EASE = 4
 """Percent of weft ease that the note on slack proposes: of those in docs/fabrics.md, the one that folds every cage."""
@@ -88,7 +88,7 @@ def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[st
     above = []
     for frame in frames:
         for garment, entry in zip(garments, frame.get("garments", ()), strict=False):
-            sides = (entry.get("energy_joules") or {}) if is_first(garment, entry) else {}
+            sides = (entry.get("energy_joules") or {}) if is_first(garment["path"], entry) else {}
             before, after = (sum(sides.get(side, {}).values()) for side in ("input", "output"))
             if after > (1.0 + ENERGY_ROUNDING) * before:
                 above.append((after - before, garment["path"], frame["time"], before, after))

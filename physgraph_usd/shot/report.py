@@ -37,6 +37,11 @@ _GARMENT: dict[str, Any] = dict.fromkeys(
 _CONTACT: dict[str, Any] = dict.fromkeys(("bodies", "cloth", "repaired", "projected"))
 
 
+def is_first(path: str, entry: Mapping[str, Any]) -> bool:
+    """Whether a garment is the first of those solved together in a frame: all have one energy and one contact."""
+    return entry.get("together", [path])[0] == path
+
+
 def is_of_failure(path: Path) -> bool:
     """Whether a file is the report of a run that failed, which the next run may replace."""
     try:
@@ -128,8 +133,7 @@ class RefineReport:
         """Edges through faces of each measurement, "before" or "after"."""
         paths = [garment["path"] for garment in self.garments]
         entries = [pair for frame in self.frames for pair in zip(paths, frame.get("garments", ()), strict=False)]
-        # Garments that are solved together have one measurement, which each of them tells.
-        alone = [entry for path, entry in entries if entry.get("together", [path])[0] == path]
+        alone = [entry for path, entry in entries if is_first(path, entry)]
         found = [entry["contact"] for entry in alone if "contact" in entry]
         measured = [each for contact in found for each in (contact.get("cloth"), *contact.get("bodies", {}).values())]
         return [each[side]["crossings"] for each in measured if each]

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import counted
 from ..solver.strain import SHRUNK, StrainedPart
-from .report import RefineReport
+from .report import RefineReport, is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import AUTO, NEAR, Beside, options_of
 
@@ -220,18 +220,13 @@ def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
     left = {
         time: [each for each in _measured(entry.get("contact", {})) if each[1]]
         for time, entry in entries.items()
-        if is_first(garment, entry)
+        if is_first(garment["path"], entry)
     }
     left = {time: counts for time, counts in left.items() if counts}
     if left:
         times = sorted(left, key=lambda time: -sum(after for _, after, _ in left[time]))  # The worst first.
         named = [f"{what} ({before:,} in the cage)" for what, _, before in left[times[0]]]
         yield WARNINGS["contact"](garment["path"], times, left=", ".join(named))
-
-
-def is_first(garment: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:
-    """Whether a garment is the first of those that a frame solved together: they have one energy and one contact."""
-    return entry.get("together", [garment["path"]])[0] == garment["path"]
 
 
 def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
