@@ -55,7 +55,7 @@ def main(folder: Path | None, bound: float) -> None:
 def row(file: Path, options: RefineOptions, bound: float) -> str:
     """Cells of a shot's row, but for its name."""
     with closing(open_for(str(file), options)) as shot:
-        frames, garments = sample_frames(shot.times_to_sample, shot.frame), shot.scene.garments
+        frames, garments = sample_frames(shot.every_time, shot.frame), shot.scene.garments
         choices, meter = choose_levels(shot.scene, frames), CrowdingMeter(shot.scene)
         crowding = [meter.measure(frame) for frame in frames]
     times = [seconds(garments, [level] * len(garments), crowding) for level in range(LEAST, MOST + 1)]

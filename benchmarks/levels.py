@@ -53,7 +53,7 @@ def main() -> None:
         overrides = [f"physgraph:material:{name}={value}" for name, value in values.items()]
         reading = {"garments": given.garment, "colliders": given.collider, "level": level, "overrides": overrides}
         with closing(open_shot(given.shot, **reading)) as shot:
-            choice = choose_levels(shot.scene, sample_frames(shot.times_to_sample, shot.frame))[0]
+            choice = choose_levels(shot.scene, sample_frames(shot.every_time, shot.frame))[0]
             refiner = Refiner(shot.scene, RefineOptions(steps=given.steps).solve_settings())
             frame = shot.frame(given.time)
             start = time.process_time()

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import click
 import numpy as np
+from physgraph_usd.shot.page.raycast import draw, encode_color, fit_view
 from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
 from benchmarks.knobs import neighbour_mean, refinements_of, smooth_stencil, standing_off, vertex_normals
 from benchmarks.rows import say
 from physgraph_usd.shot.page.preview import label, surface_of
-from physgraph_usd.shot.page.raycast import draw, encode_color, fit_view
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
 from physgraph_usd.usd.read.reader import open_shot

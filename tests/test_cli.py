@@ -398,7 +398,7 @@ class TestOtherCommands:
 
     @pytest.mark.parametrize(("name", "down"), [("swatch", "-Y"), ("swatch_zup", "-Z")])
     def test_inspect_says_where_gravity_pulls(self, sample: Sample, name: str, down: str) -> None:
-        assert f"gravity: 9.81 m/s^2 towards {down}\n" in run("inspect", sample(name)).stdout
+        assert f"gravity: 9.81 m/s^2 towards {down}, by upAxis of the stage\n" in run("inspect", sample(name)).stdout
 
     def test_tag_then_refine(self, sample: Sample, tmp_path: Path) -> None:
         found = json.loads(run("inspect", sample("swatch"), "--json").stdout)

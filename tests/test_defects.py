@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from meshes import any_mesh, cube, grid, mesh_of, planar_mesh, prism, tetrahedron
 
-from physgraph_usd.solver.mesh.defects import defects
+from physgraph_usd.solver.mesh.defects import defects, in_brief
 from physgraph_usd.solver.mesh.subdivide import subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -70,3 +70,12 @@ def test_any_mesh_can_be_asked(mesh: PolygonMesh):
     used = set(mesh.indices.tolist())
     found = defects(mesh, points)
     assert {defect.index for defect in found if defect.kind == "isolated-point"} == set(range(len(points))) - used
+
+
+def test_defects_of_a_kind_are_one_line():
+    mesh = mesh_of([[0, 1, 2], [0, 1, 3], [3, 4, 5], [3, 4, 6]], 8)
+    assert in_brief(defects(mesh)) == [
+        "both faces run through edge 0-1 the same way, and 1 more",
+        "vertex 3 joins several fans of faces in a point",
+        "no face uses vertex 7",
+    ]

@@ -18,6 +18,7 @@ from stages import add_sheet, new_stage
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.report import of_a_kind
+from physgraph_usd.shot.warnings import WARNINGS
 from physgraph_usd.solver.contact.broad_phase import Parts
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 from physgraph_usd.usd.read.find import felt_by, find_colliders
@@ -113,7 +114,7 @@ class TestWarnings:
     def test_of_a_kind_are_one(self):
         given = [f"</g{index}>: edges of {index + 0.5} mm" for index in range(5)] + ["</g1>: is still", "stage: odd"]
         assert of_a_kind(given) == {
-            "5 prims, e.g. </g0>, </g1>: edges of 0.5 mm (the figures are those of the first)": [
+            "</g0>, </g1>, </g2> and 2 more: edges of 0.5 mm (the figures are those of the first)": [
                 f"/g{index}" for index in range(5)
             ],
             "</g1>: is still": [],
@@ -124,15 +125,22 @@ class TestWarnings:
         more = ["", "; also at time code 2", "; also at time codes 2 and 3", "; also in 9 other frames"]
         assert len(of_a_kind(f"</g{index}> at time code 1: moves{also}" for index, also in enumerate(more))) == 1
 
-    def test_of_a_few_prims_stay_as_they_are(self):
-        given = [f"</g{index}>: is still" for index in range(3)]
+    def test_of_one_prim_stay_as_they_are(self):
+        given = ["</g>: is still", "</g> at time code 1: moves"]
         assert of_a_kind([*given, *given]) == {each: [] for each in given}
+
+    def test_of_one_kind_are_one_whatever_they_name(self):
+        given = [WARNINGS["contact"](f"/g{index}", [1.0], left=left) for index, left in enumerate(["2 a", "3 b, 4 c"])]
+        (said,) = of_a_kind(given)
+        assert said.startswith("</g0>, </g1> at time code 1: 2 a are left;")
 
     def test_of_a_shot_name_all_prims_in_the_report(self, tmp_path: Path):
         shot = tmp_path / "shot.usda"
-        sheets(shot, 5)
+        stage = sheets(shot, 5)
+        stage.ClearMetadata("metersPerUnit")
+        stage.Save()
         report = refine(shot, tmp_path / "fine.usdc")
-        (said,) = [each for each in report.warnings if "waves" in each]
-        assert said.startswith("5 prims, e.g. </World/g0>, </World/g1>: ")
+        (said,) = [each for each in report.warnings if "measures" in each]
+        assert said.startswith("</World/g0>, </World/g1>, </World/g2> and 2 more: measures ")
         assert report.warned[said] == [f"/World/g{index}" for index in range(5)]
         assert said in inspect_shot(shot, level=1)["warnings"]

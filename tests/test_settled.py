@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 from shots import CLOTH, cloth_shot, command, refine
 
+from physgraph_usd.shot.notes import of_energy
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.shot.settled import unsettled
-from physgraph_usd.shot.warnings import Entries, of_contact, of_energy
+from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact
 
 
 def told(level: int, remaining: float, stopped: str = "steps") -> dict[str, Any]:
@@ -44,20 +45,21 @@ def gentle(tmp_path: Path) -> Path:
     return cloth_shot(tmp_path / "gentle.usdc", broken={3.0: 0.5})
 
 
-def test_a_warning_names_prim_time_code_and_figure(gentle: Path, tmp_path: Path):
+def test_a_note_names_prim_time_code_and_figure(gentle: Path, tmp_path: Path):
     report = refine(gentle, tmp_path / "fine.usdc", steps=0)
     assert {entry["path"] for entry in report.unsettled} == {CLOTH}
-    warning = next(each for each in report.warnings if "did not settle" in each)
+    (said,) = [each for each in report.notes if "did not settle" in each]
     worst = max(report.unsettled, key=lambda entry: entry["remaining_move"])
-    assert warning.startswith(f"<{CLOTH}> at time code {worst['time']:g}")
-    assert f"{worst['remaining_move']:.2g} edges" in warning
+    assert f" frames did not settle, <{CLOTH}> at time code {worst['time']:g} the least: " in said
+    assert f"{worst['remaining_move']:.2g} edges" in said
+    assert not [each for each in report.warnings if "settle" in each]
     assert report.exit_code == 0
 
 
 def test_a_frame_that_settles_is_not_told_of(gentle: Path, tmp_path: Path):
     report = refine(gentle, tmp_path / "fine.usdc", steps=96)
     assert report.unsettled == []
-    assert not [each for each in report.warnings if "settle" in each]
+    assert not [each for each in report.notes if "settle" in each]
 
 
 @pytest.mark.parametrize(("steps", "code"), [(0, 3), (96, 0)])
@@ -75,12 +77,14 @@ def entry(side: str, before: int, after: int) -> dict[str, Any]:
 
 class TestContact:
     def test_what_is_left_in_bodies_is_told_of_as_in_cloth_with_what_there_was(self):
+        remedy = WARNINGS["contact"].remedy
         entries: Entries = {1.0: entry("/Body", 10, 1), 2.0: entry("/Body", 1196, 174), 3.0: entry("/Body", 9, 0)}
         assert list(of_contact({"path": "/A"}, entries)) == [
-            "</A> at time code 2: crossings with </Body>: 1,196 in the cage, 174 refined; also at time code 1"
+            f"</A> at time code 2: 174 crossings with </Body> (1,196 in the cage) are left; {remedy}; "
+            "also at time code 1"
         ]
         assert list(of_contact({"path": "/A"}, {1.0: entry("cloth", 3, 1)})) == [
-            "</A> at time code 1: crossings of cloth: 3 in the cage, 1 refined"
+            f"</A> at time code 1: 1 crossing of cloth (3 in the cage) are left; {remedy}"
         ]
 
     @pytest.mark.parametrize(("after", "code"), [(0, 0), (10, 0), (11, 3)])
@@ -102,12 +106,6 @@ def test_a_frame_above_its_input_is_told_of():
     def energies(before: float, after: float) -> dict[str, Any]:
         return {"energy_joules": {"input": {"stretch": before}, "output": {"stretch": after}}}
 
-    entries: Entries = {
-        1.0: energies(1e-3, 1e-3),
-        2.0: energies(1.9e-5, 3.2e-4),
-        3.0: energies(1e-3, 1.1e-3),
-        4.0: {},
-    }
-    (said,) = of_energy({"path": "/A"}, entries)
-    assert said.startswith("</A> at time code 2: its energy is 0.00032 J, its upsampled cage's 1.9e-05 J")
-    assert said.endswith("more --steps may help; also at time code 3")
+    found = {1.0: energies(1e-3, 1e-3), 2.0: energies(1.9e-5, 3.2e-4), 3.0: energies(1e-3, 1.1e-3), 4.0: {}}
+    (said,) = of_energy([{"path": "/A"}], [{"time": time, "garments": [each]} for time, each in found.items()])
+    assert said.startswith("2 frames ended with more energy than the upsampled cage, </A> at time code 2: 0.00032 J")

@@ -6,7 +6,6 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -79,18 +78,20 @@ class TestDone:
         assert asked["physgraph"].modelled["network"].startswith(f"physgraph made {share:.0%} of the steps")
         assert "network" not in asked["physgraph"].left_out
 
-    def test_the_level_that_would_do_and_its_cost_are_told_before_the_first_frame(
-        self, shot: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    @pytest.mark.parametrize("frames", [None, (2.0, 3.0)])
+    def test_what_is_known_before_the_first_frame_is_what_inspect_says_of_the_whole_shot(
+        self, shot: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, frames: tuple[float, float] | None
     ):
+        caplog.set_level("INFO", "physgraph_usd")
         seen: list[list[str]] = []
-        options: dict[str, Any] = {"overrides": (f"{BEND}=1e-6",), "level": 1}
-        report = refine(shot, tmp_path / "fine.usdc", progress=lambda *_: seen.append(caplog.messages), **options)
-        garment = inspect_shot(shot, **options)["garments"][0]
-        said = f"use --level {min(garment['level_needed'], 5)}, with edges of "
-        assert any(said in message for message in seen[0])
-        assert said in garment["level_reason"]
-        assert report.garments[0] == garment
-        assert set(seen[0]) <= set(report.warnings)
+        found = inspect_shot(shot, level=1)
+        report = refine(shot, tmp_path / "fine.usdc", progress=lambda *_: seen.append(caplog.messages), frames=frames)
+        (garment,), (refined,) = found["garments"], report.garments
+        for name in ("wavelength_mm", "level_needed", "level_reason", "strained", "unfelt"):
+            assert refined[name] == garment[name], name
+        assert report.notes[: len(found["notes"])] == found["notes"]
+        assert {*report.warnings, *found["notes"]} >= {*found["warnings"]} | {*found["notes"]}
+        assert {*found["warnings"], *found["notes"]} <= {*seen[0]}
         assert {record.name for record in caplog.records} == {"physgraph_usd"}
 
     def test_progress_counts_up(self, shot: Path, tmp_path: Path):
@@ -276,7 +277,7 @@ class TestOptions:
         plain = RefineOptions(level=1, steps=3, heat_map=True, preroll=0).plain()
         assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
             "progress", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths", "resume",
-            "keep_frames", "strict", "skip_existing", "sources", "scheduler",
+            "gravity", "keep_frames", "strict", "skip_existing", "sources", "scheduler",
         }  # fmt: skip
         assert json.loads(json.dumps(record, default=str))
 

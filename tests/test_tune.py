@@ -218,7 +218,7 @@ def test_levels(session: TuneSession):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda own: own.set_value(CLOTH, "bend", 1.0), "known values: stretchStiffness"),
+        (lambda own: own.set_value(CLOTH, "bend", 1.0), "known values: rest:weftEase"),
         (lambda own: own.set_value("/World/x", "bendStiffness", 1.0), "no garment </World/x>"),
         (lambda own: own.set_value(CLOTH, "density", -1.0), "density is -1"),
         (lambda own: own.set_preset(CLOTH, "steel"), "known presets: cotton"),

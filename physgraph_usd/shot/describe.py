@@ -13,20 +13,24 @@ from ..errors import GarmentError, StageError
 from ..solver.contact.crowding import Crowding, CrowdingMeter
 from ..solver.fabric import Fabric
 from ..solver.integrate import LEARNED
-from ..solver.mesh.defects import defects
+from ..solver.mesh.defects import defects, in_brief
 from ..solver.resolution import LevelChoice, choose_levels, sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
 from ..solver.strain import StrainedPart, strained_parts
+from ..usd.read.find import GRAVITY_OPTION
 from ..usd.read.reader import Shot
 from ..usd.read.survey import survey
+from ..usd.schema import GARMENT
 from ..usd.stage import GarmentSource
 from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
+from .notes import of_fabrics, of_slack
 from .options import RefineOptions
 from .report import RefineReport, of_a_kind
-from .untagged import bodies_beside, command_of, proposal, rest_options
-from .warnings import of_levels, of_strain, of_unfelt
+from .untagged import Beside, bodies_beside, command_of, proposal, rest_options
+from .up_axis import across_gravity
+from .warnings import of_gravity, of_strain, of_unfelt
 
 
 def begin_report(
@@ -43,7 +47,7 @@ def begin_report(
     Returns:
         What the user should know.
     """
-    first, frames = _first_frame(opened), sample_frames(opened.times_to_sample, opened.frame)
+    first, frames = _first_frame(opened), sample_frames(opened.every_time, opened.frame)
     choices = choose_levels(opened.scene, frames)
     parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
     written = "--velocities" if options.velocities else "none"
@@ -56,12 +60,15 @@ def begin_report(
     crowding = _crowding(opened, frames, options) if before_a_run else ()
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=crowding).plain()
     known = _strained(opened, report, frames)
-    known += of_levels([garment.path for garment in opened.scene.garments], choices)
-    known += _unfelt(opened, report, frames) if options.contact != "off" else []
+    beside = bodies_beside(opened, frames)
+    known += _unfelt(report, beside) if options.contact != "off" else []
+    known += _across(opened, frames, beside)
+    report.note(*of_slack([garment.path for garment in opened.scene.garments], choices), *of_fabrics(opened))
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
-    return [str(notice) for notice in opened.warnings] + known
+    refined = {None, *opened.scene.times}  # Frames that are looked at alone may be broken.
+    return [str(notice) for notice in opened.warnings if notice.time in refined] + known
 
 
 def say_what_was(report: RefineReport) -> None:
@@ -118,11 +125,9 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
         "modelled": report.modelled,
         "left_out": report.left_out,
         "variants": report.variants,
-        "defects": {
-            garment.path: [defect.message for defect in defects(garment.mesh, garment.rest)]
-            for garment in opened.scene.garments
-        },
+        "defects": {garment.path: in_brief(defects(garment.mesh, garment.rest)) for garment in opened.scene.garments},
         "warnings": [*of_a_kind(warnings)],
+        "notes": report.notes,
         **_command(opened, report, options),
     }
 
@@ -226,22 +231,28 @@ def _crowding(opened: Shot, frames: Sequence[Frame], options: RefineOptions) -> 
     return found
 
 
-def _unfelt(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
+def _unfelt(report: RefineReport, beside: Sequence[Beside]) -> list[str]:
     """Add to the report the closed meshes that garments touch and do not feel; returns a warning of them."""
-    beside = bodies_beside(opened, frames)
     for garment in report.garments:
         garment["unfelt"] = [each.path for each in beside if garment["path"] in each.shares]
     return of_unfelt(beside)
 
 
+def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Beside]) -> list[str]:
+    """A warning where bodies and garments stand across gravity that nobody chose."""
+    chosen = opened.gravity_source == GRAVITY_OPTION or opened.gravity_source.endswith(GARMENT["gravity"].name)
+    found = None if chosen else across_gravity(opened.scene, frames, beside)
+    return [] if found is None else [of_gravity(*found, pull=_pull(opened.scene.gravity), source=opened.gravity_source)]
+
+
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
-    """Add to the report the parts of garments that are not of their rest shape's size; returns warnings."""
-    warnings, up = [], -opened.scene.gravity
+    """Add to the report the parts of garments that are not of their rest shape's size; returns a warning of them."""
+    found, up = {}, -opened.scene.gravity
     for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
         parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets, up=up)
         report.garments[index]["strained"] = [dataclasses.asdict(part) for part in parts]
-        warnings += of_strain(garment.path, source.sources["rest"], parts)
-    return warnings
+        found[garment.path] = parts
+    return of_strain(found, opened.sources[0].sources["rest"])
 
 
 def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
@@ -249,7 +260,7 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     modelled = {
         **_in_plane(report),
         "bending": f"dihedral angles, {angles}",
-        "gravity": _pull(opened.scene.gravity),
+        "gravity": f"{_pull(opened.scene.gravity)}, by {opened.gravity_source}",
         "guide": "ties the local average to the coarse animation",
     }
     if _touching(opened) and options.contact != "off":

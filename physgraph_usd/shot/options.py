@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import UsageError
+from ..usd.schema import AXES
 from ..usd.write.atomic import ASSET_PATHS
 
 if TYPE_CHECKING:
@@ -143,6 +144,13 @@ class RefineOptions:
         flag="rest",
         metavar="FRAME|auto",
     )
+    gravity: str | None = _scene(
+        None,
+        "Axis of the stage along which gravity pulls, such as -Y.  [default: the garments', the physics scene's, or "
+        "against the stage's up axis]",
+        metavar="AXIS",
+        choices=AXES,
+    )
     root: Path | None = _files(None, "Also write a .usda with the layer over the shot.")
     strict: bool = _layer(
         False, "Exit with 3 where a frame did not settle or over a tenth of what crossed is left.", result=False
@@ -160,7 +168,7 @@ class RefineOptions:
         """The options that decide the result, ready for JSON."""
         names = {name for name, option in OPTIONS.items() if option.result}
         # A layer without these is as it was before there were any.
-        later = ("heat_map", "weights", "preroll")
+        later = ("heat_map", "weights", "preroll", "gravity")
         names -= {name for name in later if getattr(self, name) is None or getattr(self, name) is False}
         values = {name: getattr(self, name) for name in OPTIONS if name in names}
         if self.weights:
@@ -237,7 +245,7 @@ RefineOptions.__doc__ = f"{RefineOptions.__doc__}\n\nAttributes:\n" + "\n".join(
 
 
 def _check(name: str, value: Any, option: Option) -> None:
-    if option.choices and value not in option.choices:
+    if option.choices and value is not None and value not in option.choices:
         raise UsageError(f"unknown {name} '{value}'; known: {', '.join(option.choices)}")
     if option.least is not None and value is not None and not value >= option.least:
         raise UsageError(f"{name} is {value:g}: give {option.least} or more")

@@ -23,8 +23,8 @@ LEFT = 0.1
 """Part of what crosses in the input that a strict run may leave."""
 LOG = logging.getLogger("physgraph_usd")
 """Where warnings and progress go, for the whole package."""
-MOST_ALONE = 3
-"""Prims that each get a warning of a kind; more of them get one together."""
+MOST_NAMED = 3
+"""Most prims that a warning about several of them names."""
 _OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
 _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
@@ -35,6 +35,11 @@ _GARMENT: dict[str, Any] = dict.fromkeys(
     )
 )  # fmt: skip
 _CONTACT: dict[str, Any] = dict.fromkeys(("bodies", "cloth", "repaired", "projected"))
+
+
+def is_first(path: str, entry: Mapping[str, Any]) -> bool:
+    """Whether a garment is the first of those solved together in a frame: all have one energy and one contact."""
+    return entry.get("together", [path])[0] == path
 
 
 def is_of_failure(path: Path) -> bool:
@@ -65,7 +70,8 @@ class RefineReport:
         unsettled: Frames that were written though the solver left them unsettled: path, time and in what way.
         strict: Whether a run with unsettled frames counts as done in part.
         variants: Variant selections in force on what the garments depend on, as paths ``/World/coat{fit=loose}``.
-        warnings: What the user should know; what is so of many prims is one of them, which names a few.
+        warnings: What the user should know; what is so of several prims is one of them, which names a few.
+        notes: What could look otherwise, though nothing is wrong: slack of the cages, fabrics by name, the level.
         warned: All prims that such a warning is about.
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB]; None where the system does not tell.
@@ -88,6 +94,7 @@ class RefineReport:
     strict: bool = False
     variants: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     warned: dict[str, list[str]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float | None = None
@@ -132,7 +139,7 @@ class RefineReport:
         """Measurements of contact in a frame: garments that are solved together have one."""
         paths = [garment["path"] for garment in self.garments]
         entries = list(zip(paths, frame.get("garments", ()), strict=False))
-        alone = [entry for path, entry in entries if (entry.get("together") or [path])[0] == path]
+        alone = [entry for path, entry in entries if is_first(path, entry)]
         return [entry["contact"] for entry in alone if entry.get("contact")]
 
     def warn(self, *warnings: str) -> None:
@@ -142,6 +149,12 @@ class RefineReport:
                 self.warnings.append(warning)
                 self.warned |= {warning: paths} if paths else {}
                 LOG.warning(warning, extra={"shot": self.shot})
+
+    def note(self, *notes: str) -> None:
+        """Take notes, and log them as information."""
+        for note in notes:
+            self.notes.append(note)
+            LOG.info("%s", note, extra={"shot": self.shot})
 
     def to_dict(self) -> dict[str, Any]:
         """The report as plain values, every frame and every garment in it with the same names."""
@@ -169,9 +182,9 @@ class RefineReport:
 
 
 def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
-    """Warnings without those that are there twice, and one for all that tell the same of many prims, in order.
+    """Warnings without those that are there twice, and one for all that tell the same of several prims, in order.
 
-    Warnings are of a kind where only their prims and figures differ.
+    Warnings are of a kind where they say so, or where only their prims and figures differ.
 
     Args:
         warnings: What is to be told; those of prims begin with the prim's path in angle brackets.
@@ -181,20 +194,21 @@ def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
     """
     kinds: dict[str, list[str]] = {}
     for warning in dict.fromkeys(warnings):
-        about = _OF_PRIM.match(warning)
-        kinds.setdefault(_DIFFERS.sub("#", _ALSO.sub("", warning)) if about else warning, []).append(warning)
+        kind = getattr(warning, "kind", "") or _DIFFERS.sub("#", _ALSO.sub("", warning))
+        kinds.setdefault(kind if _OF_PRIM.match(warning) else warning, []).append(warning)
     found: dict[str, list[str]] = {}
     for alike in kinds.values():
         paths = list(dict.fromkeys(match[1] for match in map(_OF_PRIM.match, alike) if match))
-        found |= {warning: [] for warning in alike} if len(paths) <= MOST_ALONE else {_for_all(alike, paths): paths}
+        found |= {str(warning): [] for warning in alike} if len(paths) <= 1 else {_for_all(alike, paths): paths}
     return found
 
 
 def _for_all(alike: Sequence[str], paths: Sequence[str]) -> str:
-    """One warning for many of a kind; its figures are those of the first."""
+    """One warning for several of a kind; its figures are those of the first."""
     texts = [warning.partition(">")[2] for warning in alike]
     figures = "" if len(set(texts)) == 1 else " (the figures are those of the first)"
-    return f"{len(paths):,} prims, e.g. <{paths[0]}>, <{paths[1]}>{texts[0]}{figures}"
+    named, more = ", ".join(f"<{path}>" for path in paths[:MOST_NAMED]), len(paths) - MOST_NAMED
+    return f"{named}{f' and {more:,} more' if more > 0 else ''}{texts[0]}{figures}"
 
 
 def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from .farm import connected
 from .finished import made_from
 from .frames import FrameFolder, Outcome, frames_folder
 from .joined import SafeMover, joined
+from .notes import of_energy, of_folds, of_rest
 from .options import RefineOptions
 from .report import LOG, RefineReport
 from .settled import unsettled_frames
@@ -174,6 +175,8 @@ class Run:
         report.seconds["close"] = clock.perf_counter() - start
         report.seconds["write"] = written
         report.warn(*map(str, writer.notices), *of_frames(report))
+        report.note(*of_folds(report.garments, report.frames), *of_energy(report.garments, report.frames))
+        (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
 
     def _write_frame(self, writer: LayerWriter, outcome: Outcome) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from ..solver.integrate.solve import FAR
@@ -37,6 +37,11 @@ class Unsettled:
             return f"the cage has shrunk to {100.0 * self.size:.2g}% of its rest shape's size"
         why = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
         return f"level {self.level} would still move by {self.remaining_move:.2g} edges ({why})"
+
+
+def in_words(entry: Mapping[str, Any]) -> str:
+    """An entry of `unsettled_frames` in words."""
+    return str(Unsettled(**{each.name: entry[each.name] for each in fields(Unsettled)}))
 
 
 def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:

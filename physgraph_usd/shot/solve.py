@@ -47,6 +47,7 @@ def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
         level=options.level,
         overrides=options.overrides,
         rest_frame=options.rest_frame,
+        gravity=options.gravity,
     )
 
 

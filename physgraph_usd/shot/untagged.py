@@ -15,7 +15,7 @@ import torch
 
 from ..errors import StageError
 from ..solver.colliders.mesh import MeshBody
-from ..solver.colliders.pose import MeshPose
+from ..solver.colliders.pose import MeshPose, Pose
 from ..solver.colliders.sign import signed_distances
 from ..solver.contact.broad_phase import bounds_of, mean_edge
 from ..solver.mesh.threads import start_warp
@@ -45,10 +45,12 @@ class Beside:
         path: The mesh.
         shares: For each garment that touches it, the share of its vertices that is in it or near it, in the first frame
             looked at where any is.
+        pose: Where the mesh is in that frame.
     """
 
     path: str
     shares: Mapping[str, float]
+    pose: Pose
 
     @property
     def garment(self) -> str:
@@ -83,7 +85,7 @@ def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
             }
             touched = {path: share for path, share in shares.items() if share}
             if touched:
-                found.append(Beside(path, touched))
+                found.append(Beside(path, touched, pose))
                 break
     return sorted(found, key=lambda each: -max(each.shares.values()))
 
@@ -103,7 +105,7 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     if AUTO not in colliders:
         return open_shot(shot, colliders=colliders, **options)
     with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **options)) as first:
-        beside = bodies_beside(first, sample_frames(first.scene.times, first.frame))
+        beside = bodies_beside(first, sample_frames(first.every_time, first.frame))
         named = [*first.colliders, *(each.path for each in beside)]
     return open_shot(shot, colliders=named, **options)
 
@@ -121,7 +123,7 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
     """
     try:
         with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
-            sampled = sample_frames(opened.scene.times, opened.frame)
+            sampled = sample_frames(opened.every_time, opened.frame)
             found = bodies_beside(opened, sampled)
             lying = {path for each in found for path in each.shares}
             garments = [garment.path for garment in opened.scene.garments if garment.path in lying]

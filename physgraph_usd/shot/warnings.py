@@ -6,26 +6,31 @@ What a stage holds that is odd or repaired is named by its reader, as `usd.stage
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from itertools import groupby
+from dataclasses import dataclass
 from shlex import join
 from typing import Any
 
 from ..errors import counted
-from ..solver.folds import EDGES_PER_WAVE
-from ..solver.resolution import FEWEST_EDGES, SHARP_FRACTION, LevelChoice, finer
 from ..solver.strain import StrainedPart
 from ..usd.read.rest import FITTED
-from .report import RefineReport
-from .settled import COLLAPSED, LIMITED, UNSOLVED, Unsettled
+from .report import RefineReport, is_first
+from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import AUTO, NEAR, Beside, options_of
 
-ENERGY_ROUNDING = 1e-3
-"""Part of an energy that counts for nothing: sums are in single precision."""
 MOST_NAMED = 3
 """Most prims, parts or time codes that one warning names."""
 Entries = Mapping[float | None, Mapping[str, Any]]
 """A garment's telemetry by time code."""
+
+
+class Warned(str):
+    """The text of a warning of a kind.
+
+    Attributes:
+        kind: Title of its kind.
+    """
+
+    kind = ""
 
 
 @dataclass(frozen=True)
@@ -56,59 +61,36 @@ class Kind:
         place = f"<{path}>" if path else ""
         place += "" if first is None else f" at time code {first:g}"
         parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
-        return (f"{place}: " if place else "") + "; ".join(filter(None, parts))
+        warning = Warned((f"{place}: " if place else "") + "; ".join(filter(None, parts)))
+        warning.kind = self.title
+        return warning
 
 
-_MEND = "cache that frame again, or leave it out with --frames"
-_CROSSED = "`physgraph:contact:layer` orders garments; mend a cage that crosses itself; `--heat-map` shows where"
 WARNINGS = {
     "failed": Kind(
         "no sample is written at time code",
         "that frame failed, the reason follows; mend the input, run again",
         "no sample is written at time code {name}: {error}",
     ),
-    "unsettled": Kind(
-        "the frame did not settle",
-        "`--steps 24`; `--strict` makes it exit code 3",
-        "the frame did not settle: {how}",
-        "more --steps may help",
-    ),
     LIMITED: Kind(
         "the frame reached its limit of time",
-        "it took over 20 times as long as the shot's other frames (and over two minutes and 10 ms a fine vertex), and "
-        "stands where it was stopped: valid, not at rest, and the one result that depends on the machine's speed. Look "
-        "at that frame's cage and bodies; `--frame-limit SECONDS` sets the limit",
+        "it took over 20 times as long as other frames and stands where it was stopped: valid, not at rest, and "
+        "dependent on the machine's speed. Look at its cage and bodies; `--frame-limit SECONDS` sets the limit",
         "the frame was not solved to its end: it reached its limit of time",
         "see --frame-limit",
     ),
-    COLLAPSED: Kind(
-        "the cage has shrunk",
-        "the animation collapses the garment in that frame; it is upsampled there",
-        "{how}; the frame is upsampled, not solved",
-        _MEND,
-    ),
     UNSOLVED: Kind(
         "it follows its cage there, not solved",
-        "the reason stands before it: a body pushes the garment farther than it is large, or it cannot be solved; mend "
-        "the animation there",
+        "the reason stands before it; mend the animation there, or leave the frame out with `--frames`",
         "{how}; it follows its cage there, not solved",
-        _MEND,
+        "cache that frame again, or leave it out with --frames",
     ),
-    "crossings": Kind(
-        "crossings in the cage and refined",
-        _CROSSED,
-        "crossings {where}: {before:,} in the cage, {after:,} refined",
-    ),
-    "inside": Kind(
-        "vertices inside a body",
-        "a wrong side of the body (`physgraph:collider:side`), or cloth that other cloth holds there",
-        "vertices {where}: {before:,} in the cage, {after:,} refined",
-    ),
-    "energy": Kind(
-        "more energy than the upsampled cage",
-        "`--steps 24`, or a lower `physgraph:guide:stiffness`",
-        "its energy is {after:.3g} J, its upsampled cage's {before:.3g} J",
-        "more --steps may help",
+    "contact": Kind(
+        "crossings or vertices inside a body are left",
+        "`--heat-map` writes where: mend the cage there; `physgraph:contact:layer` orders garments, "
+        "`physgraph:collider:side` mends a wrong side. Some frames come out clean alone (`--frames`)",
+        "{left} are left",
+        "--heat-map shows where, to mend the cage there",
     ),
     "passed_through": Kind(
         "the coarse cloth passes right through a body",
@@ -128,20 +110,6 @@ WARNINGS = {
         "the garment or a body jumps from this first frame to the next",
         "if it is broken, leave it out with --frames. Time code {next:g} starts anew",
     ),
-    "coarse": Kind(
-        "folds may be of the mesh's own size",
-        "a finer `--level`, or accept it: the layer is whole",
-        "its fabric can fold in waves of {wave:.1f} mm; level {level} has edges of {edge:.1f} mm, a fifth of a wave is "
-        "{fifth:.1f} mm: folds may be of the mesh's own size{raised}",
-        "{finer}",
-    ),
-    "sharp_folds": Kind(
-        "edges fold by more than 45 degrees",
-        "as above",
-        "{share:.0%} of the edges fold by more than 45 degrees: edges of {edge:.1f} mm, level {level}, are too coarse "
-        "for this fabric and show wrinkles of the mesh's own size",
-        "{finer}",
-    ),
     "strained": Kind(
         "in most frames the cage has not its rest shape's size",
         "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth goes to its rest shape's size",
@@ -153,6 +121,12 @@ WARNINGS = {
         "`--collider auto`, or the command that the warning names",
         "cloth is inside or within {near:.0f} mm of {meshes} that it does not feel, for {why}: {named}",
         "give --collider {auto}, or by name {options}",
+    ),
+    "gravity": Kind(
+        "gravity pulls across it",
+        "set the stage's `upAxis` right, or give `--gravity` the axis; also where a body lies and gravity is right",
+        "it and <{body}> inside it stand along {axis}, but gravity is {pull} by {source}",
+        "give --gravity -{axis}, or mend the stage's upAxis",
     ),
     "solved_anew": Kind(
         "finished frames are solved anew",
@@ -180,44 +154,27 @@ def advice_table() -> str:
     return "\n".join(["| it says | do |", "|---|---|", *rows]) + "\n"
 
 
-def of_levels(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[str]:
-    """A warning for each garment that can fold in waves of which its level carries nothing.
-
-    Args:
-        garments: Their paths.
-        choices: Their levels.
-    """
-    return [
-        WARNINGS["coarse"](
-            path,
-            wave=1e3 * choice.wavelength,
-            level=choice.level,
-            edge=1e3 * choice.edge,
-            fifth=1e3 * choice.wavelength / EDGES_PER_WAVE,
-            raised=f", and bending is raised {choice.raised[-1]:.3g} times" if choice.raised[-1:] > (1.0,) else "",
-            finer=choice.advice,
-        )
-        for path, choice in zip(garments, choices, strict=True)
-        if choice.needed > choice.level and choice.wavelength < FEWEST_EDGES * choice.edge
-    ]
-
-
-def of_strain(path: str, source: str, parts: Sequence[StrainedPart]) -> list[str]:
+def of_strain(found: Mapping[str, Sequence[StrainedPart]], source: str) -> list[str]:
     """A warning where parts are larger than their rest shape in most frames, or far smaller.
 
     Args:
-        path: The garment.
-        source: Where its rest shape is from.
-        parts: Its strained parts, largest first.
+        found: Strained parts of each garment, largest first, by its path.
+        source: Where the first one's rest shape is from.
     """
-    large = [part for part in parts if part.needs_rest]
-    named = [f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}" for part in large]
-    named[MOST_NAMED:] = [counted(len(named) - MOST_NAMED, "smaller part")] if len(named) > MOST_NAMED else []
+    named = []
+    for path, parts in found.items():
+        large = [part for part in parts if part.needs_rest]
+        for part in large[:1]:
+            named.append(f"<{path}> {part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}")
     fitted = "give --rest FRAME of a frame in which they have their size, or author primvars:rest"
-    remedy = (
-        fitted if source.startswith(FITTED) else "give --rest auto, or author primvars:rest in the cloth's own size"
-    )
-    return [WARNINGS["strained"](path, source=source, parts=", ".join(named), remedy=remedy)] if named else []
+    authored = "give --rest auto, or author primvars:rest in the cloth's own size"
+    remedy = fitted if source.startswith(FITTED) else authored
+    return [WARNINGS["strained"](source=source, parts=", ".join(named), remedy=remedy)] if named else []
+
+
+def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) -> str:
+    """A warning of gravity that pulls across a garment and the body inside it, which stand along an axis."""
+    return WARNINGS["gravity"](garment, body=body, axis=axis, pull=pull, source=source)
 
 
 def of_unfelt(found: Sequence[Beside]) -> list[str]:
@@ -239,21 +196,9 @@ def of_frames(report: RefineReport) -> list[str]:
         (garment, {frame["time"]: frame["garments"][index] for frame in report.frames if "garments" in frame})
         for index, garment in enumerate(report.garments)
     ]
-    checks = (of_folds, _of_bodies_that_passed, _of_jumps, of_contact, of_energy)
+    checks = (_of_bodies_that_passed, _of_jumps, of_contact)
     found = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
-    return [*found, *_of_unsettled(report.unsettled)]
-
-
-def of_folds(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning where a garment's mesh was too coarse for its folds, with its worst frame."""
-    shares = {time: entry.get("sharp_folds", 0.0) for time, entry in entries.items()}
-    worst = max(shares, key=lambda time: shares[time], default=None)
-    if not shares or shares[worst] <= SHARP_FRACTION:
-        return
-    path, level, needed, edge = (garment[name] for name in ("path", "level", "level_needed", "fine_edge_mm"))
-    known = needed > level and garment["wavelength_mm"] < FEWEST_EDGES * edge  # "coarse" has said what to do.
-    remedy = "" if known else finer(level, needed, 1e-3 * edge)
-    yield WARNINGS["sharp_folds"](path, [worst], share=shares[worst], edge=edge, level=level, finer=remedy)
+    return [*found, *_of_unsolved(report.unsettled)]
 
 
 def _of_bodies_that_passed(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
@@ -274,60 +219,40 @@ def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
 
 
 def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning for each kind of contact that a garment's result does not keep, with its worst frame."""
-    found: dict[tuple[str, str], dict[float | None, tuple[int, int]]] = {}
-    for time, entry in entries.items():
-        for kind, where, measured, name in _measured(entry.get("contact", {})):
-            before, after = (int(measured.get(side, {}).get(name, 0)) for side in ("before", "after"))
-            if after:
-                found.setdefault((kind, where), {})[time] = before, after
-    for (kind, where), counts in found.items():
-        times = sorted(counts, key=lambda time: -counts[time][1])  # The worst first, then in order.
-        before, after = counts[times[0]]
-        yield WARNINGS[kind](garment["path"], times, where=where, before=before, after=after)
+    """A warning where a garment's result crosses cloth or bodies, or is inside one, with its worst frame."""
+    left = {
+        time: [each for each in _measured(entry.get("contact", {})) if each[1]]
+        for time, entry in entries.items()
+        if is_first(garment["path"], entry)
+    }
+    left = {time: counts for time, counts in left.items() if counts}
+    if left:
+        times = sorted(left, key=lambda time: -sum(after for _, after, _ in left[time]))  # The worst first.
+        named = [f"{what} ({before:,} in the cage)" for what, _, before in left[times[0]]]
+        yield WARNINGS["contact"](garment["path"], times, left=", ".join(named))
 
 
-def of_energy(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning where refined cloth has more energy than its upsampled cage, with the worst frame.
-
-    No descent ends above its start, but warm frames start from the last one's detail, and what is pushed out of bodies
-    or untangled pays for it.
-    """
-    worse: dict[float | None, tuple[float, float]] = {}
-    for time, entry in entries.items():
-        if entry.get("together", [garment["path"]])[0] != garment["path"]:  # Solved together, they have one energy.
-            continue
-        before, after = (sum((entry.get("energy_joules") or {}).get(side, {}).values()) for side in ("input", "output"))
-        if after > (1.0 + ENERGY_ROUNDING) * before:
-            worse[time] = before, after
-    if worse:
-        times = sorted(worse, key=lambda time: worse[time][0] - worse[time][1])
-        before, after = worse[times[0]]
-        yield WARNINGS["energy"](garment["path"], times, before=before, after=after)
-
-
-def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any], str]]:
-    """Measures of contact: the kind of warning, where, the measurements, and the count's name in them."""
-    yield "crossings", "of cloth", contact.get("cloth") or {}, "crossings"
+def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
+    """Measures of contact in words, with the count in the result and in the cage."""
+    measures = [("crossing", "crossings", "of cloth", contact.get("cloth") or {}, "crossings")]
     for body, measured in contact.get("bodies", {}).items():
-        yield "crossings", f"with <{body}>", measured, "crossings"
-        yield "inside", f"inside <{body}>", measured, "inside"
-        yield "inside", f"inside <{body}>, which lies between cloth and where the cage has it", measured, "passing"
+        measures.append(("crossing", "crossings", f"with <{body}>", measured, "crossings"))
+        measures.append(("vertex", "vertices", f"inside <{body}>", measured, "inside"))
+        measures.append(("vertex", "vertices", f"on the far side of <{body}>", measured, "passing"))
+    for noun, plural, where, measured, name in measures:
+        after, before = (int(measured.get(side, {}).get(name, 0)) for side in ("after", "before"))
+        yield f"{counted(after, noun, plural)} {where}", after, before
 
 
-def _of_unsettled(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Warnings of each garment: its frame that is farthest from rest, its first that collapsed, and all other ones."""
-    for path, each in groupby(found, key=lambda entry: str(entry["path"])):
-        entries = list(each)
-        kinds = {kind: [e for e in entries if e["stopped"] == kind] for kind in (LIMITED, COLLAPSED, UNSOLVED)}
-        moving = [entry for entry in entries if entry["stopped"] not in kinds]
-        kinds = {"unsettled": sorted(moving, key=lambda entry: -entry["remaining_move"])} | kinds
-        for kind, alike in kinds.items():
-            times = [entry["time"] for entry in alike]
-            for entry in alike[:1]:
-                how = str(Unsettled(**{each.name: entry[each.name] for each in fields(Unsettled)}))
-                place = f"<{path}> at time code {entry['time']:g}: " if entry["time"] is not None else f"<{path}>: "
-                yield WARNINGS[kind](path, times, how=how.removeprefix(place))
+def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Warnings of each garment's frames that reached their limit of time, and of those that follow their cage."""
+    kinds = {LIMITED: LIMITED, COLLAPSED: UNSOLVED, UNSOLVED: UNSOLVED}
+    known = [(str(entry["path"]), kinds[entry["stopped"]], entry) for entry in found if entry["stopped"] in kinds]
+    for path, kind in dict.fromkeys((path, kind) for path, kind, _ in known):
+        entries = [entry for *of, entry in known if of == [path, kind]]
+        how = in_words(entries[0])
+        place = f"<{path}>" + ("" if entries[0]["time"] is None else f" at time code {entries[0]['time']:g}") + ": "
+        yield WARNINGS[kind](path, [entry["time"] for entry in entries], how=how.removeprefix(place))
 
 
 def _also(times: Sequence[float | None]) -> str:

@@ -64,3 +64,15 @@ PRESETS: dict[str, Fabric] = {
     "soft-jersey": Fabric(30.0, 3.6e-6, 0.187, weft_ease=0.03),
 }
 """Fabrics by name. Those whose shear stiffness lies within a fifth of an isotropic sheet's are edge springs."""
+
+NAMED: dict[str, str] = {
+    **dict.fromkeys(("leather", "belt", "suede"), "leather"),
+    **dict.fromkeys(("denim", "jeans"), "denim"),
+    **dict.fromkeys(("wool", "coat", "overcoat", "tweed"), "wool"),
+    **dict.fromkeys(("silk", "satin", "chiffon"), "silk"),
+    **dict.fromkeys(("cotton", "linen"), "cotton"),
+    **dict.fromkeys(("polyester", "nylon"), "polyester"),
+    **dict.fromkeys(("rib", "sweater", "pullover"), "rib"),
+    "paper": "paper",
+}
+"""Preset that a word in the name of a prim, material or subset stands for."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -31,8 +31,6 @@ SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
 LIMIT = 5
 """The most that the schema allows."""
-FEWEST_EDGES = 2.0
-"""No mesh carries a wave of fewer edges: what would fold so folds at the mesh's own size."""
 SHARP_FOLD = math.radians(45.0)
 SHARP_FRACTION = 0.01
 """Fraction of sharp folds from which the mesh shows: 0.1% on the T-shirt at level 3, 1.1% at level 2, where it does."""
@@ -55,6 +53,8 @@ class LevelChoice:
         vertices: Number of vertices at the chosen level, and at the one needed.
         raised: For the cage and each level up to the chosen one, how many times its own the bending stiffness is on
             the mean edge.
+        compression: Compression of the cage's edges, 90th percentile over the frames, at least `LEAST_STRAIN`; 0
+            without edges or frames.
     """
 
     level: int
@@ -64,32 +64,12 @@ class LevelChoice:
     needed: int
     vertices: tuple[int, int]
     raised: tuple[float, ...] = ()
+    compression: float = 0.0
 
     @property
-    def advice(self) -> str:
-        """The remedy, in words."""
-        return finer(self.level, self.needed, self.edge)
-
-
-def finer(level: int, needed: int, edge: float) -> str:
-    """The remedy for a mesh that is too coarse, in words.
-
-    Args:
-        level: The garment's number of subdivisions.
-        needed: The least level that resolves its shortest waves; at most ``level`` where folds alone show it.
-        edge: Mean rest edge at its level [m].
-
-    Returns:
-        The level and what it costs, where there is one; time grows at most as vertices do (`benchmarks.levels`).
-    """
-    target = min(max(needed, level + 1), LIMIT)
-    if target <= level:
-        return f"raise bendStiffness: level {LIMIT} is the finest"
-    step = target - level
-    text = f"use --level {target}, with edges of {1e3 * edge / 2**step:.1f} mm, for up to {4**step} times the time"
-    return (
-        text + (" (the finest, and not all of what is needed)" if needed > LIMIT else "") + ", or raise bendStiffness"
-    )
+    def is_tight(self) -> bool:
+        """Whether the cage has no slack: its edges are so little shorter than at rest that nothing of it folds."""
+        return 0.0 < self.compression <= LEAST_STRAIN
 
 
 def sample_frames(times: Sequence[float], frame_at: Callable[[float | None], Frame]) -> list[Frame]:
@@ -149,11 +129,9 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
     fine = edge / 2**level
     counts = fine_count(garment.mesh, level), fine_count(garment.mesh, needed)
     raised = tuple(raised_by(fabric, edge / 2**each) if garment.raises_bending else 1.0 for each in range(level + 1))
-    choice = LevelChoice(level, reason, wave, fine, needed, counts, raised)
-    reached = f"; edges of {1e3 * fine:.1f} mm resolve wrinkles of {1e3 * EDGES_PER_WAVE * fine:.1f} mm and more"
-    stiffer = f"; bending is raised {' '.join(f'{each:.3g}' for each in raised)} times, level by level"
-    reached += stiffer if max(raised) > 1.0 else ""
-    return replace(choice, reason=reason + reached + (f"; {choice.advice}" if needed > level else ""))
+    reason += f"; edges of {1e3 * fine:.1f} mm resolve wrinkles of {1e3 * EDGES_PER_WAVE * fine:.1f} mm and more"
+    reason += f"; bending is raised {raised[-1]:.3g} times" if raised[-1] > 1.0 else ""
+    return LevelChoice(level, reason, wave, fine, needed, counts, raised, strain)
 
 
 def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame]) -> float:

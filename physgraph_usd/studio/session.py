@@ -103,7 +103,7 @@ class TuneSession:
         self.garments = tuple(garment.path for garment in scene.garments)
         self.times: tuple[float | None, ...] = scene.times or (None,)
         self.time, self.contact = self.times[0], True
-        frames = sample_frames(self.shot.times_to_sample, self.shot.frame)
+        frames = sample_frames(self.shot.every_time, self.shot.frame)
         self.warning = "".join(of_unfelt(bodies_beside(self.shot, frames)))
         self.levels = [choice.level for choice in choose_levels(scene, frames)]
         # A level that is chosen from the fabric would be chosen anew from what is tried.

@@ -70,6 +70,9 @@ def _percent(value: float | None) -> float | None:
 TUNABLES: dict[str, Tunable] = {
     each.name: each
     for each in (
+        Tunable("rest:weftEase", "%", 1.0, lambda f: _percent(f.fabric.weft_ease), decades=False),
+        Tunable("rest:warpEase", "%", 1.0, lambda f: _percent(f.fabric.warp_ease), decades=False),
+        Tunable("rest:creaseTime", "s", 1.0, lambda f: f.fabric.crease_time, decades=False),
         Tunable("stretchStiffness", "N/m", 1.0, lambda f: f.fabric.stretch),
         Tunable("weftStretchStiffness", "N/m", 1.0, lambda f: f.fabric.weft_stretch),
         Tunable("shearStiffness", "N/m", 1.0, lambda f: f.fabric.shear),
@@ -78,9 +81,6 @@ TUNABLES: dict[str, Tunable] = {
         Tunable("density", "g/m²", 1e3, lambda f: f.fabric.density),
         Tunable("thickness", "mm", 1e3, lambda f: f.fabric.thickness),
         Tunable("stretchLimit", "%", 1.0, lambda f: _percent(f.fabric.stretch_limit), decades=False),
-        Tunable("rest:warpEase", "%", 1.0, lambda f: _percent(f.fabric.warp_ease), decades=False),
-        Tunable("rest:weftEase", "%", 1.0, lambda f: _percent(f.fabric.weft_ease), decades=False),
-        Tunable("rest:creaseTime", "s", 1.0, lambda f: f.fabric.crease_time, decades=False),
         Tunable("guide:stiffness", "N/m³", 1.0, lambda f: f.guide),
         Tunable("refine:detail", "", 1.0, lambda f: f.detail, decades=False),
         Tunable("contact:offset", "mm", 1e3, lambda f: f.offset),

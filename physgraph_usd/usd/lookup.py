@@ -85,7 +85,7 @@ def _parse_override(text: str) -> Override:
     if match is None:
         raise UsageError(f"cannot read {text!r}; write </prim>.attribute=value or attribute=value")
     row, word = find_property(match["name"]), match["value"].strip().lower()
-    if row.type == "rel" or row.interpolation:
+    if row.type in ("rel", "token") or row.interpolation:
         raise UsageError(f"{row.name} is not a single number; author it on the prim")
     try:
         words = _WORDS | ({"auto": AUTO_LEVEL} if row is GARMENT["refine:level"] else {})
@@ -164,15 +164,19 @@ def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
     return Found(row, "fallback", None, None if row.fallback is None else float(row.fallback))
 
 
-def find_token(prim: Usd.Prim, row: Property) -> str:
-    """Token of the prim, its nearest ancestor, or the fallback; SchemaError when it is none of the row's tokens."""
+def find_token(prim: Usd.Prim, row: Property) -> tuple[str, str]:
+    """Token of the prim, its nearest ancestor, or the fallback, and its source in words.
+
+    Raises:
+        SchemaError: The value is none of the row's tokens.
+    """
     attribute = nearest(prim, row.name)
     if attribute is None:
-        return str(row.fallback)
+        return str(row.fallback or ""), "fallback"
     value = attribute.Get()
     if value not in row.tokens:
         raise SchemaError(f"{source_name(attribute)} is {value!r}; it must be one of {', '.join(row.tokens)}")
-    return str(value)
+    return str(value), source_name(attribute)
 
 
 def source_name(attribute: Usd.Attribute) -> str:

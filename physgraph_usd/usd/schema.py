@@ -36,6 +36,8 @@ SIDES = ("auto", "winding", "start", "front", "back")
 "start": the side on which the coarse cloth is, of every piece, closed or not.
 "front", "back": that side of the authored faces of open pieces; outside of closed ones.
 """
+AXES = ("X", "Y", "Z", "-X", "-Y", "-Z")
+"""Directions along the stage's axes."""
 _JERSEY = PRESETS["jersey"]
 
 
@@ -177,6 +179,11 @@ PROPERTIES: tuple[Property, ...] = (
         GARMENT_API, "physgraph:refine:raiseBending", "bool", True, "", None, None,
         "Whether bending is raised on a level whose edges are too long for the fabric's folds.",
         "Raise Bending", REFINEMENT, uniform=True,
+    ),
+    Property(
+        GARMENT_API, "physgraph:gravity", "token", None, "", None, None,
+        "Axis of the stage along which gravity pulls, one for all garments.",
+        "Gravity", REFINEMENT, uniform=True, tokens=AXES,
     ),
     *_material(GARMENT_API, fallbacks=True),
     Property(

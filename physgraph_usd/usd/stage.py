@@ -6,7 +6,7 @@ import contextlib
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ USD_ERRORS: tuple[type[Exception], ...] = (Tf.ErrorException, *filter(None, [get
 """Exceptions of pxr; it has the second, for files that end too early, since 24.11."""
 MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
+UP_AXIS = "upAxis of the stage"
+"""Source of gravity's direction where nothing else gives one."""
 STANDARD_GRAVITY = 9.81
 """Magnitude of gravity when no physics scene gives one [m/s^2]."""
 MOST_GRAVITY = 1e5
@@ -96,6 +98,7 @@ class GarmentSource:
         left_out: Its own authored times outside the range, where the layer holds it still.
         velocities: Whether the shot has velocities for it.
         subsets: Faces of the cage in each GeomSubset, by its name.
+        words: Words in the names of the prim, the prim above it, its materials, and subsets that cover most of it.
     """
 
     path: Sdf.Path
@@ -109,6 +112,7 @@ class GarmentSource:
     left_out: tuple[float, ...] = ()
     velocities: bool = False
     subsets: dict[str, np.ndarray] = field(default_factory=dict)
+    words: tuple[str, ...] = ()
 
     @property
     def left_out_words(self) -> str:
@@ -195,14 +199,22 @@ class Units:
     Attributes:
         metres: Length of one stage unit [m].
         kilograms: Mass of one stage unit [kg].
-        up: Unit vector that points up, shape (3,).
+        up: Unit vector that points up, against gravity where there is any, shape (3,).
         gravity: Gravity [m/s^2], shape (3,).
+        gravity_source: Source of its direction, in words.
     """
 
     metres: float
     kilograms: float
     up: np.ndarray
     gravity: np.ndarray
+    gravity_source: str = UP_AXIS
+
+    def pulled(self, axis: str, source: str) -> Units:
+        """The units with gravity as strong as here along an axis, one of `AXES`, that a source gives."""
+        down = (-1.0 if axis.startswith("-") else 1.0) * np.eye(3)["XYZ".index(axis[-1])]
+        strength = float(np.linalg.norm(self.gravity))
+        return replace(self, up=-down, gravity=strength * down, gravity_source=source)
 
 
 def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
@@ -211,8 +223,9 @@ def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
     mass = root_metadata(stage, "kilogramsPerUnit")
     kilograms = float(mass) if isinstance(mass, int | float) and math.isfinite(mass) and mass > 0 else 1.0
     up, odd = up_vector(stage)
-    pull, odd_pull = gravity(stage, up, metres)
-    return Units(metres, kilograms, up, pull), notices + odd + odd_pull
+    pull, source, odd_pull = gravity(stage, up, metres)
+    strength = float(np.linalg.norm(pull))
+    return Units(metres, kilograms, -pull / strength if strength else up, pull, source), notices + odd + odd_pull
 
 
 def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
@@ -223,19 +236,23 @@ def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
     return np.array([0.0, 1.0, 0.0]), [Notice("", None, f"upAxis is {authored!r}; USD knows Y and Z; Y assumed")]
 
 
-def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray, list[Notice]]:
-    """Gravity of the first physics scene, or 9.81 m/s^2 against the up axis [m/s^2], shape (3,), and what is odd.
+def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray, str, list[Notice]]:
+    """Gravity of the first physics scene, or 9.81 m/s^2 against the up axis.
 
     UsdPhysics: a zero direction means down, a negative infinite magnitude means earth's; units are stage lengths.
+
+    Returns:
+        Gravity [m/s^2], shape (3,), the source of its direction in words, and what is odd about it.
     """
-    direction, magnitude, notices = -up, STANDARD_GRAVITY, []
+    direction, magnitude, source, notices = -up, STANDARD_GRAVITY, UP_AXIS, []
     scenes = (UsdPhysics.Scene(prim) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL))
     physics = next((scene for scene in scenes if scene), None)
     if physics is not None:
         towards, strength = physics.GetGravityDirectionAttr().Get(), physics.GetGravityMagnitudeAttr().Get()
         length = float(np.linalg.norm(np.array(towards, float))) if isinstance(towards, Gf.Vec3f) else math.nan
         number = strength if isinstance(strength, int | float) else math.nan
-        direction = np.array(towards, dtype=np.float64) / length if 0 < length < math.inf else direction
+        if 0 < length < math.inf:
+            direction, source = np.array(towards, dtype=np.float64) / length, f"<{physics.GetPath()}>"
         magnitude = number * metres if 0 <= number * metres <= MOST_GRAVITY else magnitude
         odd = {"Direction": (towards, length < math.inf), "Magnitude": (strength, number * metres <= MOST_GRAVITY)}
         notices = [
@@ -243,7 +260,7 @@ def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray
             for name, (value, usable) in odd.items()
             if not usable and value is not None
         ]
-    return direction * magnitude, notices
+    return direction * magnitude, source, notices
 
 
 def list_meshes(stage: Usd.Stage) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from test_forces_folds import TRIANGLES, hinge
 from test_guard import PROPOSALS, descent, problem
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.shot.warnings import of_folds
+from physgraph_usd.shot.notes import of_folds
 from physgraph_usd.solver.fabric import Fabric
 
 
@@ -114,16 +114,16 @@ def s38_analytic() -> Result:
 
 
 def s39_locking() -> Result:
-    """Cloth that buckles in waves of half an edge to eight edges: which of them are warned of."""
+    """Cloth that buckles in waves of half an edge to eight edges: which of them are noted."""
     warned = []
     for edges in (0.5, 1.0, 2.0, 3.0, 8.0):
         mesh, rest = sheet(8, 6, EDGE)
         bend = 300.0 * 0.2 * (edges * 0.5 * EDGE / (2.0 * np.pi)) ** 2
         fabric = Fabric(300.0, bend, 0.187)
         state = solved(mesh, rest, wave(rest, squeeze=0.2), fabric=fabric, level=1, steps=40)
-        sizes = {"level": 1, "level_needed": 2, "fine_edge_mm": 500.0 * EDGE, "wavelength_mm": 500.0 * EDGE * edges}
-        warned += [edges] * len(list(of_folds({"path": "/World/Sheet"} | sizes, {None: state.telemetry[0]})))
-    return Result(warned == [0.5, 1.0, 2.0, 3.0], f"warned at {', '.join(f'{each:g}' for each in warned)} edges a wave")
+        sheets = [{"path": "/World/Sheet", "level": 1, "fine_edge_mm": 500.0 * EDGE}]
+        warned += [edges] * len(of_folds(sheets, [{"time": None, "garments": [state.telemetry[0]]}]))
+    return Result(warned == [0.5, 1.0, 2.0, 3.0], f"noted at {', '.join(f'{each:g}' for each in warned)} edges a wave")
 
 
 def s40_gradients() -> Result:

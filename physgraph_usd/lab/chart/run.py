@@ -102,7 +102,7 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
     levels = tuple(
-        choice.level for choice in choose_levels(opened.scene, sample_frames(opened.times_to_sample, opened.frame))
+        choice.level for choice in choose_levels(opened.scene, sample_frames(opened.every_time, opened.frame))
     )
 
     def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:

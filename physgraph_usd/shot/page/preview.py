@@ -115,7 +115,8 @@ class Pictures:
         Raises:
             StageError: A stage cannot be opened.
         """
-        self._stages = [DrawnStage(layer)] if shot is None else [DrawnStage(shot), DrawnStage(shot, layer)]
+        shown = DrawnStage(layer) if shot is None else DrawnStage(shot, layer)
+        self._stages = [shown] if shot is None else [DrawnStage(shot, turn=shown.turn), shown]
         self._refined = () if shot is None else refined_in(layer)
         named = set(self._refined) & set(self._stages[0].paths())
         self._garments = tuple(sorted(named)) or self._stages[0].garments()

@@ -87,11 +87,16 @@ def _head(report: RefineReport) -> str:
 
 
 def _warnings(report: RefineReport) -> str:
-    """Warnings, each with its prim and time code, and frames that failed."""
-    if not report.warnings:
-        return "<h2>Warnings</h2><p id='warnings'>None.</p>"
-    lines = "".join(f"<li>{html.escape(warning)}</li>" for warning in report.warnings)
-    return f"<h2>Warnings</h2><ul class='warnings' id='warnings'>{lines}</ul>"
+    """Warnings, each with its prim and time code, and notes."""
+    return "".join(
+        f"<h2>{name.title()}</h2>"
+        + (
+            f"<ul class='warnings' id='{name}'>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>"
+            if lines
+            else f"<p id='{name}'>None.</p>"
+        )
+        for name, lines in (("warnings", report.warnings), ("notes", report.notes))
+    )
 
 
 def _pictures(report: RefineReport, shot: Shot) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,13 @@ def defects(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[Defect]
     sound = PolygonMesh(mesh.counts[valid], mesh.indices[corners], mesh.vertex_count) if len(bad_faces) else mesh
     found += _face_defects(sound, points, valid)
     return found + _edge_defects(sound) + _vertex_defects(sound)
+
+
+def in_brief(found: Sequence[Defect]) -> list[str]:
+    """A line for each kind of defects: the first in words, and how many more there are."""
+    kinds = Counter(defect.kind for defect in found)
+    first = {defect.kind: defect.message for defect in reversed(found)}
+    return [first[kind] + (f", and {count - 1:,} more" if count > 1 else "") for kind, count in kinds.items()]
 
 
 def _named(kind: str, indices: Iterable[int], message: str) -> list[Defect]:

@@ -151,7 +151,7 @@ def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None,
         return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
     kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
     offset = find_value(prim, COLLIDER["collider:offset"]).at(None) or 0.0
-    side = find_token(prim, COLLIDER["collider:side"])
+    side, _ = find_token(prim, COLLIDER["collider:side"])
     odd = (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
     return ColliderReader(prim, Collider(path, kind, offset, side), metres), odd
 

@@ -7,11 +7,13 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-from ...errors import AbsentError, GarmentError, StageError
-from ..lookup import is_on, with_ancestors
-from ..schema import COLLIDER, COLLIDER_API, GARMENT_API
-from ..stage import TRAVERSAL, Notice, list_meshes
+from ...errors import AbsentError, GarmentError, SchemaError, StageError
+from ..lookup import find_token, is_on, with_ancestors
+from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API
+from ..stage import TRAVERSAL, Notice, Units, list_meshes
 
+GRAVITY_OPTION = "--gravity"
+"""Source of gravity that was asked for."""
 _COLLECTION = ".collection:"
 _COLLIDERS_RELATIONSHIP = "physgraph:colliders"
 _SHOWN = 20
@@ -114,6 +116,26 @@ def targets_of(prim: Usd.Prim, name: str) -> list[Sdf.Path]:
     """Targets of a relationship; collections are named by their property paths."""
     relationship = prim.GetRelationship(name)
     return relationship.GetForwardedTargets() if relationship else []
+
+
+def with_gravity(units: Units, garments: Sequence[Usd.Prim], asked: str | None) -> Units:
+    """Units with gravity along the axis that was asked for, or that garments author; as they are without either.
+
+    Args:
+        units: The stage's units.
+        garments: Mesh prims of the garments.
+        asked: One of `AXES`, or None.
+
+    Raises:
+        SchemaError: An attribute is no axis, or two garments have different ones.
+    """
+    if asked is not None:
+        return units.pulled(asked, GRAVITY_OPTION)
+    found = [(axis, source) for axis, source in (find_token(prim, GARMENT["gravity"]) for prim in garments) if axis]
+    if len({axis for axis, _ in found}) > 1:
+        listed = ", ".join(f"{source} is {axis}" for axis, source in dict.fromkeys(found))
+        raise SchemaError(f"{listed}: a shot has one gravity")
+    return units.pulled(*found[0]) if found else units
 
 
 def _collides(prim: Usd.Prim) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -13,7 +14,7 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import SchemaError
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import Garment, GarmentFrame
-from ..lookup import Found, Override, check_limits, find_value
+from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
 from ..times import garment_times, merge, transform_times, within
@@ -25,6 +26,8 @@ from .rest import Animation, Rest, read_rest, rests_bent
 from .skinning import Bake
 
 _SMALL, _LARGE = 0.01, 100.0
+_WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
+"""A word of a name such as "LeatherBelt_geo1"."""
 _THICK = 10.0
 """Fraction (one over it) of its size beyond which cloth keeps no distance: where all of it is near all of it, there are
 V^2 pairs, and cloth that is pushed out by more than it measures has no shape of the shot."""
@@ -116,11 +119,10 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     self_contact, layer, raises, level = _constants(prim, request)
     painted, cut = _painted(prim, points.count, notices, values=values)
     grain, lies = read_grain(prim, cage.mesh, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
-    order, subdivisions = layer.at(None), round(level.at(None) or 0.0)
     garment = Garment(
-        *(str(prim.GetPath()), cage.mesh, rest.points, subdivisions, is_flipped(prim, matrix), bent),
+        *(str(prim.GetPath()), cage.mesh, rest.points, round(level.at(None) or 0.0), is_flipped(prim, matrix), bent),
         self_contact=bool(self_contact.at(None)),
-        layer=None if order is None else round(order),
+        layer=None if (order := layer.at(None)) is None else round(order),
         grain=grain,
         raises_bending=bool(raises.at(None)),
         **painted,
@@ -135,7 +137,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
-        subsets=_subsets(prim, cage.kept_faces),
+        subsets=(subsets := _subsets(prim, cage.kept_faces)),
+        words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(cage.kept_faces)]),
     )
     return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices])
 
@@ -176,6 +179,14 @@ def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
         members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
         subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
     return subsets
+
+
+def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:
+    """Words, in lower case, in the names of a mesh, the prim above it, their materials, and subsets of the mesh."""
+    prims = [prim, prim.GetParent(), *bound_materials(prim)]
+    for subset in (prim.GetChild(name) for name in subsets):
+        prims += [subset, *bound_materials(subset)]
+    return tuple(word.lower() for each in prims for word in _WORD.findall(each.GetName()))
 
 
 def _rest(prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray) -> Rest:

@@ -13,17 +13,16 @@ from ...errors import LayerError, StageError
 from ...solver.mesh.subdivide import smooth, subdivide
 from ...solver.mesh.topology import PolygonMesh, TriangleSplit
 from ..provenance import read_record, recorded_shot
-from ..stage import bad_rate, list_meshes, metres_per_unit, open_layer, paths_in, pxr_errors, quiet, timecode, up_vector
+from ..schema import AXES
+from ..stage import bad_rate, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
 from ..times import garment_times, merge
 from ..view import root_over
-from .find import has_schema, traverse
+from .find import has_schema, traverse, with_gravity
 from .placement import place
 from .reader import Shot
 
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh without one."""
-Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Turns Z up into Y up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +73,14 @@ class DrawnStage:
     Args:
         shot: The shot's file, which gives units, axis and rates.
         over: A layer put over the shot, or None.
+        turn: Rotation of the world in which it is drawn, shape (3, 3); None turns what gravity of the shot, or of the
+            layer, pulls down.
 
     Raises:
         StageError: When a file cannot be opened, or its rate is none.
     """
 
-    def __init__(self, shot: Path, over: Path | None = None) -> None:
+    def __init__(self, shot: Path, over: Path | None = None, *, turn: np.ndarray | None = None) -> None:
         """Compose and open."""
         base = open_layer(shot, StageError)
         layers = [open_layer(path, StageError) for path in (over, shot) if path is not None]
@@ -91,8 +92,10 @@ class DrawnStage:
         if message := bad_rate(self.stage):
             raise StageError(f"cannot draw {shot}: {message}")
         self.rate = float(self.stage.GetTimeCodesPerSecond())
-        self._scale = metres_per_unit(self.stage)[0]
-        self._turn = Z_UP if up_vector(self.stage)[0][2] == 1.0 else np.eye(3)
+        with pxr_errors(f"cannot open {shot}"), quiet():
+            meshes = [prim for prim in traverse(self.stage) if UsdGeom.Mesh(prim)]
+            units = with_gravity(read_units(self.stage)[0], meshes, _gravity_of(layers[0]))
+        self._scale, self.turn = units.metres, upright(units.up) if turn is None else turn
 
     def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
         """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons.
@@ -141,9 +144,25 @@ class DrawnStage:
             matrix = np.array(transforms.GetLocalToWorldTransform(prim))
             read = _read(mesh, code, matrix)
             if read is not None:
-                points = self._scale * (read.points @ matrix[:3, :3] + matrix[3, :3]) @ self._turn.T
+                points = self._scale * (read.points @ matrix[:3, :3] + matrix[3, :3]) @ self.turn.T
                 drawn.append(replace(read, points=points))
         return drawn
+
+
+def upright(up: np.ndarray) -> np.ndarray:
+    """Smallest rotation that turns a unit vector, shape (3,), into Y, shape (3, 3)."""
+    x, y, z = up
+    if y <= -1.0 + 1e-9:  # Many turn it over; this one goes about Z.
+        return np.diag([-1.0, -1.0, 1.0])
+    cross = np.array([[0.0, x, 0.0], [-x, 0.0, -z], [0.0, z, 0.0]])
+    return np.eye(3) - cross + cross @ cross / (1.0 + y)
+
+
+def _gravity_of(layer: Sdf.Layer) -> str | None:
+    """The axis that a refined layer was asked to take for gravity's; None where there is none."""
+    options = (read_record(layer) or {}).get("options")
+    asked = options.get("gravity") if isinstance(options, dict) else None
+    return asked if asked in AXES else None
 
 
 def shot_of(layer: Path) -> Path | None:

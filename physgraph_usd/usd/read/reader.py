@@ -21,9 +21,9 @@ from pxr import Sdf, Usd
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
-from ..lookup import check_limits, check_overrides, find_value, is_on, parse_overrides
+from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
-from ..schema import AUTO_LEVEL, GARMENT
+from ..schema import GARMENT
 from ..stage import (
     GarmentSource,
     Notice,
@@ -41,11 +41,11 @@ from ..times import merge, snap, within
 from ..view import StageView
 from .authored import authored_faults
 from .bodies import ColliderReader, read_collider
-from .find import felt_by, find_colliders, find_garments, instance_roots, read_apart
+from .find import felt_by, find_colliders, find_garments, instance_roots, read_apart, with_gravity
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .materials import find_values
 from .placement import to_metres
-from .rest import AUTO, has_rest
+from .rest import AUTO
 from .skinning import Bake
 
 
@@ -63,6 +63,7 @@ class Shot:
         selections: Variant selections in force on what the garments depend on, as paths `/World/coat{fit=loose}`.
         warnings: Warnings for the user; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
+        gravity_source: Source of gravity's direction, in words.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class Shot:
         self.selections: tuple[str, ...] = ()
         self.unsaved: tuple[str, ...] = ()
         self.warnings: list[Notice] = []
-        self.metres_per_unit = request.units.metres
+        self.metres_per_unit, self.gravity_source = request.units.metres, request.units.gravity_source
         times = merge(time for reader in readers for time in reader.source.times)
         self.sources: tuple[GarmentSource, ...] = tuple(
             replace(reader.source, times=snap(reader.source.times, times)) for reader in readers
@@ -105,18 +106,10 @@ class Shot:
 
     def times_until(self, last: float) -> list[float]:
         """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
-        return [time for time in self._every_time() if time < last] + [last]
+        return [time for time in self.every_time if time < last] + [last]
 
     @property
-    def times_to_sample(self) -> tuple[float, ...]:
-        """Time codes of which a few are looked at before a run: its own, or all where a level is chosen by the folds.
-
-        A shot has one level, whatever part of it is refined.
-        """
-        is_auto = any(garment.level == AUTO_LEVEL for garment in self.scene.garments)
-        return self._every_time() if is_auto else self.scene.times
-
-    def _every_time(self) -> tuple[float, ...]:
+    def every_time(self) -> tuple[float, ...]:
         """Time codes at which any garment has a sample, outside the range of frames too."""
         return merge(time for source in self.sources for time in (*source.times, *source.left_out))
 
@@ -182,6 +175,7 @@ def open_shot(
     level: int | None = None,
     overrides: Sequence[str] = (),
     rest_frame: float | str | None = None,
+    gravity: str | None = None,
     skip_invisible: bool = False,
 ) -> Shot:
     """Open a shot for refining.
@@ -197,6 +191,7 @@ def open_shot(
         overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
         rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to all of
             the shot; both go before authored rest shapes. Without one a shape is fitted where none is authored.
+        gravity: Axis of the stage along which gravity pulls, one of `AXES`; None: as the stage says.
         skip_invisible: Leave out garments that are invisible at all their time codes.
 
     Returns:
@@ -227,6 +222,7 @@ def open_shot(
             refuse_missing_arcs(prim, notices)
         notices += authored_faults(prims, found)
         units, odd = read_units(stage)
+        units = with_gravity(units, prims, gravity)
         assumed = root_metadata(stage, "metersPerUnit") is None
         bake = Bake(stage)
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
@@ -313,12 +309,8 @@ def _read(
     on = [prim for prim in prims if is_on(prim, GARMENT["enabled"], request.overrides)]
     notices += [_left_out(prim, "is disabled") for prim in prims if prim not in on]
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in on}
-    # A run that begins in the middle may walk there from any frame before, and bodies are split by their first points.
-    whole = request.rest_frame is not None or any(
-        _is_auto(prim, request) or not has_rest(prim, request.bake.layer) for prim in on
-    )
-    frames = None if request.frames is None or whole else (-math.inf, request.frames[1])
-    notices += request.bake.add([*roots], frames, bodies=bodies)
+    # A level, and what is known of a shot beforehand, are the same whatever part of it is refined.
+    notices += request.bake.add([*roots], None, bodies=bodies)
     readers, every = [], []
     for path, instances in roots.items():
         prim = stage.GetPrimAtPath(path)
@@ -338,12 +330,6 @@ def _read(
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")
     return readers
-
-
-def _is_auto(prim: Usd.Prim, request: Request) -> bool:
-    """Whether a garment's level is chosen by its folds."""
-    asked, row = request.level, GARMENT["refine:level"]
-    return (find_value(prim, row, request.overrides).at(None) if asked is None else asked) == AUTO_LEVEL
 
 
 def _left_out(prim: Usd.Prim, why: str) -> Notice:

@@ -1,0 +1,123 @@
+"""Lines for the report and `inspect` that are no warnings: nothing is wrong, but cloth could look otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from shlex import join
+from typing import Any
+
+from ..errors import counted
+from ..solver.fabric import NAMED
+from ..solver.resolution import SHARP_FRACTION, LevelChoice
+from ..usd.read.reader import Shot
+from ..usd.schema import GARMENT
+from .report import is_first
+from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
+from .untagged import options_of
+
+EASE = 4
+"""Percent of weft ease that the note on slack proposes: of those in docs/fabrics.md, the one that folds every cage."""
+ENERGY_ROUNDING = 1e-3
+"""Part of an energy that counts for nothing: sums are in single precision."""
+MATERIALS = "stretchStiffness", "bendStiffness", "density"
+"""Values of a fabric that every preset has."""
+
+
+def of_slack(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[str]:
+    """A note of the garments whose cages have no slack.
+
+    Args:
+        garments: Their paths.
+        choices: Their levels.
+    """
+    tight = [f"<{path}>" for path, choice in zip(garments, choices, strict=True) if choice.is_tight]
+    if not tight:
+        return []
+    cages = "this cage has" if len(tight) == 1 else "these cages have"
+    words = f"{cages} no slack: expect what subdivision gives; for folds give --set weftEase={EASE}"
+    return [f"{', '.join(tight)}: {words}"]
+
+
+def of_fabrics(shot: Shot) -> list[str]:
+    """A note for each preset that garments without a fabric of their own are named after.
+
+    Args:
+        shot: An open shot.
+    """
+    named: dict[str, dict[str, str]] = {}
+    for source in shot.sources:
+        word = next((word for word in source.words if word in NAMED), None)
+        if word and all(source.sources[name] == "fallback" for name in MATERIALS):
+            named.setdefault(NAMED[word], {})[str(source.path)] = word
+    notes = []
+    for preset, words in named.items():
+        listed = ", ".join(f"<{path}> ({word})" for path, word in words.items())
+        out = str(Path(shot.path).with_suffix(f".{preset}.usda"))
+        tag = ["physgraph-usd", "tag", shot.path, "-o", out, "--preset", preset, *options_of("--garment", words)]
+        notes.append(f"named like {preset}: {listed}; to refine it so: {join(tag)}")
+    return notes
+
+
+def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:
+    """A note of the frames that ended before they were at rest, with the one farthest from it.
+
+    Args:
+        unsettled: A report's frames that did not settle.
+        frames: Number of frames.
+    """
+    moving = [entry for entry in unsettled if entry["stopped"] not in (LIMITED, COLLAPSED, UNSOLVED)]
+    if not moving:
+        return []
+    worst = max(moving, key=lambda entry: entry["remaining_move"])
+    at = "" if worst["time"] is None else f" at time code {worst['time']:g}"
+    count = len({entry["time"] for entry in moving})
+    return [f"{count} of {counted(frames, 'frame')} did not settle, <{worst['path']}>{at} the least: {in_words(worst)}"]
+
+
+def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note of the frames that ended with more energy than their upsampled cage has, with the one that has most more.
+
+    No descent ends above its start, but frames start from the last one's detail, and what is pushed out of bodies or
+    untangled pays for it.
+
+    Args:
+        garments: A report's garments.
+        frames: A report's frames.
+    """
+    above = []
+    for frame in frames:
+        for garment, entry in zip(garments, frame.get("garments", ()), strict=False):
+            sides = (entry.get("energy_joules") or {}) if is_first(garment["path"], entry) else {}
+            before, after = (sum(sides.get(side, {}).values()) for side in ("input", "output"))
+            if after > (1.0 + ENERGY_ROUNDING) * before:
+                above.append((after - before, garment["path"], frame["time"], before, after))
+    if not above:
+        return []
+    _, path, time, before, after = max(above, key=lambda each: each[0])
+    count, at = len({each[2] for each in above}), "" if time is None else f" at time code {time:g}"
+    energies = f"{after:.3g} J, the cage's {before:.3g} J"
+    return [f"{counted(count, 'frame')} ended with more energy than the upsampled cage, <{path}>{at}: {energies}"]
+
+
+def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note where cloth folds as sharply as only a mesh too coarse for its fabric does, of the garment that does most.
+
+    Args:
+        garments: A report's garments.
+        frames: A report's frames.
+    """
+    found = [
+        (entry.get("sharp_folds", 0.0), frame["time"], garment)
+        for frame in frames
+        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
+    ]
+    share, time, worst = max(found, key=lambda each: each[0], default=(0.0, None, {}))
+    if share <= SHARP_FRACTION:
+        return []
+    others = len({id(garment) for each, _, garment in found if each > SHARP_FRACTION}) - 1
+    level, at = worst["level"], "" if time is None else f" at time code {time:g}"
+    text = f"level: {share:.0%} of the edges of <{worst['path']}>{at} fold by more than 45 degrees, so the mesh shows"
+    text += f", and in {counted(others, 'other garment')}" if others else ""
+    finer = f"--level {level + 1} halves the edges of {worst['fine_edge_mm']:.1f} mm, for up to 4 times the time"
+    return [text + (f"; {finer}" if level < (GARMENT["refine:level"].maximum or 0) else "")]

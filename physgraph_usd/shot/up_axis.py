@@ -1,0 +1,64 @@
+"""Whether gravity pulls across the bodies that wear the garments, as on a stage whose upAxis is wrong.
+
+USD has two up axes, Y and Z, and a stage may name the wrong one. Neither a body nor a garment shows that alone: a table
+is wide and low, a sleeve runs along an arm. A garment that goes round a body, and a body that stands along the same
+axis, do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..solver.colliders.pose import Pose
+from ..solver.scene import Frame, Garment, Scene
+from .untagged import Beside
+
+TWICE = 2.0
+"""Ratio from which a body stands and a garment goes round. Points of people who stand, walk or dance spread 2.4 to 8
+times as far upwards as forwards; a four-legged animal is at most half as long again as it is high."""
+
+
+def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Beside]) -> tuple[str, str, str] | None:
+    """A garment, a body inside it, and the axis, "Y" or "Z", along which both stand, where gravity pulls across.
+
+    A garment goes round an axis if `TWICE` as much of it faces both ways along gravity as both ways along the axis, in
+    the frames and in the rest shape: the rest shape of a person who lies stands.
+
+    Args:
+        scene: The scene.
+        frames: A few of its frames.
+        beside: Bodies that garments touch and do not feel.
+    """
+    down = int(np.abs(scene.gravity).argmax())
+    for index, garment in enumerate(scene.garments):
+        cages = [frame.garments[index].points for frame in frames]
+        rest, moving = _faces(garment, garment.rest), sum((_faces(garment, points) for points in cages), np.zeros(3))
+        bodies = [(each.path, [each.pose]) for each in beside if garment.path in each.shares]
+        bodies += [(collider.path, _around(frames, index, number)) for number, collider in enumerate(scene.colliders)]
+        for axis in {1, 2} - {down}:
+            if all(TWICE * faced[axis] < faced[down] for faced in (rest, moving)):
+                for path, poses in bodies:
+                    spread = sum((pose.corners().std(axis=0) for pose in poses), np.zeros(3))
+                    if spread[axis] > TWICE * spread[down]:
+                        return garment.path, path, "XYZ"[axis]
+    return None
+
+
+def _faces(garment: Garment, points: np.ndarray) -> np.ndarray:
+    """Area of a cage that faces along each axis, of the side from which less of it does [m^2], shape (3,)."""
+    a, b, c = (points[corner] for corner in garment.mesh.triangulate(garment.rest).triangles.T)
+    area = 0.5 * np.cross(b - a, c - a)
+    return np.minimum(np.maximum(area, 0.0).sum(axis=0), np.maximum(-area, 0.0).sum(axis=0))
+
+
+def _around(frames: Sequence[Frame], garment: int, collider: int) -> list[Pose]:
+    """A collider's poses in the frames in which its bounds hold the middle of a garment."""
+    found = []
+    for frame in frames:
+        pose, middle = frame.colliders[collider], frame.garments[garment].points.mean(axis=0)
+        corners = np.zeros((0, 3)) if pose is None else pose.corners()
+        if pose and len(corners) and (corners.min(axis=0) < middle).all() and (middle < corners.max(axis=0)).all():
+            found.append(pose)
+    return found

@@ -1,0 +1,108 @@
+"""Which way is down: as the stage says, as it was asked for, or as garments author it; and a stage that is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bodies import Soup, box, tube
+from pxr import Sdf, UsdGeom
+from shots import refine
+from stages import COLLIDER_API, GARMENT_API, author, new_stage, save, vec3
+
+from physgraph_usd.errors import SchemaError
+from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.usd.read.meshes import DrawnStage, upright
+from physgraph_usd.usd.read.reader import open_shot
+
+PERSON = (0.4, 0.25, 1.7)
+"""Sizes of a standing body whose height comes last [m]."""
+SKIRT = tube(0.25, 0.6, around=12, rows=4)
+BLANKET = SKIRT[0], SKIRT[1][SKIRT[0][SKIRT[1], 1].mean(axis=1) > 0.0]
+
+
+def along(axis: str, points: np.ndarray) -> np.ndarray:
+    """Points that stand along z, turned to stand along an axis."""
+    return points if axis == "Z" else points @ upright(np.array([0.0, 0.0, 1.0])).T
+
+
+def worn(path: Path, *, up: str, axis: str, cloth: Soup = SKIRT, body: tuple[float, float, float] = PERSON) -> str:
+    """A stage of an up axis, with cloth round a body that stand along another, or the same."""
+    stage = new_stage(path, up=up)
+    for name, (points, faces), api in (("cloth", cloth, GARMENT_API), ("body", box(body), COLLIDER_API)):
+        mesh = UsdGeom.Mesh.Define(stage, f"/World/{name}")
+        mesh.CreatePointsAttr(vec3(along(axis, points)))
+        mesh.CreateFaceVertexCountsAttr(np.full(len(faces), 3).tolist())
+        mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
+        mesh.GetPrim().AddAppliedSchema(api)
+    return save(stage)
+
+
+def warned(shot: str, **options: Any) -> list[str]:
+    return [each for each in inspect_shot(shot, level=0, **options)["warnings"] if "stand along" in each]
+
+
+@pytest.mark.parametrize("axis", ["Y", "Z"])
+@pytest.mark.parametrize("up", ["Y", "Z"])
+def test_a_stage_across_its_bodies_is_told_with_an_option_that_mends_it(tmp_path: Path, up: str, axis: str):
+    shot = worn(tmp_path / "s.usda", up=up, axis=axis)
+    said = warned(shot)
+    assert len(said) == (up != axis)
+    for each in said:
+        assert f"</World/body> inside it stand along {axis}, but gravity is 9.81 m/s^2 towards -{up}" in each
+        assert f"give --gravity -{axis}" in each
+    assert warned(shot, gravity=f"-{axis}") == warned(shot, gravity=f"-{up}") == []
+
+
+@pytest.mark.parametrize(
+    ("cloth", "body"),
+    [
+        (SKIRT, (0.4, 0.8, 1.2)),  # a dog's coat
+        (BLANKET, PERSON),  # on one who lies
+        (tube(0.25, 0.05, around=12, rows=2), (2.0, 0.1, 0.1)),  # a ring on a rod
+    ],
+)
+def test_what_lies_is_not_told(tmp_path: Path, cloth: Soup, body: tuple[float, float, float]):
+    assert warned(worn(tmp_path / "s.usda", up="Y", axis="Z", cloth=cloth, body=body)) == []
+
+
+def test_garments_author_one_gravity_and_options_go_before(tmp_path: Path):
+    shot = worn(tmp_path / "s.usda", up="Z", axis="Y")
+    root = Sdf.Layer.FindOrOpen(shot)
+    Sdf.AttributeSpec(root.GetPrimAtPath("/World"), "physgraph:gravity", Sdf.ValueTypeNames.Token).default = "-Y"
+    root.Save()
+    opened = open_shot(shot)
+    np.testing.assert_allclose(opened.scene.gravity, [0.0, -9.81, 0.0])
+    assert opened.gravity_source == "</World>.physgraph:gravity"
+    assert warned(shot) == []
+    np.testing.assert_allclose(open_shot(shot, gravity="X").scene.gravity, [9.81, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("values", "message"), [(("down",), "must be one of X, Y"), (("-Y", "-Z"), "has one gravity")])
+def test_gravity_that_is_none_or_two_is_refused(tmp_path: Path, values: tuple[str, ...], message: str):
+    stage = new_stage(tmp_path / "s.usda")
+    for index, value in enumerate(values):
+        mesh = UsdGeom.Mesh.Define(stage, f"/World/cloth{index}")
+        mesh.CreatePointsAttr(vec3(np.eye(3)))
+        mesh.CreateFaceVertexCountsAttr([3])
+        mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+        mesh.GetPrim().AddAppliedSchema(GARMENT_API)
+        author(mesh.GetPrim(), "physgraph:gravity", value, kind="token")
+    with pytest.raises(SchemaError, match=message):
+        open_shot(save(stage))
+
+
+def test_pictures_stand_as_gravity_pulls(tmp_path: Path):
+    shot, layer = worn(tmp_path / "s.usda", up="Z", axis="Y"), tmp_path / "fine.usdc"
+    refine(Path(shot), layer, level=0, gravity="-Y")
+    sizes = [
+        np.ptp(stage.meshes(None)[0].points, axis=0)
+        for stage in (DrawnStage(Path(shot), layer), DrawnStage(Path(shot)))
+    ]
+    assert sizes[0][1] == pytest.approx(0.6, abs=0.05)  # the skirt's length
+    assert sizes[1][2] == pytest.approx(0.6, abs=0.05)
+    for up in (*np.eye(3), *-np.eye(3), np.array([0.48, -0.6, 0.64])):
+        np.testing.assert_allclose(upright(up) @ up, [0.0, 1.0, 0.0], atol=1e-12)
+        assert np.linalg.det(upright(up)) == pytest.approx(1.0)
