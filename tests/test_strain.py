@@ -95,7 +95,7 @@ def test_cloth_in_its_own_size_is_not_warned_of(tmp_path: Path, default: bool, a
 
 def test_a_fitted_shape_that_is_not_the_clothes_is_not_to_be_fitted_again():
     part = StrainedPart("all over it", 9, 1.5, 1.0)
-    (said,) = of_strain(SLEEVE, f"{FITTED}: something", [part])
+    (said,) = of_strain({SLEEVE: [part]}, f"{FITTED}: something")
     assert "--rest auto" not in said
     assert "--rest FRAME" in said
     assert not rest_options([(f"{FITTED}: something", [part])])
