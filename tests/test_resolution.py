@@ -18,7 +18,7 @@ from physgraph_usd.shot.warnings import of_folds, of_levels
 from physgraph_usd.solver import resolution
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.folds import EDGES_PER_WAVE
-from physgraph_usd.solver.level import build_levels, hinge_geometry
+from physgraph_usd.solver.level import build_levels
 from physgraph_usd.solver.mesh.subdivide import fine_count, subdivide_times
 from physgraph_usd.solver.resolution import (
     AUTO,
@@ -135,11 +135,7 @@ def test_sharp_folds_are_counted():
 
 
 def test_what_cuda_measures_is_what_the_host_does():
-    rng = np.random.default_rng(2)
-    x, values = rng.normal(size=(60, 3)), rng.uniform(size=201).astype(np.float32)
-    hinges = np.array([rng.permutation(60)[:4] for _ in range(300)])
-    found = resolution._angles(torch.as_tensor(x), torch.as_tensor(hinges)).numpy()
-    assert np.abs(found - hinge_geometry(x, hinges)[0]).max() < 1e-12
+    values = np.random.default_rng(2).uniform(size=201).astype(np.float32)
     wanted = dict(zip(("p50", "p99", "max"), np.percentile(values, [50, 99, 100]), strict=True))
     assert resolution._spread(torch.as_tensor(values)) == pytest.approx(wanted, rel=1e-6)
 
