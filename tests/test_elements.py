@@ -9,6 +9,7 @@ from energies import apart, difference_force, evaluate
 from meshes import cube, grid, mesh_of
 from probes import cylinder_rigidity
 from sheets import garment_of
+from test_force_hessians import dense, matrix_of
 from test_forces import INTERNAL, crumple, force_of
 
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
@@ -51,6 +52,16 @@ def test_forces_of_triangles_beside_quads_are_minus_the_gradient(name: str):
     level = levels_of(mesh, flat + np.random.default_rng(0).normal(scale=0.05, size=flat.shape))[0]
     force, x = force_of(name, level), crumple(flat, 0.1, 2)
     assert apart(evaluate(force, x)[1], difference_force(force, x, 1e-3)) < 1e-6
+
+
+@pytest.mark.parametrize("name", INTERNAL)
+def test_the_rest_matrix_of_triangles_beside_quads_is_the_trace_of_the_hessian(name: str):
+    mesh, flat = grid(4, 2, "mixed")
+    level = levels_of(mesh, flat + np.random.default_rng(0).uniform(-0.1, 0.1, flat.shape) * [1.0, 1.0, 0.0])[0]
+    force = force_of(name, level)
+    trace = np.einsum("vawa->vw", dense(force, level.rest))
+    assert np.allclose(matrix_of(force), trace, atol=1e-6 * np.abs(trace).max())
+    assert np.allclose(force.diagonal(level.rest).numpy(), np.diag(trace) / 3.0, atol=1e-6 * np.abs(trace).max())
 
 
 def test_a_grid_of_rectangles_bends_alike_in_every_direction():

@@ -99,7 +99,7 @@ def test_springs_of_quads_stand_for_the_mean_of_both_splits():
     level = build_levels([garment_of(mesh, points)], [()], dtype=torch.float64)[0]
     areas = dict(zip(map(tuple, level.springs.tolist()), level.spring_area.tolist(), strict=True))
     side, diagonal = QUAD_SPRING
-    assert len(areas) == 9
+    assert len(areas) == 10
     assert areas[0, 4] == pytest.approx(1.0 / 3.0)
     assert areas[1, 4] == pytest.approx((0.5 + 0.5 * side) / 3.0)
     assert areas[1, 2] == pytest.approx(0.5 * side / 3.0)
