@@ -171,8 +171,8 @@ cylinder of ten edges' radius with every vertex held on it; in both the energy i
 rim. Then a strip is clamped at one end and hangs under its own
 weight: two bending lengths (D / density g)^(1/3) long, 24 edges, a third as wide, hinges at the clamp twice as stiff,
 for it leaves one of their two faces to bend. Its chord's angle is compared with the heavy elastica of stiffness
-D (1 - nu^2), for the sides are free: {narrow:.1f} degrees for nu = 1/3 or -1/3, and {wide:.1f} degrees for nu = 0. The last
-column is the D with which the elastica would hang at the angle found.
+D (1 - nu^2), for the sides are free: {narrow:.1f} degrees for nu = 1/3 or -1/3, and {wide:.1f} degrees for nu = 0.
+The last column is the D with which the elastica would hang at the angle found.
 
 {bend}
 

@@ -153,12 +153,14 @@ def test_garments_side_by_side_are_what_they_are_alone():
         ("spring", ("springs", "spring_area", "spring_length", "spring_scale")),
         ("membrane", ("membrane", "membrane_area", "membrane_inverse", "membrane_scale")),
         ("hinge", ("hinges", "hinge_shape", "hinge_area", "rest_angle", "bend_scale")),
-        ("vertex", ("rest", "vertex_area", "spacing", "pin")),
+        ("vertex", ("rest", "vertex_area", "pin")),
     ):
         mine = getattr(level, f"{owner}_garment") == 1
         for name in names:
             values, expected = getattr(level, name)[mine], getattr(alone, name)
             assert torch.allclose(values if values.is_floating_point() else values - start, expected), name
+    used = alone.vertex_area > 0
+    assert torch.allclose(level.spacing[start:][used], alone.spacing[used])
 
 
 def test_paint_is_the_mean_of_the_vertices():
@@ -194,8 +196,8 @@ def test_maps_between_levels_compose(depths: tuple[int, int]):
 
 @pytest.mark.parametrize("name", ["stretch", "membrane"])
 def test_uniform_strain_costs_the_same_at_every_level(name: str):
-    """A stiffness means the same at every level."""
-    mesh, points = grid(3, 2, "triangles")
+    """A stiffness means the same at every level; of triangles smooth subdivision rounds the corners off."""
+    mesh, points = grid(3, 2)
     garment = garment_of(mesh, points)
     strain = torch.tensor([[1.1, 0.05, 0.0], [0.0, 0.95, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     energies = []

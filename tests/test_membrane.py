@@ -106,7 +106,8 @@ def test_springs_of_quads_stand_for_the_mean_of_both_splits():
     assert areas[1, 5] == areas[2, 4] == pytest.approx(0.5 * diagonal / 3.0)
     assert float(level.spring_area.sum()) == pytest.approx(2.0)
     assert float(level.membrane_area.sum()) == pytest.approx(2.0)
-    assert len(level.triangles) == 4 and len(level.membrane) == 6
+    assert len(level.triangles) == 4
+    assert len(level.membrane) == 6
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
