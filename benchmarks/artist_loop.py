@@ -61,8 +61,8 @@ def wavelength(level: Level, field: np.ndarray) -> float:
 
     Springs of weight 2 a_e / l^2 are the Laplacian of an equilateral mesh.
     """
-    ends, length = level.edges.numpy(), level.rest_length.double().numpy()
-    weight = 2.0 * level.edge_area.double().numpy() / length**2
+    ends, length = level.springs.numpy(), level.spring_length.double().numpy()
+    weight = 2.0 * level.spring_area.double().numpy() / length**2
     rise = field[ends[:, 1]] - field[ends[:, 0]]
     pull = np.zeros_like(field)
     np.add.at(pull, ends[:, 0], weight[:, None] * rise)

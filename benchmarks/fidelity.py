@@ -48,6 +48,7 @@ from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
+from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Grain, Scene
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -233,7 +234,7 @@ class Judge:
 
     def curvature(self, x: np.ndarray) -> float:
         """Total absolute mean curvature [m]: half the sum of the hinges' angles times their lengths."""
-        angle, _, _, length = hinge_geometry(x, self.level.hinges.numpy())
+        angle, _, _, length = hinge_geometry(x, hinges_of(self.level.triangles.numpy()))
         return float(0.5 * (np.abs(angle) * length).sum())
 
     def amplitudes(self, x: np.ndarray) -> np.ndarray:
@@ -245,7 +246,7 @@ class Judge:
 
     def folds(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Density of folds [1/m] and the angle [rad] of the direction in which they bend, at each vertex."""
-        hinges = self.level.hinges.numpy()
+        hinges = hinges_of(self.level.triangles.numpy())
         angle, _, _, length = hinge_geometry(x, hinges)
         along = self.flat[hinges[:, 1]] - self.flat[hinges[:, 0]]
         sound = np.linalg.norm(along, axis=1) < 2.0 * np.median(np.linalg.norm(along, axis=1))  # Not across the seam.

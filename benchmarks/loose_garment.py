@@ -99,8 +99,8 @@ def vertex_area(level: Level) -> np.ndarray:
 
 def laplacian(level: Level) -> sp.csr_matrix:
     """The matrix of springs 2 a_e / l^2: the Laplacian of an equilateral mesh, times the areas."""
-    ends, length = level.edges.cpu().numpy(), level.rest_length.double().cpu().numpy()
-    weight = 2.0 * level.edge_area.double().cpu().numpy() / length**2
+    ends, length = level.springs.cpu().numpy(), level.spring_length.double().cpu().numpy()
+    weight = 2.0 * level.spring_area.double().cpu().numpy() / length**2
     i, j = ends.T
     count = level.vertex_count
     off = sp.coo_matrix(

@@ -130,11 +130,12 @@ def evaluation_table(group: Group, frame) -> None:
 def autograd_evaluation(level: Level, x: torch.Tensor) -> torch.Tensor:
     """Stretch and bending of jersey in plain torch, their force by reverse mode."""
     x = x.detach().requires_grad_()
-    ends, hinge = level.edges.long(), level.hinges.long()
+    ends, hinge = level.springs.long(), level.hinges.long()
     length = (x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1)
-    stiffness = 90.0 * level.edge_area / level.rest_length**2
-    stretch = 0.5 * (stiffness * (length - level.rest_length) ** 2).sum()
-    i, j, k, ell = (x[hinge[:, corner]] for corner in range(4))
+    stiffness = 90.0 * level.spring_area / level.spring_length**2
+    stretch = 0.5 * (stiffness * (length - level.spring_length) ** 2).sum()
+    i, j = (x[hinge[:, corner]] for corner in (0, 1))
+    k, ell = (x[hinge[:, corners]].mean(dim=1) for corners in ([2, 3], [4, 5]))
     n1, n2 = torch.linalg.cross(j - i, k - i), torch.linalg.cross(ell - i, j - i)
     sine = (torch.linalg.cross(n1, n2) * (j - i)).sum(dim=1) / (j - i).norm(dim=1)
     angle = torch.atan2(sine, (n1 * n2).sum(dim=1))

@@ -28,6 +28,7 @@ from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level, hinge_geometry
+from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
@@ -84,7 +85,7 @@ def dressed(frame: Frame, fabric: Fabric) -> Frame:
 
 def curvature(level: Level, x: np.ndarray) -> float:
     """Total absolute mean curvature [m]."""
-    angle, _, _, length = hinge_geometry(x, level.hinges.numpy())
+    angle, _, _, length = hinge_geometry(x, hinges_of(level.triangles.numpy()))
     return float(0.5 * (np.abs(angle) * length).sum())
 
 

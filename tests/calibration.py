@@ -38,6 +38,8 @@ SHEAR = {"springs": None, "membrane, G = 0.375 Y": 0.375 * YOUNGS, "membrane, G 
 CHAIN = Fabric(2000.0, 1e-9, 0.2)
 CHAIN_LENGTH, CHAIN_SPAN = 0.3, 0.24
 BENDING_LENGTH = (RIGIDITY / (DENSITY * 9.81)) ** (1 / 3)
+BENT = {"equilateral": -1 / 3, "irregular": -1 / 3, "quads": 0.0}
+"""Poisson's ratio of bending by the kind of mesh."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +142,8 @@ What a sheet of cloth shows to an experiment, over what was asked for, on four k
 `python tests/calibration.py docs/notes/calibration.md`; `tests/stability/test_forces_analytic.py` holds the figures in
 bounds.
 
-The meshes: equilateral triangles; Delaunay triangles of a jittered lattice (quality over 0.4); squares as our
-subdivision leaves them, whose diagonals alternate; squares that were triangulated before they came to us, all diagonals
-one way.
+The meshes: equilateral triangles; Delaunay triangles of a jittered lattice (quality over 0.4); squares that
+came to us as quads; squares that were triangulated before they came to us, all diagonals one way.
 
 ## In the plane
 
@@ -153,9 +154,9 @@ columns are a strip pulled along x with its long sides free.
 
 {plane}
 
-- **Springs** are exact on equilateral triangles and on the squares of our subdivision; the latter because springs along
-  sides and diagonals of quads carry the factors 0.75 and 1.5 (`level.QUAD_SPRING`). Without them Y would run from 0.75
-  to 1.20, nu from 0.20 to 0.50 and G from 0.25 to 0.50.
+- **Springs** are exact on equilateral triangles and on quads that are squares. A quad has springs along its sides and
+  both diagonals, of the factors 0.75 and 1.5 (`elements.QUAD_SPRING`). Without these Y would run from 0.75 to 1.20, nu
+  from 0.20 to 0.50 and G from 0.25 to 0.50.
 - On irregular triangles springs are a little soft: the mesh relaxes into its irregularities.
 - **One-way diagonals** cannot be isotropic with three directions of springs: Y is a third along the diagonal's normal.
   Author the quads as quads, or a shear stiffness.
@@ -166,22 +167,22 @@ columns are a strip pulled along x with its long sides free.
 ## Bending
 
 The rim takes a uniform curvature, the inside relaxes; D in units of the D asked for. Then the sheet is rolled onto a
-cylinder of ten edges' radius with every vertex held on it. Then a strip is clamped at one end and hangs under its own
+cylinder of ten edges' radius with every vertex held on it; in both the energy is weighed by a bump that vanishes at the
+rim. Then a strip is clamped at one end and hangs under its own
 weight: two bending lengths (D / density g)^(1/3) long, 24 edges, a third as wide, hinges at the clamp twice as stiff,
-for it leaves one of their triangles to bend. Its chord's angle is compared
-with the heavy elastica, {narrow:.1f} degrees for a strip with free sides whose stiffness is D (1 - nu^2) with nu = 1/3,
-and {wide:.1f} degrees for D. The last column is
-the D with which the elastica would hang at the angle found.
+for it leaves one of their two faces to bend. Its chord's angle is compared with the heavy elastica of stiffness
+D (1 - nu^2), for the sides are free: {narrow:.1f} degrees for nu = 1/3 or -1/3, and {wide:.1f} degrees for nu = 0.
+The last column is the D with which the elastica would hang at the angle found.
 
 {bend}
 
 - Hinges on equilateral triangles have D in every direction, and a Poisson's ratio of bending of -1/3, not +1/3: a sheet
   bent one way bends the same way across, where paper bends back (Seung and Nelson 1988). For cylindrical folds it plays
   no part. A narrow strip with free sides is softer than D by 1 - nu^2 = 0.89 for either sign, which is what the
-  strip test of a fabric laboratory sees as well: to reproduce a measured strip, ask for 1.12 times its D. (Peirce's own
-  formula gives 6% more than the elastica at 41.5 degrees.)
-- The squares of our subdivision carry the factors 1.28 and 0.64 (`level.QUAD_HINGE`). Without them D would run from
-  0.86 to 1.36 with direction, and the strip would hang at 48.0 degrees.
+  strip test of a fabric laboratory sees as well: to reproduce a measured strip on triangles, ask for 1.12 times its D.
+  (Peirce's own formula gives 6% more than the elastica at 41.5 degrees.)
+- Quads have D in every direction, and a Poisson's ratio of bending of 0: hinges at their sides measure the curvature
+  along both sides, and hinges round both diagonals of each quad the twist. A strip hangs as a beam of stiffness D.
 - One-way diagonals are three times too stiff about one diagonal and a quarter too soft about the other.
 
 ## Hanging

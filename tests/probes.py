@@ -116,14 +116,19 @@ def plane_stiffness(level: Level, forces: Sequence[Force]) -> np.ndarray:
 
 
 def bending_stiffness(level: Level, rigidity: float) -> np.ndarray:
-    """Bending stiffness [N m], shape (3, 3), for curvatures (k11, k22, 2 k12).
-
-    The energy is weighed by a bump that vanishes near the rim.
-    """
+    """Bending stiffness [N m], shape (3, 3), for curvatures (k11, k22, 2 k12), away from the rim."""
     p, edge = level.rest.numpy(), float(level.spacing.mean())
     modes = 0.5 * np.stack([p[:, 0] ** 2, p[:, 1] ** 2, p[:, 0] * p[:, 1]], axis=1)
     bending = Bending(level, torch.tensor([rigidity]))
     u = relaxed(hessian(bending, level.rest, [2]), modes, rim(level, 2.2 * edge))
+    weighed, area = inside(level)
+    stiffness = hessian(Bending(weighed, torch.tensor([rigidity])), level.rest, [2])
+    return u.T @ stiffness @ u / area
+
+
+def inside(level: Level) -> tuple[Level, float]:
+    """The level with its bending weighed by a bump that vanishes near the rim, and the area under the bump [m^2]."""
+    p, edge = level.rest.numpy(), float(level.spacing.mean())
     low, high = p.min(axis=0)[:2] + 2.7 * edge, p.max(axis=0)[:2] - 2.7 * edge
 
     def bump(at: np.ndarray) -> np.ndarray:
@@ -131,8 +136,7 @@ def bending_stiffness(level: Level, rigidity: float) -> np.ndarray:
 
     weight = bump(p[level.hinges.numpy()[:, :2]].mean(axis=1))
     weighed = replace(level, bend_scale=level.bend_scale * torch.as_tensor(weight))
-    stiffness = hessian(Bending(weighed, torch.tensor([rigidity])), level.rest, [2])
-    return u.T @ stiffness @ u / float((level.vertex_area.numpy() * bump(p)).sum())
+    return weighed, float((level.vertex_area.numpy() * bump(p)).sum())
 
 
 def turned(stiffness: np.ndarray, angle: float) -> np.ndarray:
@@ -186,14 +190,15 @@ def tensile_test(level: Level, forces: Sequence[Force]) -> tuple[float, float]:
 
 
 def cylinder_rigidity(level: Level, radius: float, angle: float) -> float:
-    """D over the hinges' D, from the energy of the sheet rolled onto a cylinder, every vertex on it."""
-    bending = Bending(level, torch.ones(1))
+    """D over the hinges' D, from the energy of the sheet rolled onto a cylinder, every vertex on it, inside its rim."""
+    weighed, area = inside(level)
+    bending = Bending(weighed, torch.ones(1))
     p = level.rest.numpy()
     along = p[:, 0] * np.cos(angle) + p[:, 1] * np.sin(angle)
     across = p[:, 1] * np.cos(angle) - p[:, 0] * np.sin(angle)
     rolled = np.stack([radius * np.sin(along / radius), across, radius * np.cos(along / radius)], axis=1)
     energy = float(bending.add_force(torch.as_tensor(rolled), torch.zeros_like(level.rest)))
-    return 2 * energy * radius**2 / float(level.vertex_area.sum())
+    return 2 * energy * radius**2 / area
 
 
 def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int = 400) -> torch.Tensor:

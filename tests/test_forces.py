@@ -207,7 +207,7 @@ def test_gravity_is_the_weight_of_the_sheet():
     rest, triangles = equilateral(0.5, 0.4, 0.1)
     level = level_of(rest, triangles)
     weight = evaluate(force_of("gravity", level), level.rest)[1].sum(dim=0)
-    assert weight.numpy() == pytest.approx(0.2 * float(level.triangle_area.sum()) * DOWN)
+    assert weight.numpy() == pytest.approx(0.2 * float(level.vertex_area.sum()) * DOWN)
 
 
 def test_a_collapsed_edge_pulls_nowhere():

@@ -92,7 +92,7 @@ def test_eased_cloth_is_at_rest_where_it_is_that_much_longer(fabric: Fabric):
 
 def test_cloth_that_is_drawn_in_without_end_keeps_a_quarter_of_its_length():
     level = sheet().eased([Fabric(warp_ease=-1.0, weft_ease=-3.0)])
-    assert level.triangle_inverse.isfinite().all()
+    assert level.membrane_inverse.isfinite().all()
     assert (level.rest_length / sheet().rest_length).numpy() == pytest.approx(0.25)
 
 
@@ -114,7 +114,8 @@ def test_gathers_and_painted_ease_act_where_they_are_painted():
     flat = np.abs(span[:, 1]) < 1e-9
     assert ratio[flat & (middle > 0.11)] == pytest.approx(1.1)
     assert ratio[flat & (middle < 0.05)] == pytest.approx(1.0)
-    assert (ratio[~flat & (middle < 0.05)] > 1.3).all()
+    inside = (middle > 0.03) & (middle < 0.05)  # Smooth subdivision turns edges at the jagged rim.
+    assert (ratio[~flat & inside] > 1.3).all()
 
 
 def garment_with(values: np.ndarray | None, *, name: str = "st", turn: float = 0.0) -> tuple[Grain, str]:

@@ -22,8 +22,8 @@ from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate import method_named
-from physgraph_usd.solver.level import QUAD_HINGE, QUAD_SPRING, Level, build_levels, refine_garments
-from physgraph_usd.solver.mesh.topology import quad_edges
+from physgraph_usd.solver.level import Level, build_levels, refine_garments
+from physgraph_usd.solver.mesh.elements import QUAD_SPRING
 from physgraph_usd.solver.scene import GarmentFrame
 
 SPRINGS, TRIANGLES = Fabric(30.0), Fabric(30.0, shear=7.0)
@@ -93,42 +93,21 @@ def test_painted_scale_multiplies_the_triangles():
     assert energies[1] == pytest.approx(2.5 * energies[0])
 
 
-def test_quads_tell_sides_from_diagonals():
+def test_springs_of_quads_stand_for_the_mean_of_both_splits():
+    """A grid of a square of two triangles, which share the side 1-4 with a square of one quad."""
     mesh, points = grid(2, 1, "mixed")
-    split = mesh.triangulate(points)
     level = build_levels([garment_of(mesh, points)], [()], dtype=torch.float64)[0]
-    edges = level.edges.numpy()
-    from_quad, diagonal = quad_edges(split, mesh.counts, edges)
-    found = {
-        tuple(edge): (share, bool(cross))
-        for edge, share, cross in zip(edges.tolist(), from_quad, diagonal, strict=True)
-    }
-    assert found[0, 4] == (0.0, False)
-    assert found[1, 4] == (0.5, False)
-    assert found[1, 2] == (1.0, False)
-    assert [edge for edge, (_, cross) in found.items() if cross] in ([(1, 5)], [(2, 4)])
-    factors = dict(zip(map(tuple, edges.tolist()), level.edge_factor.tolist(), strict=True))
-    assert factors[0, 4] == 1.0
-    assert factors[1, 4] == pytest.approx((1 + QUAD_SPRING[0]) / 2)
-    assert factors[1, 2] == QUAD_SPRING[0]
-    across = [factors[edge] for edge, (_, cross) in found.items() if cross]
-    assert across == [QUAD_SPRING[1]]
-    hinges = dict(
-        zip((tuple(sorted(h)) for h in level.hinges[:, :2].tolist()), level.hinge_factor.tolist(), strict=True)
-    )
-    assert hinges[0, 4] == 1.0
-    assert hinges[1, 4] == pytest.approx((1 + QUAD_HINGE[0]) / 2)
-    assert QUAD_HINGE[1] in hinges.values()
-
-
-def test_the_paper_potential_has_no_quad_factors():
-    level = pair()
-    for name in ("edge_factor", "hinge_factor"):
-        assert len(getattr(level, name).unique()) > 1
-    springs = in_plane_terms(level, [SPRINGS, SPRINGS], potential="paper")[0]
-    assert isinstance(springs, Stretch)
-    share = springs.stiffness / level.edge_area
-    assert torch.allclose(share, share[:1].expand_as(share))
+    areas = dict(zip(map(tuple, level.springs.tolist()), level.spring_area.tolist(), strict=True))
+    side, diagonal = QUAD_SPRING
+    assert len(areas) == 10
+    assert areas[0, 4] == pytest.approx(1.0 / 3.0)
+    assert areas[1, 4] == pytest.approx((0.5 + 0.5 * side) / 3.0)
+    assert areas[1, 2] == pytest.approx(0.5 * side / 3.0)
+    assert areas[1, 5] == areas[2, 4] == pytest.approx(0.5 * diagonal / 3.0)
+    assert float(level.spring_area.sum()) == pytest.approx(2.0)
+    assert float(level.membrane_area.sum()) == pytest.approx(2.0)
+    assert len(level.triangles) == 4
+    assert len(level.membrane) == 6
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import any_mesh, cube, faces_of, grid, mesh_of, planar_mesh, tetrahedron
 
+from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.mesh.stencil import incidence
 from physgraph_usd.solver.mesh.subdivide import subdivide
-from physgraph_usd.solver.mesh.topology import PolygonMesh, edges_of, find_edges, hinges_of
+from physgraph_usd.solver.mesh.topology import PolygonMesh, edges_of, find_edges
 
 
 def triangle_normals(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -79,17 +80,24 @@ def test_find_edges_inverts_the_list(mesh: PolygonMesh):
 
 
 def test_hinges_of_two_triangles():
-    assert hinges_of(np.array([[0, 1, 2], [1, 0, 3]])).tolist() == [[0, 1, 2, 3]]
-    assert hinges_of(np.array([[1, 2, 0], [3, 1, 0]])).tolist() == [[0, 1, 2, 3]]
-    assert hinges_of(np.array([[0, 1, 2], [0, 1, 3]])).tolist() == [[0, 1, 2, 3]]
-    assert hinges_of(np.array([[2, 1, 0], [0, 1, 3]])).tolist() == [[1, 0, 2, 3]]
+    assert hinges_of(np.array([[0, 1, 2], [1, 0, 3]])).tolist() == [[0, 1, 2, 2, 3, 3]]
+    assert hinges_of(np.array([[1, 2, 0], [3, 1, 0]])).tolist() == [[1, 0, 3, 3, 2, 2]]
+    assert hinges_of(np.array([[0, 1, 2], [0, 1, 3]])).tolist() == [[0, 1, 2, 2, 3, 3]]
+    assert hinges_of(np.array([[2, 1, 0], [0, 1, 3]])).tolist() == [[0, 1, 3, 3, 2, 2]]
+
+
+def test_hinges_of_quads_have_both_opposite_corners():
+    """Of a quad the corner next to the edge's second end comes first, and of two quads that are one none is left."""
+    assert hinges_of(np.array([[1, 0, 4]]), np.array([[0, 1, 2, 3]])).tolist() == [[1, 0, 4, 4, 2, 3]]
+    assert hinges_of(np.empty((0, 3)), np.array([[0, 1, 2, 3], [1, 0, 4, 5]])).tolist() == [[0, 1, 2, 3, 4, 5]]
+    assert len(hinges_of(np.empty((0, 3)), np.array([[0, 1, 2, 3], [3, 2, 1, 0]]))) == 0
 
 
 def test_no_hinge_at_boundaries_fins_and_duplicates():
     assert len(hinges_of(np.array([[0, 1, 2]]))) == 0
     assert len(hinges_of(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))) == 0
     assert len(hinges_of(np.array([[0, 1, 2], [0, 2, 1]]))) == 0
-    assert hinges_of(np.empty((0, 3), np.int32)).shape == (0, 4)
+    assert hinges_of(np.empty((0, 3), np.int32)).shape == (0, 6)
 
 
 @given(st.integers(0, 2**16))
@@ -98,7 +106,7 @@ def test_flat_hinges_are_flat_whatever_the_winding(seed: int):
     triangles = mesh.triangulate().triangles.copy()
     flips = np.random.default_rng(seed).random(len(triangles)) < 0.5
     triangles[flips] = triangles[flips, ::-1]
-    i, j, k, other = (points[column] for column in hinges_of(triangles).T)
+    i, j, k, other = (points[column] for column in hinges_of(triangles).T[[0, 1, 2, 4]])
     one, two = np.cross(j - i, k - i), np.cross(other - i, j - i)
     assert len(i) == np.sum(edges_of(triangles, len(points)).face_count == 2)
     assert np.all(np.einsum("hx,hx->h", one, two) > 0.9)
@@ -108,8 +116,8 @@ def test_a_closed_surface_has_a_hinge_at_each_edge():
     mesh, points = tetrahedron()
     hinges = hinges_of(mesh.triangulate().triangles)
     assert len(hinges) == 6
-    assert sorted(hinges[0].tolist()) == [0, 1, 2, 3]
-    i, j, k, other = (points[column] for column in hinges.T)
+    assert sorted(hinges[0].tolist()) == [0, 1, 2, 2, 3, 3]
+    i, j, k, other = (points[column] for column in hinges.T[[0, 1, 2, 4]])
     one, two = np.cross(j - i, k - i), np.cross(other - i, j - i)
     cosine = np.einsum("hx,hx->h", one, two) / np.linalg.norm(one, axis=1) / np.linalg.norm(two, axis=1)
     np.testing.assert_allclose(cosine, -1 / 3)

@@ -51,8 +51,9 @@ class Finest:
     def __init__(self, problem: Any) -> None:
         """Take it from a problem."""
         self._problem, self._last = problem, int(problem["levels"]) - 1
-        self.base, self.rest, self.edges, self.free = (self.array(name) for name in ("base", "rest", "edges", "free"))
-        self.length = float(np.linalg.norm(self.sides(self.edges), axis=1).mean())
+        self.base, self.rest, self.free = (self.array(name) for name in ("base", "rest", "free"))
+        edges = np.unique(np.sort(self.array("triangles")[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        self.length = float(np.linalg.norm(self.sides(edges), axis=1).mean())
         self.scale = DRAG / (PROXIMITY * float(self.array("diagonal").mean()))
 
     def array(self, name: str) -> np.ndarray:
@@ -107,7 +108,7 @@ def set_up(thing: Any, settings: Any, level: Finest) -> None:
     down, weight = load.sum(axis=0), float(np.linalg.norm(load, axis=1).mean())
     unit = down / max(float(np.linalg.norm(down)), 1e-30)
     bpy.context.scene.gravity = (scale * weight / (THOUSANDTH * mass) * unit).tolist()
-    least, most = paint(thing, "springs", level.edges, level.array("spring") * level.length * scale)
+    least, most = paint(thing, "springs", level.array("springs"), level.array("spring") * level.length * scale)
     settings.tension_stiffness = settings.compression_stiffness = least
     settings.tension_stiffness_max = settings.compression_stiffness_max = most
     settings.vertex_group_structural_stiffness = "springs"

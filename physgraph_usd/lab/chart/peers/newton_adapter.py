@@ -105,7 +105,7 @@ def build(problem: Any, index: int, solver: str, device: str) -> Level:
     points, still = base.tolist(), np.zeros_like(base).tolist()
     # XPBD pushes particles apart that are nearer than their radii, by default a decimetre.
     builder.add_particles(points, still, mass.tolist(), radius=[0.0] * len(base))
-    builder.spring_indices += array("edges").ravel().tolist()
+    builder.spring_indices += array("springs").ravel().tolist()
     builder.spring_rest_length += array("rest_length").tolist()
     builder.spring_stiffness += array("spring").tolist()
     builder.spring_damping += [0.0] * len(array("spring"))

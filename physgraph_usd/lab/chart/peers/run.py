@@ -174,18 +174,32 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
         "triangles": level.triangles,
         "load": load,
         "free": level.free[:, 0],
-        "edges": level.edges,
-        "rest_length": level.rest_length,
+        "springs": level.springs,
+        "rest_length": level.spring_length,
         "spring": springs.stiffness,
-        "hinges": level.hinges,
-        "rest_angle": level.rest_angle,
-        "hinge": hinges.weight,
-    }
+    } | _hinges_of_triangles(level, hinges.weight)
     for name, value in values.items():
         yield f"{name}{index}", value.double().cpu().numpy() if value.is_floating_point() else value.cpu().numpy()
     yield f"bound{index}", guide.rest_matrix().diagonal()
     yield f"diagonal{index}", springs.rest_matrix().diagonal()
     yield from _sparse("", index, guide.hessian())
+
+
+def _hinges_of_triangles(level: Level, weight: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Hinges of four corners: of one at a quad each of the corners opposite to the edge, with its part of the weight.
+
+    For small bends of a planar quad at rest their mean angle is that of the hinge.
+    """
+    hinges = level.hinges.long()
+    pairs = torch.stack([hinges[:, [0, 1, k, other]] for k in (2, 3) for other in (4, 5)], dim=1)
+    owner = torch.arange(len(hinges), device=hinges.device).repeat_interleave(4)
+    rows = torch.cat([owner[:, None], pairs.reshape(-1, 4)], dim=1)
+    corners, count = torch.unique(rows, dim=0, return_counts=True)
+    return {
+        "hinges": corners[:, 1:],
+        "rest_angle": level.rest_angle[corners[:, 0]],
+        "hinge": weight[corners[:, 0]] * count / 4.0,
+    }
 
 
 def _sparse(prefix: str, index: int, matrix: sp.csr_matrix) -> Iterator[tuple[str, Any]]:
