@@ -64,10 +64,10 @@ def _waiting(solved: Solved, failures: int, wait: int) -> Solved:
 
 def _unsound(telemetry: Mapping[str, Any]) -> str:
     """Why a result is unsound; "" where it is not."""
-    if (excess := _excess(telemetry)) > 0.0:
-        return f"it ended with {excess:.3g} J more than its upsampled cage has"
-    crossings = _crossings(telemetry)
-    return f"it kept {crossings:,} crossings" if crossings else ""
+    if crossings := _crossings(telemetry):
+        return f"it kept {crossings:,} crossings"
+    excess = _excess(telemetry)
+    return f"it ended with {excess:.3g} J more than its upsampled cage has" if excess > 0.0 else ""
 
 
 def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
