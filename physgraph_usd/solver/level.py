@@ -273,6 +273,8 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     bilinear, rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
     split = _sound(mesh.triangulate(bilinear if not chain else None), bilinear)
     elements = elastic_elements(mesh, split, bilinear)
+    normal = vertex_normals(rest, elements.membrane)
+    rest = bilinear + ((rest - bilinear) * normal).sum(axis=1, keepdims=True) * normal
     painted = {name: getattr(garment, name) for name in ("stretch_scale", "bend_scale", "pin")}
     if garment.grain is not None:
         painted |= {"ease_scale": garment.grain.ease_scale, "gather": garment.grain.gather}
@@ -308,6 +310,15 @@ def _size(linear: sp.csr_matrix, elements: ElasticElements, bilinear: np.ndarray
     round_cage, smoothed = (linear.T @ vertex_areas(x, elements.membrane, elements.share) for x in (bilinear, rest))
     known = smoothed > 0
     return np.asarray(linear @ np.sqrt(np.where(known, round_cage / np.where(known, smoothed, 1.0), 1.0)))
+
+
+def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit normals by the areas of the triangles at each vertex, shape (V, 3); zero where there are none."""
+    corners = x[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(x)
+    np.add.at(total, triangles, normal[:, None])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def vertex_areas(x: np.ndarray, triangles: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -386,10 +397,10 @@ def _grain(parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray]) -> t
         np.concatenate([part.vertex_values.get(name, np.full(part.vertex_count, none)) for part in parts])
         for name, none in (("ease_scale", 1.0), ("gather", 0.0))
     )
-    along = cosines[find_edges(springs, hinges[:, :2])]
+    along, twists = cosines[find_edges(springs, hinges[:, :2])], np.concatenate([p.elements.twists for p in parts])
     return warp, {
         "spring": cosines,
-        "hinge": along[:, 1] - along[:, 0],  # A hinge bends across its edge.
+        "hinge": np.where(twists, 0.0, along[:, 1] - along[:, 0]),  # A hinge bends across its edge; a twist is both.
         "spring_scale": scale[springs].mean(axis=1),
         "membrane_scale": scale[triangles].mean(axis=1),
         "spring_gather": gather[springs].mean(axis=1),
@@ -436,7 +447,7 @@ def rest_shape(
     The bending energy of a sheet is D/2 (k1^2 + k2^2) by its principal curvatures. A hinge at an edge l between
     triangles of areas A1 and A2 bends across l: D l^2 / (A1 + A2) times half its angle squared. On a grid of rectangles
     these leave out D k12^2, the twist along the sides. Round the diagonal l of a rectangle of area A the angle is
-    k12 l, so each of both diagonals has D A / l^2.
+    k12 l, so that hinge has 2 D A / l^2.
 
     Args:
         rest: Positions [m], shape (V, 3), float64.
@@ -463,7 +474,7 @@ def rest_shape(
     angle, first, second, hinge_length = hinge_geometry(rest, hinges)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = hinge_length**2 / (first + second)
-        hinge_shape = np.where(twists, 1.0 / ratio, np.minimum(ratio, HINGE_SHAPE_LIMIT))
+        hinge_shape = np.where(twists, 2.0 / ratio, np.minimum(ratio, HINGE_SHAPE_LIMIT))
     return {
         "spring_length": np.maximum(length, 1e-9 * fallback),
         "spring_area": spring_area,

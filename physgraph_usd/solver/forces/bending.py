@@ -7,7 +7,7 @@
 |---|---|---|
 | D | ``rigidity`` | bending stiffness [N m] |
 | theta | atan2(n1 x n2 . e, n1 . n2) | signed angle between the triangles' normals [rad] |
-| s_h | ``level.hinge_shape`` | l0^2 / (A1 + A2) at edges, A / l0^2 at both diagonals of a quad (`level.rest_shape`) |
+| s_h | ``level.hinge_shape`` | l0^2 / (A1 + A2) at edges, 2 A / l0^2 at a quad's diagonal (`level.rest_shape`) |
 | | `grain.bending_factor` | where warp and weft differ: D by the direction in which a hinge bends |
 | k_b | 3.46 D | the paper's constant [N m] for the same D on an equilateral lattice (docs/fabrics.md) |
 
@@ -256,6 +256,9 @@ class Bending:
         for each in self._kinds:
             jacobian = hinge_jacobian(x, each.corners)
             value = self.weight[each.which].unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
+            if each.corners.shape[1] == 6:  # A triangle's corner stands twice, with half of its gradient each time.
+                twice = (each.corners[:, 2::2] == each.corners[:, 3::2]).repeat_interleave(2, dim=1)
+                value[:, 2:] *= torch.where(twice, 2.0, 1.0)
             add_at(total, each.corners.long().reshape(-1), value.reshape(-1))
         return total
 
