@@ -117,7 +117,7 @@ class TestTangledStart:
             state = solver.solve(frame_with([small[1] - small[1].mean(axis=0) + middle, upper], time=float(time)))
             starts.append(state.telemetry[1]["start"])
             strains.append(state.telemetry[1]["strain"]["max"])
-        assert starts[1].startswith("cold: cloth is caught")
+        assert starts[1].startswith("cold: started anew")
         assert max(strains) < 0.5
 
     def test_of_a_shot_crosses_less_than_its_input(self, tmp_path: Path):

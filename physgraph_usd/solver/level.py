@@ -50,8 +50,8 @@ class Level:
     Attributes:
         index: 0 is the cage.
         spans: Vertex range of each garment.
-        rest: Rest positions [m], shape (V, 3): the cage's, smoothly subdivided. Lengths and areas of the cloth are
-            those of this surface, scaled to the area that the cage has there.
+        rest: Rest positions [m], shape (V, 3), linear between the cage's. Lengths, areas and angles at rest are of
+            the smoothly subdivided cage, scaled to the area that the cage has there.
         triangles: Corner vertices of the surface that collides; a quad is two, shape (T, 3).
         edges: Their sides, shape (E, 2).
         springs: End vertices of the elastic springs, every edge among them, shape (S, 2).
@@ -243,6 +243,7 @@ class _GarmentLevel:
 
     vertex_count: int
     rest: np.ndarray
+    smooth_rest: np.ndarray
     size: np.ndarray
     triangles: np.ndarray
     edges: np.ndarray
@@ -270,18 +271,20 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         mesh, face = refinement.mesh, face[refinement.parent_face]
     if index > len(chain):
         linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
-    bilinear, rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
-    split = _sound(mesh.triangulate(bilinear if not chain else None), bilinear)
-    elements = elastic_elements(mesh, split, bilinear)
-    normal = vertex_normals(rest, elements.membrane)
-    rest = bilinear + ((rest - bilinear) * normal).sum(axis=1, keepdims=True) * normal
+    rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
+    split = _sound(mesh.triangulate(rest if not chain else None), rest)
+    elements = elastic_elements(mesh, split, rest)
+    # Along normals only: what smoothing moves within the surface would strain a flat cage.
+    normal = vertex_normals(smooth_rest, elements.membrane)
+    smooth_rest = rest + ((smooth_rest - rest) * normal).sum(axis=1, keepdims=True) * normal
     painted = {name: getattr(garment, name) for name in ("stretch_scale", "bend_scale", "pin")}
     if garment.grain is not None:
         painted |= {"ease_scale": garment.grain.ease_scale, "gather": garment.grain.gather}
     return _GarmentLevel(
         vertex_count=mesh.vertex_count,
         rest=rest,
-        size=_size(linear, elements, bilinear, rest),
+        smooth_rest=smooth_rest,
+        size=_size(linear, elements, rest, smooth_rest),
         triangles=split.triangles,
         edges=edges_of(split.triangles, mesh.vertex_count).vertices,
         elements=elements,
@@ -296,7 +299,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     )
 
 
-def _size(linear: sp.csr_matrix, elements: ElasticElements, bilinear: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _size(linear: sp.csr_matrix, elements: ElasticElements, rest: np.ndarray, smooth_rest: np.ndarray) -> np.ndarray:
     """Lengths of the cloth over those of its smooth rest surface, shape (V,).
 
     Smooth subdivision makes a curved cage smaller. Round each cage vertex the cloth has the area of the cage.
@@ -304,10 +307,10 @@ def _size(linear: sp.csr_matrix, elements: ElasticElements, bilinear: np.ndarray
     Args:
         linear: Linear map from the cage, shape (V, C).
         elements: Elastic elements.
-        bilinear: The cage's rest positions on the mesh, linearly [m], shape (V, 3).
-        rest: The same smoothly [m].
+        rest: The cage's rest positions on the mesh, linearly [m], shape (V, 3).
+        smooth_rest: The same smoothly [m].
     """
-    round_cage, smoothed = (linear.T @ vertex_areas(x, elements.membrane, elements.share) for x in (bilinear, rest))
+    round_cage, smoothed = (linear.T @ vertex_areas(x, elements.membrane, elements.share) for x in (rest, smooth_rest))
     known = smoothed > 0
     return np.asarray(linear @ np.sqrt(np.where(known, round_cage / np.where(known, smoothed, 1.0), 1.0)))
 
@@ -413,16 +416,16 @@ def _measured(
 ) -> dict[str, np.ndarray]:
     """Every real-valued field of a level, under its name there."""
     springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
-    rest, size = (np.concatenate([getattr(part, name) for part in parts]) for name in ("rest", "size"))
+    surface, size = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "size"))
     share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))
     bent = np.repeat([part.bent_rest for part in parts], [len(part.elements.hinges) for part in parts])
-    inverse = triangle_inverse(rest, triangles, warp)
+    inverse = triangle_inverse(surface, triangles, warp)
     stretch, bend, pin = (
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
-    shape = rest_shape(rest, springs, triangles, share=share, hinges=hinges, twists=twists, bent=bent, size=size)
+    shape = rest_shape(surface, springs, triangles, share=share, hinges=hinges, twists=twists, bent=bent, size=size)
     return shape | {
-        "rest": rest,
+        "rest": np.concatenate([part.rest for part in parts]),
         "membrane_inverse": inverse / size[triangles].mean(axis=1, keepdims=True),
         "spring_scale": stretch[springs].mean(axis=1),
         "membrane_scale": stretch[triangles].mean(axis=1),

@@ -147,7 +147,9 @@ def _bending_of_quads(
     corner = corners[h]
     xi = x[corner[0]]
     axis = x[corner[1]] - xi
-    ik, il = (x[corner[2]] + x[corner[3]]) * half - xi, (x[corner[4]] + x[corner[5]]) * half - xi
+    # Differences first: in single precision they are exact where sums of positions are not.
+    ik = ((x[corner[2]] - xi) + (x[corner[3]] - xi)) * half
+    il = ((x[corner[4]] - xi) + (x[corner[5]] - xi)) * half
     stored, at_j, at_k, at_l = _bent(axis, ik, il, weight[h], rest_angle[h])
     energy[h] = stored
     corner_force[6 * h] = -at_j - at_k - at_l

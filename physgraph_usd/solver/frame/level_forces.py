@@ -154,7 +154,7 @@ def build_forces(
         *body_terms(level, fabrics, gravity=gravity, potential=potential),
     )
     guide = Guide(level, guide_map, torch.as_tensor(stiffness), relative_weight=relative)
-    matrix = on_edges(ForceModule((*terms, guide)).rest_matrix(), level.edges.cpu().numpy())
+    matrix = on_edges(ForceModule((*terms, guide)).rest_matrix(), level.springs.cpu().numpy())
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
     bends = any(fabric.bend > 0 for fabric in fabrics)

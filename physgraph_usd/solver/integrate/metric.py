@@ -28,7 +28,7 @@ REGULARISATION = 1e-7
 
 
 def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
-    """A graph Laplacian with a matrix's negative couplings along the edges and its row sums.
+    """A graph Laplacian with a matrix's negative couplings along edges and its row sums.
 
     The rest form of bending also couples vertices across two triangles. Those entries double the time of a solve, and
     take the gap at equal steps from 6.9% to 6.1% at best: on a sleeve, elsewhere by nothing (benchmarks/metric.py).
