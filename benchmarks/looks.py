@@ -16,13 +16,13 @@ from pathlib import Path
 
 import click
 import numpy as np
-from physgraph_usd.shot.page.raycast import draw, encode_color, fit_view
 from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
 from benchmarks.knobs import neighbour_mean, refinements_of, smooth_stencil, standing_off, vertex_normals
 from benchmarks.rows import say
-from physgraph_usd.shot.page.preview import label, surface_of
+from physgraph_usd.shot.page.drawing import draw, encode_color, fit_view
+from physgraph_usd.shot.page.preview import label
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
 from physgraph_usd.usd.read.reader import open_shot
@@ -110,8 +110,7 @@ def whole(sides: Sequence[Side], prim: str, camera: tuple[float, float], panel: 
     """The garment and what it touches, one picture a side."""
     points = np.concatenate([_cloth(side, prim).points for side in sides])
     view, floor = fit_view(points, 1.0, azimuth=camera[0], elevation=camera[1]), float(points[:, 1].min()) - 0.02
-    drawn = ([surface_of(mesh, lined=False) for mesh in meshes] for _, meshes in sides)
-    return [draw(surfaces, view, size=(panel, panel), floor=floor) for surfaces in drawn]
+    return [draw(meshes, view, size=(panel, panel), floor=floor) for _, meshes in sides]
 
 
 def close(

@@ -3,7 +3,8 @@
 A quad split along one diagonal is stiffer at the ends of that diagonal, and vertices there stand up on folds. So no
 element prefers a diagonal. Springs and the membrane of a quad are the mean over both splits. A hinge between two
 faces bends round their common edge, and a quad's normal there is that of the triangle from the edge to the middle of
-the opposite side. The twist of a quad is measured round a diagonal: small twists are the same round either.
+the opposite side. The twist of a quad is measured round the diagonal that splits it: small twists are the same
+round either.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class ElasticElements:
         face: The face that a triangle is part of, shape (M,).
         hinges: Edge i-j, the corners k, k' of the first face opposite to it, and l, l' of the second; k = k' at a
             triangle, shape (H, 6).
-        twists: Whether a hinge is a quad's own, round its first diagonal i-j, shape (H,).
+        twists: Whether a hinge is a quad's own, round the diagonal i-j that splits it, shape (H,).
     """
 
     springs: np.ndarray
@@ -59,7 +60,9 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
     membrane = np.concatenate([split.triangles[alone], halves]).astype(np.int32)
     face = np.concatenate([split.face[alone], np.repeat(quads, 4)])
     share = np.where(np.arange(len(membrane)) < alone.sum(), 1.0, 0.5)
-    twist = np.stack([a, c, d, d, b, b], axis=1)
+    first = np.searchsorted(split.face, quads)
+    (i, other, j), k = split.triangles[first].T, split.triangles[first + 1, 2]
+    twist = np.stack([i, j, k, k, other, other], axis=1)
     sides = hinges_of(split.triangles[alone], np.stack([a, b, c, d], axis=1))
     return ElasticElements(
         springs=edges_of(membrane, mesh.vertex_count).vertices,
