@@ -15,7 +15,7 @@ import torch
 from hypothesis import settings
 from shapes import check_shapes
 
-from physgraph_usd.solver.mesh.threads import start_warp
+from physgraph_usd.solver.mesh.kernels import start_warp
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 20

@@ -223,7 +223,7 @@ def warm_up(device: str) -> None:
     They are kept in the folder that WARP_CACHE_PATH names, by default in the user's cache.
     """
     from ..shot.solve import prepare_device
-    from ..solver.mesh.threads import compile_kernels
+    from ..solver.mesh.kernels import compile_kernels
 
     prepare_device(device)
     compile_kernels(device)

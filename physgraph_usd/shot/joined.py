@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..solver.frame.refiner import Refiner
-from ..solver.mesh.threads import start_warp
+from ..solver.mesh.kernels import start_warp
 from ..usd.read.reader import Shot
 from .frames import Lead, Outcome
 from .options import RefineOptions

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..errors import NOTICE, SolveError, counted
 from ..solver.level import refine_garments
-from ..solver.mesh.threads import kernels_are_compiled
+from ..solver.mesh.kernels import kernels_are_compiled
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED
 from ..usd.read.reader import Shot
 from ..usd.view import Layer

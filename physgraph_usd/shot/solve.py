@@ -13,7 +13,7 @@ import torch
 from ..errors import SolveError, StageError, UsageError
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
-from ..solver.mesh.threads import start_warp
+from ..solver.mesh.kernels import start_warp
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
 from .frames import Outcome

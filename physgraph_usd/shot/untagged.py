@@ -18,7 +18,7 @@ from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import MeshPose, Pose
 from ..solver.colliders.sign import signed_distances
 from ..solver.contact.broad_phase import bounds_of, mean_edge
-from ..solver.mesh.threads import start_warp
+from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Frame, Garment
 from ..solver.strain import StrainedPart, strained_parts

@@ -17,10 +17,11 @@ import numpy as np
 import warp as wp
 from scipy.ndimage import uniform_filter
 
-from ...solver.mesh.threads import run, start_warp
+from ...solver.mesh.kernels import KERNELS, start_warp
+from ...solver.mesh.threads import run
 from ...usd.read.meshes import DrawnMesh
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 KEY, KEY_WIDTH = np.array([-0.62, 0.62, 0.48]), 0.16
 """Direction to the key light in the camera's frame (right, up, towards the viewer), and its radius at distance 1."""

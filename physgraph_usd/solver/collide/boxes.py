@@ -11,11 +11,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from .domains import single
 from .parts import Parts
 from .topology import Topology
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 FAR = wp.constant(wp.float64(1.0e30))
 """Corner of a box that holds nothing."""

@@ -18,6 +18,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run, workers_on
 from .boxes import FAR, Swept, mean_path, motion_of, overlap, room_for_swept, sweep_boxes
 from .domains import Patches, flat, holds
@@ -25,7 +26,7 @@ from .parts import Parts
 from .patches import MARGIN, NOTHING
 from .topology import Topology
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 ROOM = 48
 """Pairs of a cluster that there is room for before they are counted."""

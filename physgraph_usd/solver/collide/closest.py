@@ -12,11 +12,12 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, Launch
 from .distance import weights_on_triangle
 from .domains import holds
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 FAR = wp.constant(wp.float64(1.0e30))
 """Distance of what has no faces to look at."""

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..level import Level
-from ..mesh.threads import start_warp
+from ..mesh.kernels import start_warp
 
 
 class Clusters:

@@ -11,6 +11,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.piercing import volume
 from .boxes import ROUNDING, Boxes, Motion, outside, overlap
 from .detector import Detector
@@ -18,7 +19,7 @@ from .narrow_phase import Found, has, is_one, write
 from .parts import Parts
 from .topology import Topology
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from ..mesh.kernels import KERNELS
+
+wp.set_module_options(KERNELS)
 
 FLAT = wp.constant(wp.float64(1.0e-20))
 """Squared sine under which a triangle counts as its sides, and two edges as parallel."""

@@ -15,11 +15,12 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, run
 from .clusters import gathered
 from .topology import Topology
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 WIDE, SMALL = 3, 2
 """Rings of clusters round a patch's own that belong to it: of wide patches, and of small ones that are looked at where

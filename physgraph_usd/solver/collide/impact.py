@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from ..mesh.kernels import KERNELS
 from .distance import weights_of
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 TIGHT = 0.9
 """Part of a distance under the floor that pairs keep."""

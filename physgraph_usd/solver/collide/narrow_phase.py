@@ -12,6 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, argument, run
 from .boxes import Boxes, Motion, highest_of, lowest_of, outside, overlap, pass_by, room_of
 from .broad_phase import launch
@@ -19,7 +20,7 @@ from .impact import can_meet, distance_of, impact_of, motion_of
 from .parts import Parts
 from .topology import Topology
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 ROOM, MOST_ROOM = 2**19, 64
 """Pairs of parts that there is room for in any case, shared by the pairs of clusters, and most of two clusters': those

@@ -11,13 +11,14 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
 from .detector import Detector
 from .distance import weights_of
 from .narrow_phase import Reach
 from .parts import Parts
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,11 +29,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run, workers_on
 from .domains import Patches, area_of, domains_of, single
 from .topology import Topology
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 SAMPLED = wp.constant(4)
 """Of so many triangles one is counted where Q is fitted: any Q is right, the best proves most."""

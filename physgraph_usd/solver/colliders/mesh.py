@@ -13,13 +13,14 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, argument, run
 from .base import Nearest
 from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
 from .pose import MeshPose, moved_rigidly
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 Rim = tuple[np.ndarray, np.ndarray]
 """Rim edges and rim corners of open triangles, as `Pieces` has them."""

@@ -13,10 +13,11 @@ import warp as wp
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.piercing import passes_through
 from ..mesh.threads import LEAST_QUERIES, Launch
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 
 @wp.func

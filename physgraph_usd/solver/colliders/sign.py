@@ -17,12 +17,13 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS, start_warp
 from ..mesh.stencil import vectors
-from ..mesh.threads import argument, run, start_warp
+from ..mesh.threads import argument, run
 from ..mesh.topology import joined_by
 from .base import Nearest, Surface
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 LEAST_REACH = 1e-3
 """Distance within which closest points are always asked for [m]."""

@@ -15,11 +15,12 @@ import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int
 
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import Launch
 from .pose import ShapePose
 from .primitives import ShapeSurface
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 KNOTS = wp.constant(8)
 BISECTIONS = wp.constant(20)

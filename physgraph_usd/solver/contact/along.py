@@ -15,10 +15,11 @@ from torch import Tensor
 
 from ..collide.narrow_phase import Pairs
 from ..collide.near import weights
+from ..mesh.kernels import KERNELS
 from ..mesh.stencil import incidence
 from ..mesh.threads import Launch, argument
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 COMES = 0.8
 """Part by which a pair may come nearer of what the promise lets it; the rest is for the little that it turns on its

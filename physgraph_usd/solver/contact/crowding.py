@@ -12,7 +12,7 @@ from ..collide.crossings import crossings
 from ..collide.parts import Parts
 from ..colliders.sign import signed_distances
 from ..level import build_levels
-from ..mesh.threads import start_warp
+from ..mesh.kernels import start_warp
 from ..scene import Frame, Garment, GarmentFrame, Scene
 from .broad_phase import Bodies, bounds_of, reach_of, touch_one_another
 

@@ -13,10 +13,11 @@ import warp as wp
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
 from ..colliders.sign import signed_distances
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import Launch
 from .measure import depths
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 LAYERS = wp.constant(8)
 """Most faces along an edge that are looked at."""

@@ -17,9 +17,10 @@ from torch import Tensor
 from ..colliders.base import Nearest, Surface
 from ..colliders.mesh import MeshSurface
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, argument, run
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 DETOUR = 1.05
 """The nearest face is buried where the way out is longer than this, over the distance to it."""

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, argument, run
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 OFF = 1e-5
 """How far off the surface a ray starts, so that it does not meet where it starts [m]."""

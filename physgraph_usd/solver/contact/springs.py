@@ -25,9 +25,10 @@ from ..collide.narrow_phase import Pairs
 from ..collide.near import NearPairs
 from ..forces.self_contact import PairConstraints
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 HALF, MARGIN = 0.5, 0.1
 """The part of their distance at rest that pairs of one garment keep at most, so that a flat sheet pushes nothing; and

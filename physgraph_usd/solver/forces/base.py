@@ -12,12 +12,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.stencil import QUAD, SCALAR, VECTOR, incidence, overloads, vectors
 from ..mesh.threads import Launch
 
-wp.set_module_options({"enable_backward": False})
-FUSED = {"enable_backward": False, "cpu_compiler_flags": "-march=native -ffp-contract=fast"}
-"""Options of modules whose kernels compute most: on the CPU a product and a sum are one instruction."""
+wp.set_module_options(KERNELS)
 
 
 @runtime_checkable

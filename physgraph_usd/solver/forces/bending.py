@@ -34,9 +34,10 @@ from torch import Tensor
 
 from ..grain import bending_factor
 from ..level import Level
+from ..mesh.kernels import FUSED
 from ..mesh.stencil import add_at
 from ..mesh.threads import argument
-from .base import FUSED, Elements, element_overloads
+from .base import Elements, element_overloads
 from .stretch import garment_area
 
 wp.set_module_options(FUSED)

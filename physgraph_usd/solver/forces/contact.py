@@ -24,10 +24,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.kernels import KERNELS, start_warp
 from ..mesh.stencil import SCALAR, VECTOR, overloads, vectors
-from ..mesh.threads import Launch, argument, start_warp
+from ..mesh.threads import Launch, argument
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 
 @dataclass(frozen=True, eq=False)

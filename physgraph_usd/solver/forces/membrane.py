@@ -41,8 +41,9 @@ from torch import Tensor
 
 from ..fabric import Fabric
 from ..level import Level
+from ..mesh.kernels import FUSED
 from ..mesh.stencil import add_at
-from .base import FUSED, Elements, Force, element_overloads
+from .base import Elements, Force, element_overloads
 from .stretch import Stretch, garment_area
 
 wp.set_module_options(FUSED)

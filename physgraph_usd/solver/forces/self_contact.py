@@ -23,9 +23,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from .base import Elements, element_overloads
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,10 +26,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 PAPER_SPRING = 2.598
 """The paper's k_s over Y: both in N/m."""

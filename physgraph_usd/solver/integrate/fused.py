@@ -20,12 +20,13 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.stencil import vectors
 from ..mesh.threads import Launch
 from .network import FLOOR, LOG_OFFSET, LOG_SCALE, Physgraph, clock_of, counted, families_of, pairs_of
 from .vertex_frame import VertexFrame, normal_of
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 Parts = tuple[tuple[int, bool], ...]
 Pairs = tuple[tuple[int, int], ...]

@@ -36,12 +36,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...errors import SolveError
+from ..mesh.kernels import KERNELS
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 from ..mesh.threads import current_stream
 from .dissection import dissect
 from .fronts import Tree, joined
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 BLOCK = 64
 """Threads that share a row's sum on CUDA."""

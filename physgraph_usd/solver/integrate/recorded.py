@@ -29,11 +29,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..mesh.kernels import KERNELS
 from ..mesh.threads import Launch
 from .base import Carry, System
 from .secants import Dot, Secant
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 SECANTS = 5
 """Secants kept."""

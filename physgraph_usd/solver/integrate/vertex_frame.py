@@ -22,10 +22,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.kernels import KERNELS
 from ..mesh.stencil import VECTOR, Stencil, incidence, overloads, vectors
 from ..mesh.threads import Launch
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 PARTS = ("normal", "smooth")
 

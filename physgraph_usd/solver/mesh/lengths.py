@@ -10,10 +10,11 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from .kernels import KERNELS, start_warp
 from .stencil import SCALAR, VECTOR, overloads, vectors
-from .threads import Launch, start_warp
+from .threads import Launch
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 _SIX = wp.types.vector(length=6, dtype=wp.int32)
 
 

@@ -14,9 +14,10 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from .kernels import KERNELS
 from .threads import Launch, argument
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(KERNELS)
 
 
 @wp.kernel

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import copy
 import functools
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,7 +19,6 @@ from torch import Tensor
 
 from ...interrupts import undisturbed
 
-_STDERR = 2
 LEAST_PER_THREAD = 4000
 """Items below which another thread costs more than it saves."""
 LEAST_QUERIES = 250
@@ -35,48 +31,9 @@ WORKERS = 16
 """Threads that share an item of many elements on CUDA, where few items leave most of the device idle."""
 
 
-@functools.cache
-def start_warp() -> None:
-    """Start Warp, without what its library prints itself where no CUDA driver is found: most machines have none."""
-    wp.config.log_level = wp.LOG_WARNING
-    with nullcontext() if torch.cuda.is_available() else _stderr_to_nowhere():
-        wp.init()
-
-
 def workers_on(device: str) -> int:
     """How many threads share an item of many elements."""
     return 1 if device == "cpu" else WORKERS
-
-
-def compile_kernels(device: str) -> None:
-    """Compile all kernels of modules that are imported; Warp keeps them for every later process."""
-    start_warp()
-    wp.force_load(device)
-
-
-def kernels_are_compiled() -> bool:
-    """Whether some of our kernels were compiled for this user and version of Warp before."""
-    start_warp()
-    package = __name__.split(".", maxsplit=1)[0]
-    return any(Path(wp.config.kernel_cache_dir or "").glob(f"wp_{package}*"))
-
-
-@contextmanager
-def _stderr_to_nowhere() -> Iterator[None]:
-    """Keep off the terminal what C code prints; does nothing in a program that has no standard error."""
-    try:
-        saved = os.dup(_STDERR)
-    except OSError:
-        yield
-        return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, _STDERR)
-        yield
-    finally:
-        os.dup2(saved, _STDERR)
-        os.close(saved)
-        os.close(nowhere)
 
 
 class Launch:
