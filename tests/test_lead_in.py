@@ -39,7 +39,7 @@ def test_one_frame_is_as_low_in_energy_as_in_the_whole_shot(skirt: Path, tmp_pat
         options = RefineOptions(frames=(first, 38.0), level=1)
         told: Any = refine_shot(skirt, tmp_path / f"{first:g}.usdc", options).frames[-1]["garments"][0]
         energies[first] = sum(told["energy_joules"]["output"].values())
-    assert energies[36.0] == pytest.approx(energies[26.0], abs=1e-2)
+    assert energies[36.0] < energies[26.0] + 1e-2
 
 
 class TestWhereNothingIsToBeWalked:

@@ -48,7 +48,7 @@ def lead_in(
 ) -> tuple[Refiner, float] | None:
     """Walk the cage to a run's first frame from one where it does not cross, or comes clean by itself.
 
-    That frame is looked for 1, 2, 4, 8, ... frames before; where none comes clean, it is the shot's first.
+    That frame is looked for 0, 1, 2, 4, 8, ... frames before; where none comes clean, it is the shot's first.
 
     Args:
         cages: A refiner of the shot that does not subdivide.
@@ -64,11 +64,11 @@ def lead_in(
         needed = last > 0 and _crosses(cages, frame_at(times[last]))
     except StageError:  # It is told of where the frame is solved.
         needed = False
-    if not needed or _is_clean(cages, frame_at, times[last]):
+    if not needed:
         return None
-    back = 1
+    back = 0
     while not _is_clean(cages, frame_at, times[max(last - back, 0)]) and back < last:
-        back *= 2
+        back = max(2 * back, 1)
     begun = max(last - back, 0)
     for time in times[begun + 1 :]:
         _solve(cages, frame_at, time)
