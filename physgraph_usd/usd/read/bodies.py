@@ -18,6 +18,7 @@ from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import find_token, find_value
 from ..schema import COLLIDER
 from ..stage import Notice, timecode, value_at
+from .absence import missing_value
 from .placement import is_flipped, place
 
 _EVEN = 1e-4
@@ -67,6 +68,10 @@ class ColliderReader:
         """Pose at a time code, interpolated as USD does; None, with a notice why, where there is none."""
         matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(self.prim), dtype=np.float64).T
         matrix[:3] *= self.metres
+        if time is not None and (why := missing_value(self.prim, time)):
+            return None, (self._out(time, why),)
+        if not matrix[:3, :3].any():
+            return None, (self._out(time, "its transform to the world scales it to nothing"),)
         if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
             return None, (self._out(time, "its transform to the world is not an affine one"),)
         pose, odd = (self._mesh if self.collider.kind == "mesh" else self._shape)(matrix, time)
@@ -157,7 +162,7 @@ def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None,
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
-    """An attribute's array at a time code, or its first."""
+    """An attribute's array at a time code; empty where there is none."""
     value = value_at(attribute, time)
     return np.zeros(0, np.int32) if value is None else np.asarray(value)
 
@@ -170,8 +175,8 @@ def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.n
 
     def number(name: str, fallback: float) -> float:
         attribute = prim.GetAttribute(name)
-        value = attribute.Get(timecode(time)) if attribute else None
-        if value is None:
+        value = value_at(attribute, time) if attribute else None
+        if value is None and not (attribute and attribute.GetNumTimeSamples()):
             return fallback
         return float(value) if isinstance(value, int | float) else np.nan
 

@@ -92,7 +92,8 @@ def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
         return
     first = read_integers(attribute, times[0])
     for time in samples:
-        if times[0] < time <= times[-1] and not np.array_equal(first, read_integers(attribute, time)):
+        absent = attribute.Get(time) is None  # The mesh has no shape there.
+        if times[0] < time <= times[-1] and not absent and not np.array_equal(first, read_integers(attribute, time)):
             message = f"{attribute.GetName()} changes: the topology of a garment must stay the same over the shot"
             raise GarmentError(str(attribute.GetPrim().GetPath()), message, time=time, remedy=_SPLIT)
 
@@ -230,7 +231,7 @@ class PointReader:
         at = -np.inf if time is None else time
         earlier = [each for each in reversed(self._times) if each < at]
         for each in (*earlier, *(later for later in self._times if later > at)):
-            points = self._raw(each)
+            points = self._raw(each) if self._attribute.Get(each) else ()
             if len(points) == self.count and np.isfinite(points).all():
                 return points
         return None

@@ -42,7 +42,7 @@ from ..view import StageView
 from .authored import authored_faults
 from .bodies import ColliderReader, read_collider
 from .find import felt_by, find_colliders, find_garments, instance_roots, read_apart, with_gravity
-from .garment import GarmentReader, Request, all_times, is_visible, read_garment
+from .garment import GarmentReader, Request, is_visible, read_garment, samples_of
 from .materials import find_values
 from .placement import to_metres
 from .rest import AUTO
@@ -124,7 +124,8 @@ class Shot:
         garments, notices = [], []
         with pxr_errors(f"cannot read {self.path}" + at_time(time)):
             for index, reader in enumerate(self._readers):
-                garment, odd = reader.frame(self.to_metres(index, time), time)
+                prim = self.stage.GetPrimAtPath(self.sources[index].path)
+                garment, odd = reader.frame(prim, self.metres_per_unit, time)
                 garments.append(garment)
                 notices += odd
             poses = []
@@ -314,7 +315,8 @@ def _read(
     readers, every = [], []
     for path, instances in roots.items():
         prim = stage.GetPrimAtPath(path)
-        times = all_times(prim, request.bake)
+        samples = samples_of(prim, request.bake)
+        times = samples.times
         every += times
         if times and not within(times, request.frames):
             span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}"
@@ -322,7 +324,7 @@ def _read(
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:
-            readers.append(read_garment(prim, instances, request))
+            readers.append(read_garment(prim, instances, samples, request))
     if request.frames and every and not within(every, request.frames):
         message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
         raise StageError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
