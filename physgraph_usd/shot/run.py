@@ -27,7 +27,7 @@ from .joined import SafeMover, joined
 from .notes import of_energy, of_folds, of_rest
 from .options import RefineOptions
 from .report import LOG, RefineReport
-from .settled import unsettled_frames
+from .settled import cuts, unsettled_frames
 from .solve import Outcomes, ShotSolver
 from .untagged import AUTO
 from .warnings import WARNINGS, of_frames
@@ -187,8 +187,9 @@ class Run:
             self.report.failed[name] = error
             self.report.warn(WARNINGS["failed"](name=name, error=error))
             return 0.0
-        start = clock.perf_counter()
-        writer.write(outcome.time, outcome.points, changed=[not reused for reused in outcome.reused], heat=outcome.heat)
+        start, records = clock.perf_counter(), self.report.frames
+        how = {"changed": [not reused for reused in outcome.reused], "cuts": cuts(records[-2:]), "heat": outcome.heat}
+        writer.write(outcome.time, outcome.points, **how)
         return clock.perf_counter() - start
 
 
