@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from itertools import zip_longest
 from typing import Any
 
 from ..solver.integrate.solve import FAR
 
 COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
-_STARTED_ANEW = "cold: "
-"""In the start of a frame of the telemetry, before the reason why cloth was not carried from the last one."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +69,6 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
         if far or (stopped == "stalled" and remaining > tolerance):
             return Unsettled(level, remaining, stopped)
     return None
-
-
-def cuts(records: Sequence[Mapping[str, Any]]) -> list[bool]:
-    """For each garment, whether its cloth jumps between the last two frames of a record, or starts anew in the last.
-
-    Cloth that is not carried from one frame to the next does not move between them.
-    """
-    before, now = (list(record.get("garments", ())) for record in ({}, *records)[-2:])
-    return [
-        _STARTED_ANEW in str(entry.get("start", "")) or "broken_before" in entry or _is_unsolved(entry) or _is_unsolved(earlier)
-        for earlier, entry in zip_longest(before[: len(now)], now, fillvalue={})
-    ]
-
-
-def _is_unsolved(entry: Mapping[str, Any]) -> bool:
-    return "collapsed" in entry or "not_solved" in entry
 
 
 def unsettled_frames(

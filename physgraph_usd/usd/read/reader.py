@@ -104,6 +104,14 @@ class Shot:
         """
         return to_metres(self.stage.GetPrimAtPath(self.sources[index].path), self.metres_per_unit, time)
 
+    def local(self, index: int, time: float | None) -> np.ndarray:
+        """A garment's coarse points in its own space and units at a time code, by number, shape (V, 3), float64.
+
+        Raises:
+            GarmentError: They are broken.
+        """
+        return self._readers[index].points.read(time, self._readers[index].edges)[0]
+
     def times_until(self, last: float) -> list[float]:
         """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
         return [time for time in self.every_time if time < last] + [last]

@@ -291,7 +291,6 @@ class _RefinedMesh:
         self._track.finish(hold=hold)
         self._heat.finish(hold=hold)
 
-
     @property
     def cuts(self) -> tuple[float, ...]:
         """Time codes of samples to which the cloth jumps, where there are velocities."""
