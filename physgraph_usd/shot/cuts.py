@@ -87,9 +87,9 @@ def _steps(samples: Iterable[tuple[float, np.ndarray]]) -> tuple[list[float], li
 
 
 def _mean_edge(opened: Shot, index: int) -> float:
-    """Mean edge of a cage in its own units at its first sample."""
+    """Mean edge of a cage in its own units at its first sample that can be read."""
     edges = opened.scene.garments[index].mesh.half_edges.edges
-    first = opened.local(index, opened.sources[index].times[0])
+    _, first = next(_samples(opened, index))
     return float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean())
 
 

@@ -77,9 +77,9 @@ def timecode(time: float | None) -> Usd.TimeCode:
 
 
 def value_at(attribute: Usd.Attribute, time: float | None) -> Any:
-    """An attribute's value at a time code, None where it is blocked; at the default its first sample if it has no other.
+    """An attribute's value at a time code, None where it is blocked.
 
-    A shot whose garments have no samples is read at the default.
+    At the default, at which a shot is read whose garments have no samples, it may be the first sample.
     """
     value = attribute.Get(timecode(time))
     return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None and time is None else value

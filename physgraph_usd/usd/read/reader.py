@@ -47,6 +47,7 @@ from .materials import find_values
 from .placement import to_metres
 from .rest import AUTO
 from .skinning import Bake
+from .timing import timing_notices
 
 
 class Shot:
@@ -239,6 +240,12 @@ def open_shot(
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, metres=units.metres, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
+        felt_by = [
+            [number for number, reader in enumerate(readers) if index in reader.garment.colliders]
+            for index in range(len(solids))
+        ]
+        cloth = [(stage.GetPrimAtPath(reader.source.path), reader.source) for reader in readers]
+        notices += timing_notices(cloth, [(body.prim, by) for body, by in zip(solids, felt_by, strict=True)], bake)
         read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
     opened.unsaved = unsaved
