@@ -82,7 +82,15 @@ def value_at(attribute: Usd.Attribute, time: float | None) -> Any:
     At the default, at which a shot is read whose garments have no samples, it may be the first sample.
     """
     value = attribute.Get(timecode(time))
-    return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None and time is None else value
+    return first_value(attribute) if value is None and time is None else value
+
+
+def first_value(attribute: Usd.Attribute) -> Any:
+    """An attribute's first sample that is neither blocked nor empty, or its default where it has no samples."""
+    first = attribute.Get(Usd.TimeCode.EarliestTime())
+    others = attribute.GetTimeSamples()[1:] if first is None or np.size(first) == 0 else ()
+    later = (attribute.Get(time) for time in others)
+    return next((value for value in later if value is not None and np.size(value)), first)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from pxr import Usd, UsdGeom
 from ...errors import GarmentError, counted
 from ...solver.mesh.topology import PolygonMesh
 from ..stage import Notice, value_at
+from .absence import missing_value
 
 _CONTROLS = {
     "subdivisionScheme": ("catmullClark", "loop", "bilinear", "none"),
@@ -92,8 +93,9 @@ def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
         return
     first = read_integers(attribute, times[0])
     for time in samples:
-        absent = attribute.Get(time) is None  # The mesh has no shape there.
-        if times[0] < time <= times[-1] and not absent and not np.array_equal(first, read_integers(attribute, time)):
+        if not times[0] < time <= times[-1] or np.array_equal(first, read_integers(attribute, time)):
+            continue
+        if not missing_value(attribute.GetPrim(), time):
             message = f"{attribute.GetName()} changes: the topology of a garment must stay the same over the shot"
             raise GarmentError(str(attribute.GetPrim().GetPath()), message, time=time, remedy=_SPLIT)
 

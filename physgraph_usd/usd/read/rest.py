@@ -22,7 +22,7 @@ from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
 from ..lookup import nearest, source_name
-from ..stage import Notice, value_at
+from ..stage import Notice, first_value
 from .cage import as_points, repair
 
 AUTO = "auto"
@@ -227,7 +227,7 @@ def _authored(prim: Usd.Prim, count: int, notices: list[Notice]) -> tuple[np.nda
 def _of_corners(attribute: Usd.Attribute, values: np.ndarray, count: int) -> tuple[np.ndarray | None, Notice]:
     """Rest points of values per corner, shape (C, 3); None where corners of a point differ. And a notice."""
     prim = attribute.GetPrim()
-    corners = np.asarray(value_at(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr(), None))
+    corners = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr()))
     path, name = str(prim.GetPath()), attribute.GetName()
     if len(corners) != len(values):
         message = f"{name} has {len(values)} values, one per corner, for {len(corners)} corners; it is not the rest"
@@ -237,7 +237,9 @@ def _of_corners(attribute: Usd.Attribute, values: np.ndarray, count: int) -> tup
     size = np.ptp(values, axis=0).max(initial=0.0)
     apart = np.flatnonzero(~(np.abs(points[corners] - values).max(axis=1) <= _SAME_PLACE * size))
     if not len(apart):
-        return points, Notice(path, None, f"{name} is per corner; all corners of a point agree, so it is the rest shape")
+        return points, Notice(
+            path, None, f"{name} is per corner; all corners of a point agree, so it is the rest shape"
+        )
     message = f"{name} is per corner and differs between corners of points[{corners[apart[0]]}]; it is not the rest"
     return None, Notice(path, None, f"{message} shape; author one value per point (vertex interpolation)")
 

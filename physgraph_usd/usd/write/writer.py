@@ -24,7 +24,7 @@ from ..check.validate import check_layer
 from ..files import check_targets, files_of
 from ..read.absence import named_times
 from ..read.reader import Shot
-from ..stage import Notice, pxr_errors, value_at
+from ..stage import Notice, first_value, pxr_errors, value_at
 from ..times import within
 from . import overs
 from .chunk import CHUNK, Chunk
@@ -245,7 +245,7 @@ class _RefinedMesh:
         """
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
-        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
+        counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()))
         fine = FineMap(shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
         self.notices = overs.open_instances(stream, source)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
