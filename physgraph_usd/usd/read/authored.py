@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ..lookup import USER_PROPERTIES, bound_materials, connected, find_value, is_within, with_ancestors
+from ..lookup import USER_PROPERTIES, bound_materials, connected, find_value, is_within, nearest, with_ancestors
 from ..schema import COLLIDER_API, GARMENT_API, MATERIAL, PROPERTIES, Property, nearest_property
 from ..stage import Notice
 from ..write.track import HEAT, PREFIX
@@ -47,7 +47,7 @@ def _animated_in_vain(prim: Usd.Prim, schema: str) -> Iterator[Usd.Attribute]:
         once = row.uniform or row.interpolation or schema == COLLIDER_API
         if row.schema != schema or row.type == "rel" or not once:
             continue
-        attribute = _source(prim, row)
+        attribute = _source(prim, row) if row.interpolation else nearest(prim, row.name)
         times = [] if attribute is None else attribute.GetTimeSamples()
         if attribute is not None and any(attribute.Get(time) != attribute.Get(times[0]) for time in times[1:]):
             yield attribute

@@ -233,7 +233,7 @@ class PointReader:
         at = -np.inf if time is None else time
         earlier = [each for each in reversed(self._times) if each < at]
         for each in (*earlier, *(later for later in self._times if later > at)):
-            points = self._raw(each) if self._attribute.Get(each) else ()
+            points = self._raw(each) if self._attribute.Get(each) else np.zeros((0, 3))  # It may be blocked there.
             if len(points) == self.count and np.isfinite(points).all():
                 return points
         return None

@@ -240,12 +240,7 @@ def open_shot(
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, metres=units.metres, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
-        felt_by = [
-            [number for number, reader in enumerate(readers) if index in reader.garment.colliders]
-            for index in range(len(solids))
-        ]
-        cloth = [(stage.GetPrimAtPath(reader.source.path), reader.source) for reader in readers]
-        notices += timing_notices(cloth, [(body.prim, by) for body, by in zip(solids, felt_by, strict=True)], bake)
+        notices += _timing(stage, readers, solids, bake=bake)
         read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
     opened.unsaved = unsaved
@@ -310,6 +305,18 @@ def _link(
         garment = replace(reader.garment, colliders=colliders, apart_from=others)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
     return linked, bodies
+
+
+def _timing(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader], *, bake: Bake
+) -> list[Notice]:
+    """Notices of samples of garments, and of the bodies that they feel, which do not fit in time."""
+    garments = [(stage.GetPrimAtPath(reader.source.path), reader.source) for reader in readers]
+    felt_by = [
+        [number for number, reader in enumerate(readers) if index in reader.garment.colliders]
+        for index in range(len(bodies))
+    ]
+    return timing_notices(garments, [(body.prim, by) for body, by in zip(bodies, felt_by, strict=True)], bake)
 
 
 def _read(

@@ -29,7 +29,7 @@ def timing_notices(
 
 
 def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]:
-    """What is wrong with a body's samples beside those of a garment."""
+    """Faults of a body's samples beside those of a garment, in words."""
     own, cloth = _own_times(body, bake), garment.times
     if not cloth and UsdGeom.Mesh(body) and UsdGeom.Mesh(body).GetPointsAttr().Get() is None and own:
         yield f"has no points by default, at which still garments are read; its sample at {own[0]:g} is used"
