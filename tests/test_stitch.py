@@ -248,7 +248,10 @@ def test_an_interrupted_chunk_goes_on_with_the_preroll_that_it_had(tmp_path: Pat
 
 @pytest.fixture
 def odd_shot(tmp_path: Path) -> Path:
-    """Sheets far apart: one that moves, one that halts, one with few samples, one with none; under a box of a model."""
+    """Sheets far apart, under a box of a model: one moves and jumps, one halts, one has few samples, one none.
+
+    The first two are not there for a frame each.
+    """
     stage = new_stage(tmp_path / "odd.usdc", metres=EDGE)
     world = stage.GetPrimAtPath("/World")
     hint = world.CreateAttribute("extentsHint", Sdf.ValueTypeNames.Float3Array)
@@ -261,6 +264,11 @@ def odd_shot(tmp_path: Path) -> Path:
     still = UsdGeom.Mesh(stage.GetPrimAtPath("/World/halts")).GetPointsAttr()
     for time in times[1:-1]:
         still.Set(still.Get(2.0), time)
+    moves = UsdGeom.Mesh(stage.GetPrimAtPath("/World/moves")).GetPointsAttr()
+    for time in times[5:]:
+        moves.Set(vec3(np.asarray(moves.Get(time)) + np.float32([0.0, 100.0, 0.0])), time)
+    for attribute, time in ((moves, 4.0), (still, 5.0)):
+        stage.GetRootLayer().SetTimeSample(attribute.GetPath(), time, Sdf.ValueBlock())
     return Path(save(stage))
 
 

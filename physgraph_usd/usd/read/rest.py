@@ -237,9 +237,7 @@ def _of_corners(attribute: Usd.Attribute, values: np.ndarray, count: int) -> tup
     size = np.ptp(values, axis=0).max(initial=0.0)
     apart = np.flatnonzero(~(np.abs(points[corners] - values).max(axis=1) <= _SAME_PLACE * size))
     if not len(apart):
-        return points, Notice(
-            path, None, f"{name} is per corner; all corners of a point agree, so it is the rest shape"
-        )
+        return points, Notice(path, None, f"{name} is per corner; corners of a point agree, so it is the rest shape")
     message = f"{name} is per corner and differs between corners of points[{corners[apart[0]]}]; it is not the rest"
     return None, Notice(path, None, f"{message} shape; author one value per point (vertex interpolation)")
 
