@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..rigid import AT_REST, Rigid, best_motion
+
 KINDS = ("mesh", "sphere", "capsule", "cylinder", "cube", "plane")
 RIGID = 1e-6
 """How far points may be from where a turn and a shift bring them, relative to their extent: float32's rounding."""
@@ -53,11 +55,11 @@ class MeshPose:
             and np.array_equal(self.points, other.points)
         )
 
-    def moved(self, since: Pose) -> float:
-        """How far any point has moved since another pose [m]; infinite where the two cannot be compared."""
+    def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
+        """How far any point is from where a motion takes another pose [m]; infinite where the two are not alike."""
         if not isinstance(since, MeshPose) or not np.array_equal(self.triangles, since.triangles):
             return np.inf
-        return _farthest(self.points, since.points)
+        return _farthest(self.points, along(since.points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +93,15 @@ class ShapePose:
             and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("turn", "centre", "size"))
         )
 
-    def moved(self, since: Pose) -> float:
-        """How far its axes' ends have moved since another pose [m], a plane's at a metre; infinite for other kinds."""
+    def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
+        """How far its axes' ends are from where a motion takes another pose's [m]; infinite for other kinds.
+
+        A plane's ends lie at a metre.
+        """
         if not isinstance(since, ShapePose) or self.kind != since.kind:
             return np.inf
         ends = [each.centre + (each.turn * (each.size if each.size.any() else 1.0)).T for each in (self, since)]
-        return _farthest(*ends)
+        return _farthest(ends[0], along(ends[1]))
 
 
 Pose = MeshPose | ShapePose
@@ -117,7 +122,4 @@ def moved_rigidly(before: np.ndarray, after: np.ndarray) -> bool:
         before: Positions [m], shape (V, 3), float64.
         after: Positions of the same points [m].
     """
-    a, b = (each - each.mean(axis=0) for each in (before, after))
-    u, _, vt = np.linalg.svd(b.T @ a)
-    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return bool(np.abs(a @ turn.T - b).max() <= RIGID * np.ptp(a, axis=0).max())
+    return _farthest(after, best_motion(before, after)(before)) <= RIGID * np.ptp(before, axis=0).max()

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..colliders.pose import Pose
+from ..rigid import AT_REST, Rigid, best_motion
 from ..scene import Frame, GarmentFrame
 from .values import State, join
 
@@ -68,7 +69,8 @@ class Origin:
 
     Attributes:
         frames: The frame of each garment that it starts from; None where there is none.
-        state: What they left, joined; None for a cold start.
+        state: What they left, joined and moved as the cages have moved since; None for a cold start.
+        motion: The rigid motion that brings the cages of those frames closest to this frame's.
         broken: Time code of the last frame, where the input left its place in it alone; else None.
         jumped: Time code of the first frame, where the input jumped from there to the second; else None.
         gap: Whether the time between samples is too long.
@@ -76,18 +78,23 @@ class Origin:
 
     frames: tuple[SolvedFrame | None, ...]
     state: State | None
+    motion: Rigid
     broken: float | None
     jumped: float | None
     gap: bool
 
-    def moved(self, part: tuple[int, ...], frame: Frame, near: Sequence[int]) -> float:
-        """How far any body that garments may touch has moved since [m]; infinite if more than poses changed."""
+    def moved(self, part: tuple[int, ...], frame: Frame, near: Sequence[int], gravity: np.ndarray) -> float:
+        """How far bodies that garments may touch have moved since, seen from the cages [m].
+
+        Infinite if more than poses changed. Gravity counts as a body: its direction's end at a metre.
+        """
         known = [each for each in self.frames if each is not None]
-        farthest = 0.0 if len(known) == len(part) else np.inf
+        down = gravity / max(float(np.linalg.norm(gravity)), 1e-30)
+        farthest = float(np.linalg.norm(self.motion.turn @ down - down)) if len(known) == len(part) else np.inf
         for index, last in zip(part, known, strict=False):
             if last.part != part or not set_alike(frame.garments[index], last.frame) or set(near) != set(last.near):
                 return np.inf
-            farthest = max(farthest, bodies_moved(last, frame.colliders, near))
+            farthest = max(farthest, bodies_moved(last, frame.colliders, near, along=self.motion))
         return farthest
 
     def elapsed(self, time: float | None, seconds: float) -> list[float]:
@@ -131,9 +138,18 @@ def origin_of(
     frames = frames if jumped is None else (None,) * len(part)
     known = [each for each in frames if each is not None]
     state = None if gap or len(known) < len(part) else join([each.state for each in known])
+    motion = _motion(known, [frame.garments[index] for index in part]) if state is not None else AT_REST
     if state is not None and any(each.part != part for each in known):
         state = replace(state, clean=False)  # What was solved apart may cross.
-    return Origin(frames, state, broken, jumped, gap)
+    return Origin(frames, None if state is None else state.carried(motion), motion, broken, jumped, gap)
+
+
+def _motion(known: Sequence[SolvedFrame], now: Sequence[GarmentFrame]) -> Rigid:
+    """The rigid motion that brings cages closest to where they are now; none where they start from different frames."""
+    before, after = ([each.points for each in frames] for frames in ([each.frame for each in known], now))
+    if len({each.time for each in known}) > 1 or any(a.shape != b.shape for a, b in zip(before, after, strict=True)):
+        return AT_REST
+    return best_motion(np.concatenate(before), np.concatenate(after))
 
 
 def _broken(
@@ -190,12 +206,14 @@ def cage_moved(known: SolvedFrame, now: GarmentFrame) -> float:
     return far if np.isfinite(far) else np.inf
 
 
-def bodies_moved(known: SolvedFrame, colliders: Sequence[Pose | None], near: Sequence[int]) -> float:
-    """How far any of some bodies has moved since a frame [m]; infinite where one cannot be compared."""
+def bodies_moved(
+    known: SolvedFrame, colliders: Sequence[Pose | None], near: Sequence[int], *, along: Rigid = AT_REST
+) -> float:
+    """How far any of some bodies is from where a motion takes it since a frame [m]; infinite where not comparable."""
     farthest = 0.0
     for body in near:
         before, after = known.colliders[body], colliders[body]
-        farthest = max(farthest, np.inf if before is None or after is None else after.moved(before))
+        farthest = max(farthest, np.inf if before is None or after is None else after.moved(before, along))
     return farthest
 
 

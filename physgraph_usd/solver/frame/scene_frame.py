@@ -220,7 +220,8 @@ class SceneFrame:
         cage = None if origin.state is not None else self._cage_walked(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         while True:
-            touching, moved = self.cloth.touching(part, frames, near), origin.moved(part, self.frame, near)
+            touching = self.cloth.touching(part, frames, near)
+            moved = origin.moved(part, self.frame, near, self.cloth.scene.gravity)
             walked = None if cage is None else cage[0]
             given = FrameInput(frames, self.frame.time, touching, moved, walked=walked, elapsed=elapsed)
             try:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..contact.bodies import Touching
 from ..level import Placed
+from ..rigid import AT_REST, Rigid
 from ..scene import GarmentFrame
 
 
@@ -81,6 +82,23 @@ class State:
     creeps: bool = False
     failures: int = 0
     wait: int = 0
+
+    def carried(self, motion: Rigid) -> State:
+        """This state after a rigid motion."""
+        if motion is AT_REST:
+            return self
+        turn = torch.as_tensor(motion.turn)
+
+        def placed(x: Tensor) -> Tensor:
+            return torch.as_tensor(motion(x.double().cpu().numpy())).to(x)
+
+        return replace(
+            self,
+            coarse=placed(self.coarse),
+            fine=None if self.fine is None else placed(self.fine),
+            detail=self.detail @ turn.T.to(self.detail),
+            frames=turn.to(self.frames) @ self.frames,
+        )
 
     def about(self, origin: np.ndarray) -> Placed | None:
         """Fine positions about an origin [m], float64, where cloth walks; else None."""
