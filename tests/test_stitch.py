@@ -266,7 +266,7 @@ def odd_shot(tmp_path: Path) -> Path:
         still.Set(still.Get(2.0), time)
     moves = UsdGeom.Mesh(stage.GetPrimAtPath("/World/moves")).GetPointsAttr()
     for time in times[5:]:
-        moves.Set(vec3(np.asarray(moves.Get(time)) + np.float32([0.0, 100.0, 0.0])), time)
+        moves.Set(vec3(np.asarray(moves.Get(time)) + np.array([0.0, 100.0, 0.0])), time)
     for attribute, time in ((moves, 4.0), (still, 5.0)):
         stage.GetRootLayer().SetTimeSample(attribute.GetPath(), time, Sdf.ValueBlock())
     return Path(save(stage))
