@@ -35,21 +35,23 @@ class Soup:
 
 
 def crossing_points(x: np.ndarray, edges: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges that pass through faces with which they share no vertex: numbers of both, and where, shape (N, 3)."""
-    found: list[tuple[np.ndarray, ...]] = []
-    p, q, r = (x[faces[:, i]] for i in range(3))
-    for number, (a, b) in enumerate(edges):
-        along = x[b] - x[a]
-        matrix = np.stack([q - p, r - p, np.broadcast_to(-along, p.shape)], axis=2)
-        det = np.linalg.det(matrix)
-        safe = np.abs(det) > 1e-18
-        u, v, t = np.full((3, len(faces)), -1.0)
-        u[safe], v[safe], t[safe] = np.linalg.solve(matrix[safe], (x[a] - p[safe])[:, :, None])[:, :, 0].T
-        through = (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
-        which = np.flatnonzero(through & ~((faces == a) | (faces == b)).any(axis=1))
-        found.append((np.full(len(which), number), which, x[a] + t[which, None] * along))
-    edge, face, point = (np.concatenate(part) for part in zip(*found, strict=True))
-    return edge, face, point
+    """Edges that pass through faces with which they share no vertex: numbers of both, and where, shape (N, 3).
+
+    An edge and a face whose boxes are apart do not meet.
+    """
+    near = np.ones((len(edges), len(faces)), bool)
+    for ends, corners in zip(np.moveaxis(x[edges], 2, 0), np.moveaxis(x[faces], 2, 0), strict=True):
+        near &= (ends.min(axis=1)[:, None] <= corners.max(axis=1)) & (ends.max(axis=1)[:, None] >= corners.min(axis=1))
+    edge, face = np.nonzero(near)
+    apart = (edges[edge][:, :, None] != faces[face][:, None, :]).all(axis=(1, 2))
+    edge, face = edge[apart], face[apart]
+    (a, b), (p, q, r) = x[edges[edge].T], x[faces[face].T]
+    matrix = np.stack([q - p, r - p, a - b], axis=2)
+    safe = np.abs(np.linalg.det(matrix)) > 1e-18
+    u, v, t = np.full((3, len(edge)), -1.0)
+    u[safe], v[safe], t[safe] = np.linalg.solve(matrix[safe], (a - p)[safe, :, None])[:, :, 0].T
+    through = (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
+    return edge[through], face[through], (a + t[:, None] * (b - a))[through]
 
 
 def crossings(soup: Soup, meets: np.ndarray | None = None) -> set[tuple[int, int]]:
