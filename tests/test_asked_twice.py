@@ -36,7 +36,6 @@ def beside(points: np.ndarray) -> np.ndarray:
 
 SHEET = square(5)
 SCENES: dict[str, tuple[Sequence[Cloth], Sequence[np.ndarray]]] = {
-    "on a ball": ([SHEET], [SHEET[1] + OVER]),
     "crumpled on a ball": ([SHEET], [crumpled(SHEET[1]) + OVER]),
     "one through the other": ([SHEET] * 2, [SHEET[1], tilted(SHEET[1])]),
     "sewn on a ball": ([SHEET] * 2, [SHEET[1] + OVER, beside(SHEET[1]) + OVER]),

@@ -57,6 +57,7 @@ def test_a_frame_by_itself_is_the_same_after_any_other(sample: Callable[[str], P
     assert np.array_equal(alone, after)
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_a_frame_by_itself_is_the_same_in_any_process(real_data: Path):
     """Frame 30 differed by 4.5 mm by which frames a process had solved before it."""
