@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from cloth import rms
 from layers import open_over
 from pxr import Sdf, Usd, UsdGeom
-from shots import CLOTH, EDGE, cloth_shot, command, faults, fine, refine, sample_times
+from shots import CLOTH, EDGE, cloth_shot, faults, fine, refine, run, sample_times
 from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.cli import main
@@ -109,8 +109,8 @@ class TestOneLayer:
         assert "is a chunk, with 8 of the shot's 24 frames" in problem.message
 
     def test_the_command_says_how_far_seams_move(self, runs: Runs, tmp_path: Path):
-        done = command("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc")
-        assert done.returncode == 0, done.stderr
+        done = run("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc")
+        assert done.exit_code == 0, done.stderr
         assert done.stdout.strip() == str(tmp_path / "joined.usdc")
         assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["seam at 9", "seam at 17"]
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
