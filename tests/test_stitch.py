@@ -59,11 +59,10 @@ def points_in(stage: Usd.Stage, path: str, time: float) -> Any:
 
 
 class Runs(NamedTuple):
-    """24 frames of a sheet: as one run, with three workers, and as three chunks that were stitched."""
+    """24 frames of a sheet: as one run, and as three chunks that were stitched."""
 
     shot: Path
     one: Path
-    workers: Path
     chunks: list[Path]
     joined: Path
 
@@ -73,11 +72,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folder = tmp_path_factory.mktemp("stitch")
     shot = cloth_shot(folder / "shot.usdc", times=TIMES)
     refine(shot, folder / "one.usdc")
-    refine(shot, folder / "workers.usdc", workers=3)
     (folder / "parts").mkdir()
     chunks = refine_chunks(shot, folder / "parts")
     stitch(chunks[::-1], folder / "joined.usdc")
-    return Runs(shot, folder / "one.usdc", folder / "workers.usdc", chunks, folder / "joined.usdc")
+    return Runs(shot, folder / "one.usdc", chunks, folder / "joined.usdc")
 
 
 class TestOneLayer:
@@ -86,7 +84,7 @@ class TestOneLayer:
         assert max(apart[:2]) == 0.0
         assert 0.0 < max(apart) < SEAM_BOUND, apart
 
-    def test_holds_the_chunks_positions_and_those_of_as_many_workers(self, runs: Runs):
+    def test_holds_the_chunks_positions(self, runs: Runs):
         assert sample_times(runs.joined) == TIMES
         for span, chunk in zip(SPANS, runs.chunks, strict=True):
             own = [time for time in TIMES if span[0] <= time <= span[1]]
@@ -94,7 +92,13 @@ class TestOneLayer:
             for time in own:
                 joined = points(runs.joined, time)
                 assert np.array_equal(points(chunk, time), joined) == (time + 6 <= span[1] or time > 16), time
-                assert np.allclose(points(runs.workers, time), joined, rtol=0, atol=1e-6)
+
+    @pytest.mark.slow
+    def test_holds_the_positions_of_as_many_workers(self, runs: Runs, tmp_path: Path):
+        refine(runs.shot, tmp_path / "workers.usdc", workers=3)
+        for time in TIMES:
+            by_workers = points(tmp_path / "workers.usdc", time)
+            assert np.allclose(by_workers, points(runs.joined, time), rtol=0, atol=1e-6)
 
     def test_is_valid_and_records_what_it_was_made_from(self, runs: Runs):
         assert validate_layer(runs.joined) == []

@@ -199,11 +199,13 @@ def test_the_command_tells_before_the_first_frame_and_once(tmp_path: Path):
 
 
 @pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_the_command_tells_once_of_each_of_several_shots(tmp_path: Path, workers: int):
+def test_the_command_tells_once_of_each_of_several_shots(
+    tmp_path: Path, workers: int, capfd: pytest.CaptureFixture[str]
+):
     shots = [puffed_shot(tmp_path / name) for name in ("a.usda", "b.usda")]
     done = run("refine", *shots, "-o", tmp_path / "out", "--level", "0", "--workers", str(workers))
     assert done.exit_code == 0
-    told = [line for line in done.stderr.splitlines() if "--rest auto" in line]
+    told = [line for line in (done.stderr + capfd.readouterr().err).splitlines() if "--rest auto" in line]
     assert sorted(line.partition(": in most")[0] for line in told) == [f"warning: {shot}" for shot in shots]
 
 
