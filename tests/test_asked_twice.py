@@ -20,7 +20,7 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Scene
 
 STIFF = replace(FABRIC, stretch=3.0 * FABRIC.stretch, bend=5.0 * FABRIC.bend, density=2.0 * FABRIC.density)
-SETTINGS = settings_of(steps=1)
+SETTINGS = settings_of(steps=2)
 OVER = np.array([0.0, 0.19, 0.0])
 
 
@@ -34,7 +34,7 @@ def beside(points: np.ndarray) -> np.ndarray:
     return points + np.array([np.ptp(points[:, 0]), 0.0, 0.0])
 
 
-SHEET = square(5)
+SHEET = square(4)
 SCENES: dict[str, tuple[Sequence[Cloth], Sequence[np.ndarray]]] = {
     "crumpled on a ball": ([SHEET], [crumpled(SHEET[1]) + OVER]),
     "one through the other": ([SHEET] * 2, [SHEET[1], tilted(SHEET[1])]),
