@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import signal
 import subprocess
 import sys
 import time
@@ -15,12 +13,11 @@ import pytest
 from click.testing import CliRunner, Result
 from jsonschema import Draft202012Validator
 from pxr import Usd, UsdGeom
-from shots import CLOTH, cloth_shot, command, faults, sample_times
+from shots import CLOTH, cloth_shot
 
 from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
 from physgraph_usd.shot import summary
-from physgraph_usd.shot.frames import frames_folder
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot, refine_shots
 
@@ -44,57 +41,6 @@ def rows_of(file: Path) -> dict[str, dict[str, Any]]:
     plain = json.loads(file.read_text(encoding="utf-8"))
     Draft202012Validator(json.loads(summary.SCHEMA.read_text(encoding="utf-8"))).validate(plain)
     return {Path(row["shot"]).stem: row for row in plain["shots"]}
-
-
-def interrupted(shot: Path, out: Path) -> list[str]:
-    """Begin a shot, interrupt it after a few frames; returns the frames that it finished."""
-    line = [sys.executable, "-m", "physgraph_usd", "refine", shot, "-o", out, "--progress", "--level", "0"]
-    with subprocess.Popen(list(map(str, line)), stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        next(each for each in process.stderr if "2 of" in each)
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
-    return sorted(file.name for file in frames_folder(out).glob("*.npz"))
-
-
-@pytest.mark.slow
-def test_twenty_shots_three_broken_one_there_one_interrupted(tmp_path: Path) -> None:
-    """17 layers, one summary, exit code 3, and nothing is done twice."""
-    out, log = tmp_path / "out", tmp_path / "log"
-    out.mkdir()
-    times = [float(each) for each in range(1, 13)]
-    shots = [cloth_shot(tmp_path / f"s{number:02}.usda", times=(1.0, 2.0)) for number in range(15)]
-    broken = [torn(tmp_path / f"torn{number}.usda") for number in range(3)]
-    there = cloth_shot(tmp_path / "there.usda", times=(1.0, 2.0))
-    stopped = cloth_shot(tmp_path / "stopped.usda", times=times, size=(60, 60))
-    assert run("refine", there, "-o", out / "there.refined.usdc", *SMALL).exit_code == 0
-    before = (out / "there.refined.usdc").stat()
-    finished = interrupted(stopped, out / "stopped.refined.usdc")
-    assert 2 <= len(finished) < len(times)
-
-    line = ("refine", *broken, *shots, there, stopped, "-o", out, "--workers", "2", *SMALL)
-    more = ("--skip-existing", "--resume", "--summary", tmp_path / "summary.json", "--log-file", log)
-    done = command(*line, *more)
-
-    assert done.returncode == 3, done.stderr
-    layers = sorted(out.iterdir())
-    assert len(layers) == 17
-    assert all(layer.name.endswith(".refined.usdc") for layer in layers)
-    assert (out / "there.refined.usdc").stat().st_mtime_ns == before.st_mtime_ns
-    assert sample_times(out / "stopped.refined.usdc") == tuple(times)
-    assert faults(out / "stopped.refined.usdc", stopped) == []
-    rows = rows_of(tmp_path / "summary.json")
-    states = {name: row["state"] for name, row in rows.items()}
-    assert states == dict.fromkeys(rows, "done") | {f"torn{n}": "failed" for n in range(3)} | {"there": "skipped"}
-    assert [rows["torn0"]["exit_code"], rows["there"]["exit_code"], rows["stopped"]["frames"]] == [1, 0, 12]
-    assert any(f"{len(finished)} of 12 frames are those of a run" in each for each in rows["stopped"]["warnings"])
-    assert len(re.findall(r"there.refined.usdc is there", log.read_text())) == 1
-    assert done.stderr.count("shots failed") == 1
-    assert "3 of 20 shots failed" in done.stderr
-
-    again = command(*line, *more)
-    assert again.returncode == 3
-    assert {row["state"] for row in rows_of(tmp_path / "summary.json").values()} == {"skipped", "failed"}
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,15 +45,6 @@ def of_others(refiner: Refiner, frames: list) -> np.ndarray:
     points = [refiner.solve(frame).points[0] for frame in frames][-1]
     assert points is not None
     return points
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["torus", "tshirt"])
-def test_a_frame_by_itself_is_the_same_after_any_other(sample: Callable[[str], Path], name: str):
-    shot = open_shot(str(sample(name)), level=1)
-    frames = [shot.frame(time) for time in shot.scene.times[4::6]][:3]
-    alone, after = (of_others(Refiner(shot.scene, COLD, levels=[1]), each) for each in (frames[-1:], frames))
-    assert np.array_equal(alone, after)
 
 
 @pytest.mark.slow

@@ -27,8 +27,6 @@ FOR_USERS = (
 )  # fmt: skip
 FOR_RESEARCHERS = ("chart", "collisions", "frames", "learned", "solver")
 PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in (*FOR_USERS, *FOR_RESEARCHERS))]
-REPEATED = {"index"}
-"""Pages whose commands another one has too."""
 MOST_WORDS, MOST_WORDS_OF_NOTES = 14_000, 8_000
 MOST_WORDS_OF_README, MOST_WORDS_OF_A_PAGE = 1_200, 2_000
 MOST_BYTES_OF_A_FILM, MOST_BYTES_OF_FILMS = 1_600_000, 6_000_000
@@ -84,11 +82,7 @@ def run_block(block: Block, names: dict[str, object]) -> None:
         assert done.exit_code == 0, f"{line}\n{done.output}"
 
 
-@pytest.mark.parametrize(
-    "page",
-    [pytest.param(page, marks=pytest.mark.slow) if page.stem in REPEATED else page for page in PAGES],
-    ids=lambda page: page.stem,
-)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_code_runs_or_says_why_not(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(ROOT / "plugins")
