@@ -234,7 +234,7 @@ def layer_with(shot: Path, folder: Path, **options: object) -> Path:
 class TestLayers:
     def test_s34_any_number_of_workers_gives_the_same_bytes_without_history(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc")
-        layers = [layer_with(shot, tmp_path / str(n), workers=n, temporal="off") for n in (1, 3)]
+        layers = [layer_with(shot, tmp_path / str(n), workers=n, temporal="off") for n in (1, 2)]
         assert layers[0].read_bytes() == layers[1].read_bytes()
         assert faults(layers[0], shot) == []
 
@@ -262,7 +262,7 @@ class TestLayers:
         assert min(moves) > 2 * max(apart)
         assert sample_times(one) == sample_times(two) == LONG
 
-    @pytest.mark.parametrize("workers", [1, 2])
+    @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
     def test_a_resumed_run_goes_on_as_if_it_had_not_been_interrupted(self, tmp_path: Path, workers: int):
         """What the pre-roll leaves where it goes on is no more than what it leaves between two workers."""
         shot, out = cloth_shot(tmp_path / "shot.usdc", times=LONG), tmp_path / "fine.usdc"

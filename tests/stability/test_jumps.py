@@ -29,7 +29,6 @@ def still(time: float) -> np.ndarray:
 JUMPS = {
     "two metres": lambda points: points + np.array([2.0, 0.0, 0.0]),
     "half a turn": lambda points: (points - points.mean(axis=0)) @ SPIN + points.mean(axis=0),
-    "two metres and half a turn": lambda points: points @ SPIN + [0.0, 2.0, 0.0],
 }
 
 
