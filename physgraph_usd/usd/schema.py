@@ -295,23 +295,24 @@ def fabric_values(fabric: Fabric) -> dict[str, float]:
 
 
 def find_property(text: str) -> Property:
-    """Find a garment property by full name, by name without ``physgraph:`` and ``material:``, or by its last word.
+    """Find a garment's or collider's property by full name, without ``physgraph:`` and ``material:``, or by last word.
 
     Raises:
         UsageError: When there is none, or a word may mean several; the message lists the names.
     """
-    rows = [row for row in GARMENT.values() if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}]
-    if rows:
-        return rows[0]
+    rows = GARMENT | COLLIDER
+    for row in rows.values():
+        if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}:
+            return row
     # "stiffness" is the last word of the guide's alone, but a fabric has three of them.
-    meant = [row for row in (*GARMENT.values(), *COLLIDER.values()) if row.short.lower().endswith(text.lower())]
-    if len(meant) == 1 and meant[0].short in GARMENT and meant[0].name.rsplit(":", 1)[-1] == text:
+    meant = [row for row in rows.values() if row.short.lower().endswith(text.lower())]
+    if len(meant) == 1 and meant[0].name.rsplit(":", 1)[-1] == text:
         return meant[0]
     if len(meant) > 1:
         raise UsageError(f"attribute {text!r} may mean {', '.join(row.short for row in meant)}; write one of them out")
-    near = nearest_property(text, GARMENT.values())
+    near = nearest_property(text, rows.values())
     hint = f"did you mean {near.short}? " if near else ""
-    raise UsageError(f"unknown attribute {text!r}; {hint}known attributes: {', '.join(sorted(GARMENT))}")
+    raise UsageError(f"unknown attribute {text!r}; {hint}known attributes: {', '.join(sorted(rows))}")
 
 
 def nearest_property(text: str, rows: Iterable[Property]) -> Property | None:

@@ -57,7 +57,7 @@ def subdivide(mesh: PolygonMesh) -> Refinement:
     """
     mesh.check_range()
     half = mesh.half_edges
-    polygon = mesh.counts >= 4
+    polygon = mesh.is_polygon
     child_count = np.where(polygon, mesh.counts, np.where(mesh.counts == 3, 4, 0))
     child_size = np.where(polygon, 4, 3)
     starts = np.concatenate([[0], np.cumsum(child_count * child_size, dtype=np.int64)])
@@ -79,8 +79,8 @@ def fine_count(mesh: PolygonMesh, levels: int) -> int:
         levels: Number of subdivisions.
     """
     vertices, edges = mesh.vertex_count, len(mesh.half_edges.edges)
-    larger = mesh.counts >= 4
-    triangles, polygons, corners = int((mesh.counts == 3).sum()), int(larger.sum()), int(mesh.counts[larger].sum())
+    larger = mesh.is_polygon
+    triangles, polygons, corners = int(((mesh.counts == 3) & ~larger).sum()), int(larger.sum()), int(mesh.counts[larger].sum())
     for _ in range(levels):
         vertices += edges + polygons
         edges = 2 * edges + 3 * triangles + corners
@@ -90,7 +90,7 @@ def fine_count(mesh: PolygonMesh, levels: int) -> int:
 
 def _place_triangles(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> None:
     """Write the children of triangles into ``indices``."""
-    faces = np.flatnonzero(mesh.counts == 3)
+    faces = np.flatnonzero((mesh.counts == 3) & ~mesh.is_polygon)
     corners = mesh.starts[faces, None] + np.arange(3)
     a, b, c = mesh.indices[corners].T
     ab, bc, ca = midpoint[corners].T
@@ -100,7 +100,7 @@ def _place_triangles(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray
 
 def _place_quads(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> None:
     """Write the children of polygons into ``indices``."""
-    corners = np.flatnonzero((mesh.counts >= 4)[mesh.corner_face])
+    corners = np.flatnonzero(mesh.is_polygon[mesh.corner_face])
     face = mesh.corner_face[corners]
     quads = np.stack(
         [
@@ -116,8 +116,8 @@ def _place_quads(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, in
 
 
 def face_points(mesh: PolygonMesh) -> np.ndarray:
-    """Child vertex at the centre of each parent face, shape (F,), int32; -1 for faces under four corners."""
-    polygon = mesh.counts >= 4
+    """Child vertex at the centre of each parent face, shape (F,), int32; -1 for faces that get none."""
+    polygon = mesh.is_polygon
     first = mesh.vertex_count + len(mesh.half_edges.edges)
     return np.where(polygon, first + np.cumsum(polygon) - 1, -1).astype(np.int32)
 
@@ -125,9 +125,9 @@ def face_points(mesh: PolygonMesh) -> np.ndarray:
 def _linear(mesh: PolygonMesh) -> sparse.csr_matrix:
     """Stencil of vertices, midpoints and centroids."""
     edges = mesh.half_edges.edges
-    sizes = mesh.counts[mesh.counts >= 4]
+    sizes = mesh.counts[mesh.is_polygon]
     columns = np.concatenate(
-        [np.arange(mesh.vertex_count), edges.reshape(-1), mesh.indices[(mesh.counts >= 4)[mesh.corner_face]]]
+        [np.arange(mesh.vertex_count), edges.reshape(-1), mesh.indices[mesh.is_polygon[mesh.corner_face]]]
     )
     lengths = np.concatenate([np.ones(mesh.vertex_count, np.int64), np.full(len(edges), 2), sizes])
     offsets = np.concatenate([[0], np.cumsum(lengths)])
@@ -268,7 +268,7 @@ def _fixed_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
 def _edge_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Each face's half of the rule of a smooth edge."""
     corners = np.flatnonzero(rules.smooth_edge[mesh.half_edges.edge])
-    polygon = (mesh.counts >= 4)[mesh.corner_face[corners]]
+    polygon = mesh.is_polygon[mesh.corner_face[corners]]
     here, there = mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]
     opposite = mesh.indices[mesh.previous_corner[corners]]
     far = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], opposite)
@@ -287,7 +287,7 @@ def _rim_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
 def _vertex_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Each corner's part of the rule of a smooth vertex."""
     corners = np.flatnonzero(rules.smooth_vertex[mesh.indices])
-    polygon = (mesh.counts >= 4)[mesh.corner_face[corners]]
+    polygon = mesh.is_polygon[mesh.corner_face[corners]]
     here, before = mesh.indices[corners], mesh.previous_corner[corners]
     turn = np.bincount(here, weights=np.where(polygon, 1 / 4, 1 / 6), minlength=mesh.vertex_count)[here]
     valence = np.where(polygon, 4, 6) * turn

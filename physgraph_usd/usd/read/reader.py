@@ -41,7 +41,17 @@ from ..times import merge, snap, within
 from ..view import StageView
 from .authored import authored_faults
 from .bodies import ColliderReader, read_collider
-from .find import felt_by, find_colliders, find_garments, instance_roots, read_apart, with_gravity
+from .find import (
+    colliders_of,
+    disabled_notices,
+    felt_by,
+    find_colliders,
+    find_garments,
+    instance_roots,
+    purpose_notices,
+    read_apart,
+    with_gravity,
+)
 from .garment import GarmentReader, Request, all_times, is_visible, read_garment
 from .materials import find_values
 from .placement import to_metres
@@ -146,7 +156,7 @@ class Shot:
             UsageError: When one cannot be read, or is for no garment.
         """
         asked = parse_overrides(overrides)
-        check_overrides(asked, [source.path for source in self.sources])
+        check_overrides(asked, [source.path for source in self.sources], [Sdf.Path(path) for path in self.colliders])
         other = copy(self)
         found = [
             find_values(self.stage.GetPrimAtPath(source.path), self._request.units, asked) for source in self.sources
@@ -216,8 +226,10 @@ def open_shot(
         check_metadata(stage)
         prims = _find(stage, garments, notices)
         refuse_refined(stage, [prim.GetPath() for prim in prims])
-        check_overrides(asked, [prim.GetPath() for prim in prims])
-        found = find_colliders(stage, prims, colliders)
+        found = find_colliders(stage, prims, colliders, overrides=asked)
+        check_overrides(asked, *([prim.GetPath() for prim in each] for each in (prims, found)))
+        notices += purpose_notices([*prims, *found], [*garments, *colliders, *colliders_of(prims)])
+        notices += disabled_notices(stage, prims, colliders, overrides=asked)
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
         notices += authored_faults(prims, found)
@@ -228,7 +240,7 @@ def open_shot(
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
-        readers, solids = _link(stage, readers, bodies, wanted=colliders, metres=units.metres, notices=notices)
+        readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
         read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
@@ -269,20 +281,23 @@ def _link(
     paths: Sequence[Sdf.Path],
     *,
     wanted: Sequence[str],
-    metres: float,
+    request: Request,
     notices: list[Notice],
 ) -> tuple[list[GarmentReader], list[ColliderReader]]:
     """Garments with the numbers of the colliders that they feel, and these colliders."""
     prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
     cloth = {prim.GetPath() for prim in prims}
-    reachable = felt_by(stage, prims, wanted)
+    reachable = felt_by(stage, prims, wanted, overrides=request.overrides)
     excluded, odd = read_apart(stage, prims)
     notices += odd
     felt = [near - targets.keys() for near, targets in zip(reachable, excluded, strict=True)]
+    times = [reader.source.times[0] if reader.source.times else None for reader in readers]
+    offset = min(reader.values.number("contact:offset", time) for reader, time in zip(readers, times, strict=True))
+    given = {"overrides": request.overrides, "offset": offset}
     bodies = []
     for path in paths:
         if any(path in near for near in felt):
-            body, odd = read_collider(stage.GetPrimAtPath(path), metres)
+            body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, **given)
             notices += odd
             bodies += [body] if body is not None else []
     numbers = {body.prim.GetPath(): number for number, body in enumerate(bodies)}
