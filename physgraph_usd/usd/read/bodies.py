@@ -8,7 +8,7 @@ ellipsoid, becomes a mesh.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Usd, UsdGeom
@@ -44,11 +44,11 @@ UPRIGHT = {
 
 @dataclass(frozen=True, eq=False)
 class _Faces:
-    """Authored arrays of a mesh's topology, the faces drawn from them, and these faces' triangles."""
+    """Authored arrays of a mesh's topology, the faces drawn from them, and their triangles, as authored and turned."""
 
     authored: tuple[np.ndarray, ...]
     drawn: DrawnMesh
-    triangles: np.ndarray
+    wound: tuple[np.ndarray, np.ndarray]
 
     def are_of(self, authored: tuple[np.ndarray, ...]) -> bool:
         return all(map(np.array_equal, self.authored, authored))
@@ -72,6 +72,10 @@ class ColliderReader:
     within: float = DRAWN_NEAR * float(GARMENT["contact:offset"].fallback or 0.0)
     always: bool = False
     _faces: _Faces | None = None
+
+    def on_side(self, side: str) -> ColliderReader:
+        """The same on another side, one of `schema.SIDES`."""
+        return replace(self, collider=replace(self.collider, side=side))
 
     def pose(self, time: float | None, skinned: np.ndarray | None = None) -> tuple[Pose | None, tuple[Notice, ...]]:
         """Pose at a time code, interpolated as USD does; None, with a notice why, where there is none.
@@ -114,12 +118,12 @@ class ColliderReader:
         usable = points.ndim == 2 and points.shape[1] == 3 and len(indices) and counts.sum() == len(indices)
         if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
             return None, (self._out(time, "its points and faces do not fit together"),)
-        flip = self.collider.side in FIXED and is_flipped(self.prim, matrix)
-        faces = self._faces_of(points, (counts, indices, holes, np.array(flip)))
+        faces = self._faces_of(points, (counts, indices, holes))
+        triangles = faces.wound[self.collider.side in FIXED and is_flipped(self.prim, matrix)]
         placed = place(np.where(np.isfinite(points), points, np.nan).astype(np.float64), matrix)
         if skinned is not None and skinned.shape == placed.shape:
             placed = skinned
-        return MeshPose(faces.drawn.place(placed), faces.triangles), self._coarse(faces.drawn)
+        return MeshPose(faces.drawn.place(placed), triangles), self._coarse(faces.drawn)
 
     def _faces_of(self, points: np.ndarray, authored: tuple[np.ndarray, ...]) -> _Faces:
         """The faces that are drawn; the same as last time while the topology is the same.
@@ -128,7 +132,7 @@ class ColliderReader:
         first.
         """
         if self._faces is None or not self._faces.are_of(authored):
-            counts, indices, holes, flip = authored
+            counts, indices, holes = authored
             mesh = UsdGeom.Mesh(self.prim)
             first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
             first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
@@ -136,8 +140,7 @@ class ColliderReader:
             polygons = PolygonMesh(counts, indices, len(points))
             drawn = drawn_mesh(polygons, first, holes=holes, scheme=scheme, within=self.within / self._scale())
             triangles = drawn.mesh.triangulate(drawn.place(first)).triangles
-            triangles = np.ascontiguousarray(triangles[:, ::-1]) if flip else triangles
-            self._faces = _Faces(authored, drawn, triangles)
+            self._faces = _Faces(authored, drawn, (triangles, np.ascontiguousarray(triangles[:, ::-1])))
         return self._faces
 
     def _scale(self) -> float:

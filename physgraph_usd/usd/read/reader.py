@@ -20,6 +20,8 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
+from ...solver.colliders.choose_side import choose_side
+from ...solver.colliders.pose import MeshPose
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
 from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
@@ -241,6 +243,7 @@ def open_shot(
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
+        solids = _with_sides(stage, readers, solids)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
         read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
@@ -309,6 +312,38 @@ def _link(
         garment = replace(reader.garment, colliders=colliders, apart_from=others)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
     return linked, bodies
+
+
+def _with_sides(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader]
+) -> list[ColliderReader]:
+    """Colliders, with sides chosen for open meshes on "auto" by where the cloth is in the first frame of the shot."""
+    asked = [body for body in bodies if (body.collider.kind, body.collider.side) == ("mesh", "auto")]
+    time, cages = _first_cages(stage, readers, asked[0].metres) if asked else (None, [])
+    found = []
+    for number, body in enumerate(bodies):
+        if body in asked:
+            front = body.on_side("front")  # Its faces are wound as they look in the world.
+            pose, _ = front.pose(time)
+            felt = [cage for reader, cage in zip(readers, cages, strict=True) if number in reader.garment.colliders]
+            body = front.on_side(choose_side(pose.points, pose.triangles, felt) if isinstance(pose, MeshPose) else "auto")
+        found.append(body)
+    return found
+
+
+def _first_cages(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float
+) -> tuple[float | None, list[np.ndarray]]:
+    """The first time code of the shot at which all cages can be read, and these [m]; none where there is none."""
+    every = merge(time for reader in readers for time in (*reader.source.times, *reader.source.left_out))
+    for time in every or (None,):
+        try:
+            prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
+            placed = zip(readers, (to_metres(prim, metres, time) for prim in prims), strict=True)
+            return time, [reader.frame(matrix, time)[0].points for reader, matrix in placed]
+        except StageError:
+            continue
+    return None, [np.zeros((0, 3))] * len(readers)
 
 
 def _read(
