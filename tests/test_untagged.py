@@ -33,6 +33,7 @@ UNDER = corners((-1.0, 0.0, -3.0), (5.0, 3.0, -0.4))
 def add_box(stage: Usd.Stage, path: str = "/World/body", points: np.ndarray = UNDER, *, faces: int = 6) -> UsdGeom.Mesh:
     """A box without a mark."""
     mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateSubdivisionSchemeAttr("none")
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray(COUNTS[:faces]))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray(FACES[: 4 * faces]))
     mesh.CreatePointsAttr(vec3(points))

@@ -139,13 +139,14 @@ def _openings(
     total = np.bincount(piece, area, piece.max() + 1)
     face, side = np.nonzero(count[edge] != 2)
     here, there = faces[face, side], faces[face, (side + 1) % 3]
-    used, ends = np.unique(np.stack([here, there]), return_inverse=True)
+    # Rims of two pieces that meet in a vertex are two.
+    places, ends = np.unique(np.stack([here, there]) + piece[face] * len(points), return_inverse=True)
     ends = ends.reshape(2, -1)
-    rims = sparse.coo_matrix((np.ones(len(face), bool), (ends[0], ends[1])), shape=(len(used), len(used)))
-    _, rim = csgraph.connected_components(rims, directed=False)
-    length = np.bincount(rim[ends[0]], np.linalg.norm(points[there] - points[here], axis=1), len(used))
-    owner = np.zeros(len(used), np.int64)
-    owner[rim[ends[0]]] = piece[face]
+    rims = sparse.coo_matrix((np.ones(len(face), bool), (ends[0], ends[1])), shape=(len(places), len(places)))
+    rim_count, rim = csgraph.connected_components(rims, directed=False)
+    length = np.bincount(rim[ends[0]], np.linalg.norm(points[there] - points[here], axis=1), rim_count)
+    owner = np.zeros(rim_count, np.int64)
+    owner[rim] = places // len(points)
     return np.bincount(owner, length**2 / (4.0 * np.pi), len(total)) / np.maximum(total, np.finfo(float).tiny)
 
 

@@ -74,7 +74,7 @@ class ColliderReader:
     _faces: _Faces | None = None
 
     def on_side(self, side: str) -> ColliderReader:
-        """The same on another side, one of `schema.SIDES`."""
+        """Return a reader of the collider on another side, one of `schema.SIDES`."""
         return replace(self, collider=replace(self.collider, side=side))
 
     def pose(self, time: float | None, skinned: np.ndarray | None = None) -> tuple[Pose | None, tuple[Notice, ...]]:

@@ -111,13 +111,17 @@ def felt_by(
 
 def _colliders_named(stage: Usd.Stage, named: Sequence[str], overrides: Sequence[Override]) -> frozenset[Sdf.Path]:
     """Gprims that are named, or else those of every collider of the stage, without the disabled ones."""
-    if named:
-        paths = {path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)}
-    else:
-        marked = (prim for prim in traverse(stage) if _collides(prim))
-        paths = {each.GetPath() for prim in marked for each in _drawn(_below(prim, UsdGeom.Gprim))}
     enabled = COLLIDER["collider:enabled"]
-    return frozenset(path for path in paths if is_on(stage.GetPrimAtPath(path), enabled, overrides))
+    found = _named_or_marked(stage, named)
+    return frozenset(path for path in found if is_on(stage.GetPrimAtPath(path), enabled, overrides))
+
+
+def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
+    """Gprims that are named, or else those of every collider of the stage."""
+    if named:
+        return list(dict.fromkeys(path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)))
+    marked = (prim for prim in traverse(stage) if _collides(prim))
+    return [each.GetPath() for prim in marked for each in _drawn(_below(prim, UsdGeom.Gprim))]
 
 
 def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Notice]:
@@ -133,17 +137,20 @@ def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Not
     return notices
 
 
-def disabled_notices(
+def disabled_colliders(
     stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str], *, overrides: Sequence[Override]
-) -> list[Notice]:
-    """Notices of colliders that are named and disabled."""
-    row, notices = COLLIDER["collider:enabled"], []
-    named = [*wanted] or colliders_of(garments)
-    for path in dict.fromkeys(path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)):
-        enabled = find_value(stage.GetPrimAtPath(path), row, overrides)
+) -> dict[Usd.Prim, Notice]:
+    """Gprims that are named or marked as colliders and are disabled, each with a notice of the attribute that does so.
+
+    Arguments are those of `find_colliders`.
+    """
+    row, found = COLLIDER["collider:enabled"], {}
+    for path in _named_or_marked(stage, [*wanted] or colliders_of(garments)):
+        prim = stage.GetPrimAtPath(path)
+        enabled = find_value(prim, row, overrides)
         if not enabled.at(None):
-            notices.append(Notice(str(path), None, f"no collider, for {row.name} is off, by {enabled.source}"))
-    return notices
+            found[prim] = Notice(str(path), None, f"no collider, for {row.name} is off, by {enabled.source}")
+    return found
 
 
 def colliders_of(garments: Sequence[Usd.Prim]) -> list[str]:

@@ -45,7 +45,7 @@ from .authored import authored_faults
 from .bodies import ColliderReader, read_collider
 from .find import (
     colliders_of,
-    disabled_notices,
+    disabled_colliders,
     felt_by,
     find_colliders,
     find_garments,
@@ -229,11 +229,13 @@ def open_shot(
         prims = _find(stage, garments, notices)
         refuse_refined(stage, [prim.GetPath() for prim in prims])
         found = find_colliders(stage, prims, colliders, overrides=asked)
-        check_overrides(asked, *([prim.GetPath() for prim in each] for each in (prims, found)))
-        notices += purpose_notices([*prims, *found], [*garments, *colliders, *colliders_of(prims)])
-        notices += disabled_notices(stage, prims, colliders, overrides=asked)
+        disabled = disabled_colliders(stage, prims, colliders, overrides=asked)
+        check_overrides(asked, *([prim.GetPath() for prim in each] for each in (prims, [*found, *disabled])))
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
+        named = [*colliders] or colliders_of(prims)
+        notices += disabled.values() if named else ()
+        notices += purpose_notices([*prims, *found], [*garments, *named])
         notices += authored_faults(prims, found)
         units, odd = read_units(stage)
         units = with_gravity(units, prims, gravity)
