@@ -105,17 +105,17 @@ def _judged(
     start_warp()
     body = MeshBody(device="cpu", threads=1)
     for index, pose in poses:
-        cages = zip(garments, frames[index].garments, strict=True)
-        fractions = {g.path: _fraction_at(body, pose, g, cage.points) for g, cage in cages if isinstance(pose, MeshPose)}
-        shares = {garment: fraction for garment, fraction in fractions.items() if fraction}
-        if shares and isinstance(pose, MeshPose):
-            most = max(shares, key=lambda garment: shares[garment])
-            number = next(number for number, garment in enumerate(garments) if garment.path == most)
-            later = [(frames[k].garments[number], other) for k, other in poses]
-            cloth = frames[index].garments[number]
-            if _moves_with(garments[number], [(cloth, pose), *later]):
-                return Candidate(path, f"it lies on <{most}> and moves with it: a trim, or the garment's own skin")
-            where = f"{shares[most]:.0%} of <{most}> is inside or within {1e3 * NEAR:.0f} mm"
+        cages = [cage.points for cage in frames[index].garments]
+        fractions = [_fraction_at(body, pose, *each) for each in zip(garments, cages, strict=True)]
+        if any(fractions):
+            most = int(np.argmax(fractions))
+            garment = garments[most]
+            seen = [(index, pose), *poses]
+            if _moves_with(garment, [(frames[k].garments[most], each) for k, each in seen]):
+                why = f"it lies on <{garment.path}> and moves with it: a trim, or the garment's own skin"
+                return Candidate(path, why)
+            where = f"{fractions[most]:.0%} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
+            shares = {g.path: fraction for g, fraction in zip(garments, fractions, strict=True) if fraction}
             return Candidate(path, where + at_time(frames[index].time), shares, pose)
     return Candidate(path, f"{FAR} in {counted(len(frames), 'frame')}")
 
@@ -227,7 +227,7 @@ def _strained(
             yield source.sources["rest"], strained_parts(garment, cages, source.subsets, up=-shot.scene.gravity)
 
 
-def _fraction_at(body: MeshBody, pose: MeshPose, garment: Garment, cage: np.ndarray) -> float:
+def _fraction_at(body: MeshBody, pose: Pose, garment: Garment, cage: np.ndarray) -> float:
     """Fraction of a cage's vertices that is in a body's closed part or near it or its open part.
 
     Args:
@@ -241,7 +241,7 @@ def _fraction_at(body: MeshBody, pose: MeshPose, garment: Garment, cage: np.ndar
         is not touched.
     """
     fraction, edges = 0.0, torch.as_tensor(garment.mesh.half_edges.edges)
-    for surface in body.pose(pose):
+    for surface in body.pose(pose) if isinstance(pose, MeshPose) else ():
         signed = signed_distances(surface, torch.as_tensor(cage - surface.origin), edges, reach=2.0 * NEAR)
         touches = (signed.abs() <= NEAR).any() or ((signed < 0).any() and (signed > 0).any())
         fraction = max(fraction, float((signed <= NEAR).double().mean())) if bool(touches) else fraction

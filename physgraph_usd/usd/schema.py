@@ -31,8 +31,11 @@ CONTACT, PAINTED, COLLISION = "Contact", "Painted Maps", "Collider"
 SIDES = ("auto", "winding", "start", "front", "back")
 """Rules for the side of a mesh on which cloth belongs.
 
-"auto": outside of pieces that are closed, and of the others the side on which the coarse cloth around a vertex is.
-"winding": outside of every piece, closed or not, by the generalised winding number.
+"auto": outside of pieces that are closed. An open mesh is on "winding" where it has pieces with an inside and most of
+the cloth is outside of them, on "front" or "back" where it is a floor or a wall with the cloth on that side; else cloth
+belongs where the coarse cloth around a vertex is.
+"winding": outside of pieces that are closed or have openings of at most half their own area, by the generalised
+winding number; of the others the side on which the coarse cloth is.
 "start": the side on which the coarse cloth is, of every piece, closed or not.
 "front", "back": that side of the authored faces of open pieces; outside of closed ones.
 """
@@ -254,7 +257,8 @@ PROPERTIES: tuple[Property, ...] = (
     _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 where the fine cloth follows the coarse cloth exactly."),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
-        "Whether garments collide with this prim.", "Collide", COLLISION, uniform=True,
+        "Whether garments collide with this prim; where nothing says so, they do where it is visible.",
+        "Collide", COLLISION, uniform=True,
     ),
     Property(
         COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, 10.0,
@@ -262,8 +266,9 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         COLLIDER_API, "physgraph:collider:side", "token", "auto", "", None, None,
-        "Where cloth belongs: auto, outside closed parts and where the coarse cloth is at open ones; winding, outside "
-        "by the winding number; start, where the coarse cloth is; front or back, that side of the faces of open parts.",
+        "Where cloth belongs: auto, outside closed parts, and at open ones as their shape and the coarse cloth tell; "
+        "winding, outside by the winding number; start, where the coarse cloth is; front or back, that side of the "
+        "faces of open parts.",
         "Side", COLLISION, uniform=True, tokens=SIDES,
     ),
     *_material(MATERIAL_API, fallbacks=False),

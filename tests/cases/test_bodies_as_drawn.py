@@ -15,7 +15,7 @@ from stages import COLLIDER_API, author, new_stage, save, vec3
 from physgraph_usd.errors import UsageError
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.colliders.mesh import MeshBody
-from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.pose import MeshPose, Pose
 from physgraph_usd.usd.read.reader import open_shot
 
 Faces = list[list[int]]
@@ -53,7 +53,7 @@ def spline(count: int, *, parts: int) -> np.ndarray:
     weights = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1) / 6.0
     rows = np.zeros((count, parts, count))
     for start in range(count):
-        np.add.at(rows[start], (slice(None), (start + np.arange(-1, 3)) % count), weights)
+        rows[start][:, (start + np.arange(-1, 3)) % count] = weights
     return rows.reshape(-1, count)
 
 
@@ -90,7 +90,7 @@ def stage(tmp_path: Path) -> Usd.Stage:
     return made
 
 
-def felt(stage: Usd.Stage, *colliders: str, time: float = 1.0, **options) -> tuple[list[str], list[MeshPose | None], str]:
+def felt(stage: Usd.Stage, *colliders: str, time: float = 1.0, **options) -> tuple[list[str], list[Pose | None], str]:
     """Colliders of a shot, their poses, and its warnings."""
     with closing(open_shot(save(stage), garments=[SKIRT], colliders=colliders, **options)) as shot:
         poses = shot.frame(time).colliders
@@ -260,7 +260,7 @@ class TestAuto:
         add(stage, "/World/guide", capped(1.2 * RADIUS, -0.1, 0.3)).CreatePurposeAttr("guide")
         add(stage, "/World/hidden", capped(RADIUS, -0.2, 0.3)).CreateVisibilityAttr("invisible")
         crate, sides = capped(0.5, 0.0, 1.0)
-        add(stage, "/World/crate", (crate + [9.0, 0.0, 0.0], sides))
+        add(stage, "/World/crate", (crate + np.array([9.0, 0.0, 0.0]), sides))
 
     def test_inspect_says_why_each_is_taken_or_left(self, stage: Usd.Stage):
         found = inspect_shot(save(stage), garments=(SKIRT,))
@@ -281,9 +281,9 @@ class TestAuto:
 def test_a_body_touched_in_one_frame_of_ten_is_taken(tmp_path: Path):
     stage = new_stage(tmp_path / "shot.usda")
     points, faces = tube(RADIUS, 0.0, 0.2)
-    add_moving(stage, SKIRT, (points, faces), *(points + [0.5 * (time == 3), 0.0, 0.0] for time in range(10)))
+    add_moving(stage, SKIRT, (points, faces), *(points + np.array([0.5 * (time == 3), 0.0, 0.0]) for time in range(10)))
     shelf, sides = capped(RADIUS, 0.05, 0.3)
-    add(stage, BODY, (shelf + [0.65, 0.0, 0.0], sides))
+    add(stage, BODY, (shelf + np.array([0.65, 0.0, 0.0]), sides))
     found = inspect_shot(save(stage), garments=(SKIRT,))["candidates"]
     assert list(found) == [BODY]
     assert found[BODY].endswith("at time code 4")

@@ -80,7 +80,8 @@ def fine_count(mesh: PolygonMesh, levels: int) -> int:
     """
     vertices, edges = mesh.vertex_count, len(mesh.half_edges.edges)
     larger = mesh.is_polygon
-    triangles, polygons, corners = int(((mesh.counts == 3) & ~larger).sum()), int(larger.sum()), int(mesh.counts[larger].sum())
+    triangles = int(((mesh.counts == 3) & ~larger).sum())
+    polygons, corners = int(larger.sum()), int(mesh.counts[larger].sum())
     for _ in range(levels):
         vertices += edges + polygons
         edges = 2 * edges + 3 * triangles + corners

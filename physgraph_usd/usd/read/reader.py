@@ -322,14 +322,14 @@ def _with_sides(
     """Colliders, with sides chosen for open meshes on "auto" by where the cloth is in the first frame of the shot."""
     asked = [body for body in bodies if (body.collider.kind, body.collider.side) == ("mesh", "auto")]
     time, cages = _first_cages(stage, readers, asked[0].metres) if asked else (None, [])
-    found = []
+    found = [*bodies]
     for number, body in enumerate(bodies):
         if body in asked:
             front = body.on_side("front")  # Its faces are wound as they look in the world.
             pose, _ = front.pose(time)
             felt = [cage for reader, cage in zip(readers, cages, strict=True) if number in reader.garment.colliders]
-            body = front.on_side(choose_side(pose.points, pose.triangles, felt) if isinstance(pose, MeshPose) else "auto")
-        found.append(body)
+            side = choose_side(pose.points, pose.triangles, felt) if isinstance(pose, MeshPose) else "auto"
+            found[number] = front.on_side(side)
     return found
 
 
