@@ -153,6 +153,22 @@ class TestSmoothBodies:
         assert np.quantile(away, 0.95) < 2e-4  # A tenth of the contact offset.
         assert away.max() < 5e-4
 
+    def test_creases_and_corners_stay(self, stage: Usd.Stage):
+        """A tube with caps whose rims are creases for ever, and one of whose rims' points is a corner."""
+        points, faces = capped(RADIUS, -0.1, 0.3)
+        mesh = add(stage, BODY, (points, faces), scheme="catmullClark")
+        rims = [[*range(16), 0], [*range(len(points) - 16, len(points)), len(points) - 16]]
+        mesh.CreateCreaseIndicesAttr([*rims[0], *rims[1]])
+        mesh.CreateCreaseLengthsAttr([17, 17])
+        mesh.CreateCreaseSharpnessesAttr([10.0, 10.0])
+        mesh.CreateCornerIndicesAttr([0])
+        mesh.CreateCornerSharpnessesAttr([10.0])
+        _, (pose,), _ = felt(stage, BODY)
+        assert isinstance(pose, MeshPose)
+        used = pose.points[np.unique(pose.triangles)]
+        assert (used[:, 1].min(), used[:, 1].max()) == pytest.approx((-0.1, 0.3), abs=1e-6)
+        assert np.linalg.norm(used - points[0], axis=1).min() < 1e-6
+
     @pytest.mark.parametrize(("scheme", "triangles"), [("none", 60), ("bilinear", 60)])
     def test_flat_faces_stay(self, stage: Usd.Stage, scheme: str, triangles: int):
         add(stage, BODY, self.torus(), scheme=scheme)

@@ -202,12 +202,14 @@ class _Rules:
     """Which smooth rule holds where."""
 
     smooth_edge: np.ndarray  # (E,) the two faces decide
-    boundary: np.ndarray  # (E,) one face only
+    boundary: np.ndarray  # (E,) one face only, or a crease
     smooth_vertex: np.ndarray  # (V,) all faces decide
     rim_vertex: np.ndarray  # (V,) cubic B-spline along two boundary edges
 
 
-def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
+def smooth(
+    mesh: PolygonMesh, refinement: Refinement, *, creased: np.ndarray | None = None, corners: np.ndarray | None = None
+) -> sparse.csr_matrix:
     """Build the smooth placement of the same child vertices.
 
     Among triangles these are Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and among polygons
@@ -216,17 +218,19 @@ def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
     or a fourth: with s the sum of them the rules are evaluated at valence 6 s and 4 s, and each corner adds its part.
     That is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) where s = 1, and the pure rule among one kind.
 
-    Boundaries are cubic B-splines. Fixed are: vertices with one face, with three or more boundary edges, on
-    non-manifold edges or between several fans, and isolated ones.
+    Boundaries and creases are cubic B-splines. Fixed are: vertices with one face, with three or more edges on
+    boundaries and creases, on non-manifold edges or between several fans, isolated ones, and corners.
 
     Args:
         mesh: The parent.
         refinement: Its subdivision, from :func:`subdivide`.
+        creased: Whether each edge is a sharp crease, shape (E,), bool; None without.
+        corners: Whether each vertex is a sharp corner, shape (V,), bool; None without.
 
     Returns:
         Stencil, shape (V_child, V_parent), float64; rows sum to 1.
     """
-    rules = _rules(mesh)
+    rules = _rules(mesh, creased, corners)
     parts = [_fixed_part(mesh, rules), _edge_part(mesh, rules), _rim_part(mesh, rules), _vertex_part(mesh, rules)]
     rows, columns, weights = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     size = refinement.mesh.vertex_count
@@ -234,15 +238,17 @@ def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
     return average @ refinement.linear
 
 
-def _rules(mesh: PolygonMesh) -> _Rules:
+def _rules(mesh: PolygonMesh, creased: np.ndarray | None, corners: np.ndarray | None) -> _Rules:
     """Classify edges and vertices."""
     half, size = mesh.half_edges, mesh.vertex_count
     proper = half.edges[:, 0] != half.edges[:, 1]
     manifold = half.count <= 2
     boundary = (half.count == 1) & proper
+    boundary = boundary if creased is None else boundary | (creased & proper & manifold)
     faces = np.bincount(mesh.indices, minlength=size)
     at_rim = np.bincount(half.edges[boundary].reshape(-1), minlength=size)
     fixed = (faces < 2) | (at_rim > 2) | (mesh.fan_counts > 1)
+    fixed = fixed if corners is None else fixed | corners
     fixed[half.edges[~manifold].reshape(-1)] = True
     rim_vertex = (at_rim == 2) & ~fixed
     return _Rules(proper & manifold & ~boundary, boundary, ~fixed & ~rim_vertex, rim_vertex)

@@ -15,7 +15,7 @@ from pxr import Usd, UsdGeom
 
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
-from ...solver.mesh.drawn import MOST_VERTICES, DrawnMesh, drawn_mesh
+from ...solver.mesh.drawn import MOST_VERTICES, Cage, DrawnMesh, drawn_mesh
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import Override, find_token, find_value
@@ -137,8 +137,8 @@ class ColliderReader:
             first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
             first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
             scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
-            polygons = PolygonMesh(counts, indices, len(points))
-            drawn = drawn_mesh(polygons, first, holes=holes, scheme=scheme, within=self.within / self._scale())
+            cage = _cage_of(mesh, PolygonMesh(counts, indices, len(points)))
+            drawn = drawn_mesh(cage, first, holes=holes, scheme=scheme, within=self.within / self._scale())
             triangles = drawn.mesh.triangulate(drawn.place(first)).triangles
             self._faces = _Faces(authored, drawn, (triangles, np.ascontiguousarray(triangles[:, ::-1])))
         return self._faces
@@ -221,6 +221,25 @@ def read_collider(
 
 def _is_invisible(prim: Usd.Prim, time: float | None) -> bool:
     return UsdGeom.Imageable(prim).ComputeVisibility(timecode(time)) == UsdGeom.Tokens.invisible
+
+
+def _cage_of(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> Cage:
+    """The faces with their creases and corners, without those whose arrays do not fit together."""
+    ends, sharpness = np.zeros((0, 2), np.int32), np.zeros(0)
+    attributes = (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr(), mesh.GetCreaseSharpnessesAttr())
+    indices, lengths, given = (_array(attribute, None) for attribute in attributes)
+    if len(lengths) and lengths.min() >= 2 and lengths.sum() == len(indices):
+        chain = np.repeat(np.arange(len(lengths)), lengths)
+        along = np.flatnonzero(chain[1:] == chain[:-1])
+        given = given[chain[along]] if len(given) == len(lengths) else given  # One a crease, or one an edge.
+        if len(given) == len(along):
+            ends, sharpness = np.stack([indices[along], indices[along + 1]], axis=1), given
+    corners = np.zeros(polygons.vertex_count)
+    places, given = (_array(each, None) for each in (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()))
+    if len(places) == len(given):
+        inside = (places >= 0) & (places < len(corners))
+        corners[places[inside]] = given[inside]
+    return Cage.of(polygons, edges=ends, creases=sharpness, corners=corners)
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
