@@ -206,15 +206,11 @@ def test_s32_a_number_of_points_that_varies_is_refused_with_prim_and_time(tmp_pa
         shot.frame(2.0)
 
 
-@pytest.mark.parametrize("time", [None, 2.0])
-def test_singular_matrices_are_refused_with_prim_and_time(tmp_path: Path, time: float | None) -> None:
+def test_singular_matrices_are_refused_with_prim_and_time(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda")
     add_sheet(stage)
-    if time is not None:
-        set_matrix(stage.GetPrimAtPath("/World"), np.eye(4), 1.0)
-    set_matrix(stage.GetPrimAtPath("/World"), np.diag([1.0, 0.0, 1.0, 1.0]), time)
-    when = "1" if time is None else "2"
-    with pytest.raises(GarmentError, match=rf"</World/cloth> at time code {when}: .* singular.*scale other than zero"):
+    set_matrix(stage.GetPrimAtPath("/World"), np.diag([1.0, 0.0, 1.0, 1.0]), None)
+    with pytest.raises(GarmentError, match=r"</World/cloth> at time code 1: .* singular.*scale other than zero"):
         open_shot(save(stage))
 
 

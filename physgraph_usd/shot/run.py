@@ -19,6 +19,7 @@ from ..usd.view import Layer
 from ..usd.write.chunk import Chunk, chunk_of
 from ..usd.write.writer import LayerWriter
 from .chunks import PREROLL, solve_in_chunks
+from .cuts import Cuts
 from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
@@ -109,6 +110,11 @@ class Run:
         levels = [garment["level"] for garment in self.report.garments]
         return ShotSolver(self.shot.path, levels, options, opened=self.shot)
 
+    @cached_property
+    def _cuts(self) -> Cuts:
+        """Jumps of the garments, across which no velocity is taken."""
+        return Cuts(self.shot, velocities=self.options.velocities)
+
     @property
     def _preroll(self) -> int:
         """Frames solved before a chunk, where frames depend on one another."""
@@ -187,8 +193,13 @@ class Run:
             self.report.failed[name] = error
             self.report.warn(WARNINGS["failed"](name=name, error=error))
             return 0.0
-        start = clock.perf_counter()
-        writer.write(outcome.time, outcome.points, changed=[not reused for reused in outcome.reused], heat=outcome.heat)
+        start, records = clock.perf_counter(), self.report.frames
+        how = {
+            "changed": [not reused for reused in outcome.reused],
+            "cuts": self._cuts(records[-2:]),
+            "heat": outcome.heat,
+        }
+        writer.write(outcome.time, outcome.points, **how)
         return clock.perf_counter() - start
 
 

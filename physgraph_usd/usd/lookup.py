@@ -16,7 +16,7 @@ from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
 from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, find_property
-from .stage import in_brief, timecode
+from .stage import at_time, in_brief, timecode
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
 _WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0}
@@ -208,6 +208,8 @@ def read_number(attribute: Usd.Attribute, time: float | None) -> float:
     if resolved in {Usd.ResolveInfoSourceNone, Usd.ResolveInfoSourceFallback}:  # samples only, asked for the default
         code = Usd.TimeCode.EarliestTime()
     value = attribute.Get(code)
+    if value is None:
+        raise SchemaError(f"{source_name(attribute)}{at_time(time)} is blocked; author a value there, or none at all")
     if not isinstance(value, bool | int | float):
         kind = attribute.GetTypeName()
         raise SchemaError(f"{source_name(attribute)} is {in_brief(value)} of type {kind}; a single number is needed")

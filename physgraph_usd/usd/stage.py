@@ -77,9 +77,20 @@ def timecode(time: float | None) -> Usd.TimeCode:
 
 
 def value_at(attribute: Usd.Attribute, time: float | None) -> Any:
-    """An attribute's value at a time code, or its first sample where it has none there."""
+    """An attribute's value at a time code, None where it is blocked.
+
+    At the default, at which a shot is read whose garments have no samples, it may be the first sample.
+    """
     value = attribute.Get(timecode(time))
-    return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
+    return first_value(attribute) if value is None and time is None else value
+
+
+def first_value(attribute: Usd.Attribute) -> Any:
+    """An attribute's first sample that is neither blocked nor empty, or its default where it has no samples."""
+    first = attribute.Get(Usd.TimeCode.EarliestTime())
+    others = attribute.GetTimeSamples()[1:] if first is None or np.size(first) == 0 else ()
+    later = (attribute.Get(time) for time in others)
+    return next((value for value in later if value is not None and np.size(value)), first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +108,7 @@ class GarmentSource:
         apart_from: Colliders and garments that it is kept apart from, by path, and what excludes each.
         left_out: Its own authored times outside the range, where the layer holds it still.
         velocities: Whether the shot has velocities for it.
+        absent: Its own authored times in range at which it has no shape, ascending; the layer has blocks there.
         subsets: Faces of the cage in each GeomSubset, by its name.
         words: Words in the names of the prim, the prim above it, its materials, and subsets that cover most of it.
     """
@@ -113,6 +125,7 @@ class GarmentSource:
     velocities: bool = False
     subsets: dict[str, np.ndarray] = field(default_factory=dict)
     words: tuple[str, ...] = ()
+    absent: tuple[float, ...] = ()
 
     @property
     def left_out_words(self) -> str:

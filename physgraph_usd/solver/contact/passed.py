@@ -15,6 +15,7 @@ from ..colliders.orient import pieces_of
 from ..colliders.pose import Collider, MeshPose, ShapePose
 from ..colliders.sweep import Sweep, through_shape
 from ..scene import Frame, Garment
+from ..strain import has_collapsed
 
 
 class Passed:
@@ -46,6 +47,9 @@ class Passed:
         found = []
         for index, garment in enumerate(self._garments):
             ways = last.garments[index].points, frame.garments[index].points
+            if any(has_collapsed(garment, points) for points in ways):  # It is not there.
+                found.append({})
+                continue
             counts = {self._colliders[body].path: self._count(body, last, frame, ways) for body in garment.colliders}
             found.append({path: count for path, count in counts.items() if count})
         return found

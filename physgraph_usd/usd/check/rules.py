@@ -14,12 +14,13 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ...solver.mesh.topology import PolygonMesh
 from ..provenance import METADATA, mute_refined, read_record
+from ..read.absence import absence
 from ..read.authored import beyond_limits
 from ..read.skinning import skel_root
 from ..stage import at_time, paths_in, root_metadata, timecode
 from ..times import SAME_TIME, garment_times
 from ..view import StageView
-from ..write.chunk import read_chunk
+from ..write.chunk import read_chunk, samples_and_blocks
 from ..write.normals import VertexNormals
 from ..write.overs import EMPTIED
 from ..write.primvars import STALE
@@ -393,7 +394,11 @@ def is_mesh(path: str, composed: Usd.Stage) -> str:
 def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:
     """Samples lie at the shot's own times, and the fine mesh is about where and as large as the coarse one."""
     name = str(target.AppendProperty("points"))
-    written = list(layer.ListTimeSamplesForPath(name))
+    written, _ = samples_and_blocks(layer, name)
+    for time in written:
+        if reason := absence(coarse, time):
+            yield _error(f"is a sample at a time at which the garment is not there: {reason}", name, time)
+            return
     if skel_root(coarse) is not None:  # A skeleton may move it; then its points are a bind pose.
         return
     authored = np.array(garment_times(coarse))

@@ -14,6 +14,7 @@ from ...errors import LayerError
 from ..provenance import read_record, recorded_shot
 from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
 from ..view import StageView
+from ..write.chunk import samples_and_blocks
 from .rules import LAYER_RULES, RULES, Fine, Problem, against_shot, is_mesh, same_metadata, same_variants, subsets
 from .validators import PLUGIN
 
@@ -89,7 +90,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
 
 def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coarse: Usd.Prim) -> Iterator[Problem]:
     """Run the rules for one garment; for subsets that break a rule in the shot already there is a warning."""
-    written = list(layer.ListTimeSamplesForPath(prim.GetPath().AppendProperty("points")))
+    written, _ = samples_and_blocks(layer, str(prim.GetPath().AppendProperty("points")))
     if samples is not None and len(written) > samples:
         written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
     fine = Fine(prim, layer, (None, *written))

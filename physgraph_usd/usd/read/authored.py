@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ..lookup import USER_PROPERTIES, bound_materials, connected, find_value, is_within, with_ancestors
+from ..lookup import USER_PROPERTIES, bound_materials, connected, find_value, is_within, nearest, with_ancestors
 from ..schema import COLLIDER_API, GARMENT_API, MATERIAL, PROPERTIES, Property, nearest_property
 from ..stage import Notice
 from ..write.track import HEAT, PREFIX
@@ -34,7 +34,23 @@ def authored_faults(garments: Sequence[Usd.Prim], colliders: Sequence[Usd.Prim])
     for schema, prims in ((GARMENT_API, garments), (COLLIDER_API, colliders)):
         for attribute, fault, _ in (each for prim in prims for each in beyond_limits(prim, schema)):
             notices[Notice(str(attribute.GetPrim().GetPath()), None, f"{attribute.GetName()} {fault}")] = None
+        for prim in prims:
+            for attribute in _animated_in_vain(prim, schema):
+                message = f"{attribute.GetName()} changes in time; its first sample is used throughout"
+                notices[Notice(str(attribute.GetPrim().GetPath()), None, message)] = None
     return list(notices)
+
+
+def _animated_in_vain(prim: Usd.Prim, schema: str) -> Iterator[Usd.Attribute]:
+    """Attributes of a garment or collider that are read once, yet have samples that differ."""
+    for row in PROPERTIES:
+        once = row.uniform or row.interpolation or schema == COLLIDER_API
+        if row.schema != schema or row.type == "rel" or not once:
+            continue
+        attribute = _source(prim, row) if row.interpolation else nearest(prim, row.name)
+        times = [] if attribute is None else attribute.GetTimeSamples()
+        if attribute is not None and any(attribute.Get(time) != attribute.Get(times[0]) for time in times[1:]):
+            yield attribute
 
 
 def _unread_on(prim: Usd.Prim, *, material: bool) -> Iterator[Notice]:

@@ -21,6 +21,7 @@ from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import Override, find_token, find_value
 from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
+from .absence import missing_value
 from .placement import is_flipped, place
 
 DRAWN_NEAR = 0.1
@@ -88,6 +89,10 @@ class ColliderReader:
             message = f"no collider where it is invisible, unless {COLLIDER['collider:enabled'].name} is set to true"
             return None, (Notice(self.collider.path, None, message),)
         matrix = self._matrix(timecode(time))
+        if time is not None and (why := missing_value(self.prim, time)):
+            return None, (self._out(time, why),)
+        if not matrix[:3, :3].any():
+            return None, (self._out(time, "its transform to the world scales it to nothing"),)
         if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
             return None, (self._out(time, "its transform to the world is not an affine one"),)
         if self.collider.kind == "mesh":
@@ -243,7 +248,7 @@ def _cage_of(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> Cage:
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
-    """An attribute's array at a time code, or its first."""
+    """An attribute's array at a time code; empty where there is none."""
     value = value_at(attribute, time)
     return np.zeros(0, np.int32) if value is None else np.asarray(value)
 
@@ -256,8 +261,8 @@ def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.n
 
     def number(name: str, fallback: float) -> float:
         attribute = prim.GetAttribute(name)
-        value = attribute.Get(timecode(time)) if attribute else None
-        if value is None:
+        value = value_at(attribute, time) if attribute else None
+        if value is None and not (attribute and attribute.GetNumTimeSamples()):
             return fallback
         return float(value) if isinstance(value, int | float) else np.nan
 

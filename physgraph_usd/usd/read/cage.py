@@ -19,6 +19,7 @@ from pxr import Usd, UsdGeom
 from ...errors import GarmentError, counted
 from ...solver.mesh.topology import PolygonMesh
 from ..stage import Notice, value_at
+from .absence import missing_value
 
 _CONTROLS = {
     "subdivisionScheme": ("catmullClark", "loop", "bilinear", "none"),
@@ -92,7 +93,9 @@ def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
         return
     first = read_integers(attribute, times[0])
     for time in samples:
-        if times[0] < time <= times[-1] and not np.array_equal(first, read_integers(attribute, time)):
+        if not times[0] < time <= times[-1] or np.array_equal(first, read_integers(attribute, time)):
+            continue
+        if not missing_value(attribute.GetPrim(), time):
             message = f"{attribute.GetName()} changes: the topology of a garment must stay the same over the shot"
             raise GarmentError(str(attribute.GetPrim().GetPath()), message, time=time, remedy=_SPLIT)
 
@@ -230,7 +233,7 @@ class PointReader:
         at = -np.inf if time is None else time
         earlier = [each for each in reversed(self._times) if each < at]
         for each in (*earlier, *(later for later in self._times if later > at)):
-            points = self._raw(each)
+            points = self._raw(each) if self._attribute.Get(each) else np.zeros((0, 3))  # It may be blocked there.
             if len(points) == self.count and np.isfinite(points).all():
                 return points
         return None

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ...errors import SchemaError
+from ...errors import GarmentError, SchemaError
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import Garment, GarmentFrame
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
 from ..times import garment_times, merge, transform_times, within
+from .absence import Samples, absence
 from .cage import PointReader, read_cage
 from .grain import read_grain
 from .materials import Values, find_values
@@ -77,9 +78,22 @@ class GarmentReader:
     edges: np.ndarray
     notices: list[Notice] = field(default_factory=list)
 
-    def frame(self, matrix: np.ndarray, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
-        """The garment at a time code, and notices of repairs; ``matrix`` is local to world metres, shape (4, 4)."""
-        local, notices = self.points.read(time, self.edges)
+    def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
+        """The garment at a time code, and notices of repairs.
+
+        A garment that is not there is all at one place, where nothing is near it: other garments may have a frame.
+
+        Args:
+            prim: Its mesh prim.
+            metres: Length of one stage unit [m].
+            time: Time code, or None for the default.
+        """
+        notices: tuple[Notice, ...] = ()
+        if time is not None and absence(prim, time):
+            points = np.broadcast_to(self.garment.rest.mean(axis=0), self.garment.rest.shape)
+        else:
+            local, notices = self.points.read(time, self.edges)
+            points = place(local, to_metres(prim, metres, time))
         names = ("guide:stiffness", "refine:detail", "contact:offset")
         guide, detail, offset = (self.values.number(name, time) for name in names)
         fabric, most = self.values.fabric(time), float(np.linalg.norm(np.ptp(self.garment.rest, axis=0))) / _THICK
@@ -88,23 +102,29 @@ class GarmentReader:
             message += f" {1e3 * fabric.thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
             notices = (*notices, Notice(self.garment.path, None, message))
         fabric, offset = replace(fabric, thickness=min(fabric.thickness, most)), min(offset, most)
-        return GarmentFrame(place(local, matrix), fabric, guide, detail, offset), notices
+        return GarmentFrame(points, fabric, guide, detail, offset), notices
 
 
-def all_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
-    """Every authored time code of a garment; a skinned one has its skeleton's, samples added by baking do not count."""
+def samples_of(prim: Usd.Prim, bake: Bake) -> Samples:
+    """Authored time codes of a garment; a skinned one has its skeleton's, samples added by baking do not count."""
     skinned = bake.skinned.get(prim.GetPath())
-    return merge([*skinned.times, *transform_times(prim)]) if skinned else garment_times(prim)
+    times = merge([*skinned.times, *transform_times(prim)]) if skinned else garment_times(prim)
+    samples = Samples.of(prim, times)
+    if times and not samples.times:
+        time, reason = next(iter(samples.absent.items()))
+        message, remedy = f"{reason}; it is there at no time code", "give it points and a scale other than zero"
+        raise GarmentError(str(prim.GetPath()), message, time=time, remedy=remedy)
+    return samples
 
 
-def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) -> GarmentReader:
+def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, request: Request) -> GarmentReader:
     """Read a garment from its mesh prim; ``roots`` are the instances that hold it on the stage as opened.
 
     Raises:
         GarmentError: When the garment is broken.
         SchemaError: When one of its values cannot be used.
     """
-    every = all_times(prim, request.bake)
+    every = samples.times
     times, first = within(every, request.frames), every[0] if every else None
     points = PointReader(prim, times[0] if times else None)
     cage = read_cage(prim, points.count, times)
@@ -114,7 +134,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
     animation = _animation(prim, points, request, edges=edges, every=every, times=times)
     rest = _rest(prim, cage.mesh, animation, request, matrix=matrix)
     bent, odd = rests_bent(prim)
-    notices = [*cage.notices, *odd, *placement]
+    absent = within(samples.absent, request.frames)
+    notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     self_contact, layer, raises, level = _constants(prim, request)
     painted, cut = _painted(prim, points.count, notices, values=values)
@@ -136,7 +157,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], request: Request) ->
         sources | values.sources | {"refine:level": level.source},
         values.animated,
         left_out=tuple(time for time in every if time not in times),
-        velocities=bool(UsdGeom.Mesh(prim).GetVelocitiesAttr().Get(Usd.TimeCode.EarliestTime())),
+        absent=absent,
+        velocities=has_velocities(prim, points.count),
         subsets=(subsets := _subsets(prim, cage.kept_faces)),
         words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(cage.kept_faces)]),
     )
@@ -169,6 +191,13 @@ def _constants(prim: Usd.Prim, request: Request) -> list[Found]:
     if request.level is not None and level.source != "--set":
         level = Found(level.row, "--level", None, request.level)
     return [*others, level]
+
+
+def has_velocities(prim: Usd.Prim, count: int) -> bool:
+    """Whether a mesh has velocities of as many points, by default or at any of its samples."""
+    attribute = UsdGeom.Mesh(prim).GetVelocitiesAttr()
+    codes = (Usd.TimeCode.Default(), *map(Usd.TimeCode, attribute.GetTimeSamples()))
+    return any(len(attribute.Get(code) or ()) == count for code in codes)
 
 
 def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:

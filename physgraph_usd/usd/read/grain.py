@@ -14,6 +14,7 @@ from pxr import Tf, Usd, UsdGeom
 
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import Grain
+from ..stage import first_value
 
 SKEWED = 1.5
 """Ratio of the two stretches of a face's texture coordinates from which these do not keep its shape."""
@@ -92,7 +93,7 @@ def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) ->
 
 def _kept_corners(prim: Usd.Prim, kept: Sequence[int] | np.ndarray) -> np.ndarray:
     """Numbers of the kept faces' corners among all of the authored faces'."""
-    counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()), np.int64)
+    counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()), np.int64)
     starts = np.concatenate([[0], np.cumsum(counts)])
     return np.concatenate([np.arange(starts[face], starts[face + 1]) for face in kept]) if len(kept) else starts[:0]
 

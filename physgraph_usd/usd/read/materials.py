@@ -40,7 +40,7 @@ from ..lookup import (
     source_name,
 )
 from ..schema import GARMENT, Property
-from ..stage import Notice, Units
+from ..stage import Notice, Units, first_value
 
 STIFFNESSES = {
     "stretchStiffness": "physics:surfaceStretchStiffness",
@@ -225,8 +225,8 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     values = values.astype(np.float64)
     mesh = UsdGeom.Mesh(prim)
     topology = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
-    counts, indices = (np.asarray(each.Get(code)) for each in topology)
-    count = len(mesh.GetPointsAttr().Get(code) or ())
+    counts, indices = (np.asarray(first_value(each)) for each in topology)
+    count = len(first_value(mesh.GetPointsAttr()) or ())
     element = prim.GetAttribute(f"{THICKNESSES}:elementType").Get()
     expected = {"constant": 1, "face": len(counts), "point": count}.get(str(element))
     if len(values) != expected:

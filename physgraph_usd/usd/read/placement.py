@@ -40,18 +40,28 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
     path = str(prim.GetPath())
     if not np.isfinite(matrix).all():
         raise GarmentError(path, "its transform to the world is NaN or infinite", time=time, remedy=_REMEDY)
-    stretches = np.linalg.svd(matrix[:3, :3], compute_uv=False)
-    if stretches[2] <= _SINGULAR * stretches[0]:
-        message = f"its transform to the world is singular: it scales by {stretches[0]:.3g}, {stretches[1]:.3g}"
-        raise GarmentError(path, f"{message} and {stretches[2]:.3g}", time=time, remedy=_REMEDY)
-    if not 1.0 / _EXTREME < stretches[0] < _EXTREME:
-        message = f"its transform to the world scales by {stretches[0]:.3g}"
+    if message := flattened(matrix):
+        raise GarmentError(path, message, time=time, remedy=_REMEDY)
+    stretch = float(np.linalg.svd(matrix[:3, :3], compute_uv=False)[0])
+    if not 1.0 / _EXTREME < stretch < _EXTREME:
+        message = f"its transform to the world scales by {stretch:.3g}"
         raise GarmentError(path, message, time=time, remedy=f"give a scale of {1 / _EXTREME:g} to {_EXTREME:g}")
     if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         message = "its transform to the world is projective"
         raise GarmentError(path, message, time=time, remedy="author affine transforms")
     matrix[:3] *= metres
     return matrix
+
+
+def flattened(matrix: np.ndarray) -> str:
+    """By how much a matrix for column vectors, shape (4, 4), scales if it has no inverse, in words; else ""."""
+    if not np.isfinite(matrix).all():
+        return ""
+    stretches = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if stretches[2] > _SINGULAR * stretches[0]:
+        return ""
+    first, second, third = (f"{stretch:.3g}" for stretch in stretches)
+    return f"its transform to the world is singular: it scales by {first}, {second} and {third}"
 
 
 def place(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:

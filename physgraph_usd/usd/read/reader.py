@@ -54,11 +54,12 @@ from .find import (
     read_apart,
     with_gravity,
 )
-from .garment import GarmentReader, Request, all_times, is_visible, read_garment
+from .garment import GarmentReader, Request, is_visible, read_garment, samples_of
 from .materials import find_values
 from .placement import to_metres
 from .rest import AUTO
 from .skinning import Bake
+from .timing import timing_notices
 
 
 class Shot:
@@ -116,6 +117,14 @@ class Shot:
         """
         return to_metres(self.stage.GetPrimAtPath(self.sources[index].path), self.metres_per_unit, time)
 
+    def local(self, index: int, time: float | None) -> np.ndarray:
+        """A garment's coarse points in its own space and units at a time code, by number, shape (V, 3), float64.
+
+        Raises:
+            GarmentError: They are broken.
+        """
+        return self._readers[index].points.read(time, self._readers[index].edges)[0]
+
     def times_until(self, last: float) -> list[float]:
         """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
         return [time for time in self.every_time if time < last] + [last]
@@ -136,7 +145,8 @@ class Shot:
         garments, notices = [], []
         with pxr_errors(f"cannot read {self.path}" + at_time(time)):
             for index, reader in enumerate(self._readers):
-                garment, odd = reader.frame(self.to_metres(index, time), time)
+                prim = self.stage.GetPrimAtPath(self.sources[index].path)
+                garment, odd = reader.frame(prim, self.metres_per_unit, time)
                 garments.append(garment)
                 notices += odd
             poses = []
@@ -247,6 +257,7 @@ def open_shot(
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
         solids = _with_sides(stage, readers, solids)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
+        notices += _timing(stage, readers, solids, bake=bake)
         read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
     opened.unsaved = unsaved
@@ -341,11 +352,23 @@ def _first_cages(
     for time in every or (None,):
         try:
             prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
-            placed = zip(readers, (to_metres(prim, metres, time) for prim in prims), strict=True)
-            return time, [reader.frame(matrix, time)[0].points for reader, matrix in placed]
+            pairs = zip(readers, prims, strict=True)
+            return time, [reader.frame(prim, metres, time)[0].points for reader, prim in pairs]
         except StageError:
             continue
     return None, [np.zeros((0, 3))] * len(readers)
+
+
+def _timing(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader], *, bake: Bake
+) -> list[Notice]:
+    """Notices of samples of garments, and of the bodies that they feel, which do not fit in time."""
+    garments = [(stage.GetPrimAtPath(reader.source.path), reader.source) for reader in readers]
+    felt_by = [
+        [number for number, reader in enumerate(readers) if index in reader.garment.colliders]
+        for index in range(len(bodies))
+    ]
+    return timing_notices(garments, [(body.prim, by) for body, by in zip(bodies, felt_by, strict=True)], bake)
 
 
 def _read(
@@ -366,7 +389,8 @@ def _read(
     readers, every = [], []
     for path, instances in roots.items():
         prim = stage.GetPrimAtPath(path)
-        times = all_times(prim, request.bake)
+        samples = samples_of(prim, request.bake)
+        times = samples.times
         every += times
         if times and not within(times, request.frames):
             span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}"
@@ -374,7 +398,7 @@ def _read(
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:
-            readers.append(read_garment(prim, instances, request))
+            readers.append(read_garment(prim, instances, samples, request))
     if request.frames and every and not within(every, request.frames):
         message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
         raise StageError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")

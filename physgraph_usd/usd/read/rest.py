@@ -22,7 +22,7 @@ from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
 from ..lookup import nearest, source_name
-from ..stage import Notice
+from ..stage import Notice, first_value
 from .cage import as_points, repair
 
 AUTO = "auto"
@@ -41,6 +41,9 @@ SHORTEST = 1e-3
 """In mean edges; shorter ones pull no harder."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
 _BENT = ("restShape", "restShapeDefault")
+_PER_CORNER = UsdGeom.Tokens.faceVarying
+_SAME_PLACE = 1e-6
+"""Part of a rest shape's size by which corners of a point may differ: what single precision leaves of it."""
 _TINY = 1e-9
 _MOST_SCALED = 2.0
 
@@ -97,13 +100,13 @@ def read_rest(
     Raises:
         GarmentError: When an authored rest shape does not fit the mesh, or the rest shape cannot be used.
     """
-    edges, first = mesh.half_edges.edges, animation.first
+    edges, first, odd = mesh.half_edges.edges, animation.first, list[Notice]()
     if asked == AUTO:
         rest = _fitted(mesh, animation, by=" (--rest)")
     elif asked is not None:
         points, notices = animation.read(float(asked))
         rest = Rest(points, f"points at time code {float(asked):g} (--rest)", notices)
-    elif (authored := _authored(prim, len(first))) is not None:
+    elif (authored := _authored(prim, len(first), odd)) is not None:
         rest = Rest(place(authored[0]), authored[1])
     elif (default := _default_points(prim, baked)) is None:
         rest = _fitted(mesh, animation)
@@ -113,7 +116,7 @@ def read_rest(
         rest = replace(rest, notices=(Notice(str(prim.GetPath()), None, message),))
     else:
         rest = _from_default(prim, edges, place(default), first=first)
-    return _checked(prim, edges, rest, first=first)
+    return _checked(prim, edges, replace(rest, notices=(*odd, *rest.notices)), first=first)
 
 
 def has_rest(prim: Usd.Prim, baked: Sdf.Layer) -> bool:
@@ -192,8 +195,8 @@ def rests_bent(prim: Usd.Prim) -> tuple[bool, list[Notice]]:
     return value in _BENT, [Notice(str(attribute.GetPrim().GetPath()), None, message)] if new else []
 
 
-def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
-    """Local rest points of an attribute other than ``points``."""
+def _authored(prim: Usd.Prim, count: int, notices: list[Notice]) -> tuple[np.ndarray, str] | None:
+    """Local rest points of an attribute other than ``points``; adds to the notices."""
     for name in _AUTHORED:
         attribute = prim.GetAttribute(name)
         if not attribute or not attribute.HasAuthoredValue():
@@ -203,6 +206,11 @@ def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
         if value is None or np.size(value) == 0:
             continue
         points = as_points(value, str(prim.GetPath()), name)
+        if name.startswith("primvars:") and UsdGeom.Primvar(attribute).GetInterpolation() == _PER_CORNER:
+            points, notice = _of_corners(attribute, points, count)
+            notices.append(notice)
+            if points is None:
+                continue
         if len(points) != count:
             message = f"{name} has {len(points)} values, the mesh has {count} points"
             remedy = "author one value per point (vertex interpolation), or remove it"
@@ -214,6 +222,24 @@ def _authored(prim: Usd.Prim, count: int) -> tuple[np.ndarray, str] | None:
             raise GarmentError(str(prim.GetPath()), message, remedy=remedy)
         return points, source_name(attribute)
     return None
+
+
+def _of_corners(attribute: Usd.Attribute, values: np.ndarray, count: int) -> tuple[np.ndarray | None, Notice]:
+    """Rest points of values per corner, shape (C, 3); None where corners of a point differ. And a notice."""
+    prim = attribute.GetPrim()
+    corners = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr()))
+    path, name = str(prim.GetPath()), attribute.GetName()
+    if len(corners) != len(values):
+        message = f"{name} has {len(values)} values, one per corner, for {len(corners)} corners; it is not the rest"
+        return None, Notice(path, None, f"{message} shape; author one value per point (vertex interpolation)")
+    points = np.tile(values.mean(axis=0), (count, 1))  # Of points in no face, which are no cloth.
+    points[corners] = values
+    size = np.ptp(values, axis=0).max(initial=0.0)
+    apart = np.flatnonzero(~(np.abs(points[corners] - values).max(axis=1) <= _SAME_PLACE * size))
+    if not len(apart):
+        return points, Notice(path, None, f"{name} is per corner; corners of a point agree, so it is the rest shape")
+    message = f"{name} is per corner and differs between corners of points[{corners[apart[0]]}]; it is not the rest"
+    return None, Notice(path, None, f"{message} shape; author one value per point (vertex interpolation)")
 
 
 def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:

@@ -11,6 +11,7 @@ from ...solver.colliders.orient import pieces_of
 from ..schema import GARMENT_API
 from ..stage import Notice, list_meshes, open_stage, pxr_errors, quiet, read_units, shot_name
 from ..times import garment_times
+from .absence import Samples
 from .cage import PointReader, read_cage
 from .find import has_schema
 from .placement import check_placement
@@ -74,7 +75,8 @@ def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
     garment, count = has_schema(prim, GARMENT_API), 0
     try:
         with pxr_errors(f"cannot read <{path}>"):
-            times = garment_times(prim)
+            samples = Samples.of(prim, garment_times(prim))
+            times = samples.times or tuple(samples.absent)  # Where it is at none, reading says what is wrong.
             first = times[0] if times else None
             points = PointReader(prim, first)
             count = points.count
@@ -84,5 +86,6 @@ def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
             odd = check_placement(prim, metres, times)
     except StageError as error:
         return MeshReport(path, garment, points=count, problem=str(error))
-    is_open, notices = len(pieces.open) > len(pieces.closed), (*cage.notices, *odd)
+    is_open = len(pieces.open) > len(pieces.closed)
+    notices = (*samples.notices(path, tuple(samples.absent)), *cage.notices, *odd)
     return MeshReport(path, garment, count, len(cage.kept_faces), is_open, times, notices=notices)

@@ -7,7 +7,8 @@ Those that it solves before them, the pre-roll, are no samples; where the cloth 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ from .track import HEAT, PREFIX
 
 CHUNK = "chunk"
 """The chunk's entry of a layer's record."""
-_TIMES, _ALL, _PREROLL = "frames", "all_frames", "preroll"
+_TIMES, _ALL, _PREROLL, _CUTS = "frames", "all_frames", "preroll", "cuts"
 
 Points = Mapping[str, np.ndarray]
 """Local points by the path of the fine mesh, each of shape (V, 3), float32."""
@@ -38,11 +39,17 @@ class Chunk:
         times: Time codes that it has, or failed to solve.
         every: Time codes of the whole shot, in order.
         preroll: Where the cloth was in the frames before them, by time code.
+        cuts: Time codes to which the cloth jumps from the sample before, by the path of the fine mesh.
     """
 
     times: tuple[float, ...]
     every: tuple[float, ...]
     preroll: Mapping[float, Points] = field(default_factory=dict)
+    cuts: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    def holds(self, others: Iterable[float]) -> tuple[float, ...]:
+        """Those of other time codes of the shot that follow one of the chunk's, or come before the shot's first."""
+        return tuple(time for time in others if self.every[max(bisect(self.every, time) - 1, 0)] in self.times)
 
     def record(self) -> dict[str, Any]:
         """The entry for the layer's record."""
@@ -50,6 +57,7 @@ class Chunk:
             _TIMES: list(self.times),
             _ALL: list(self.every),
             _PREROLL: {repr(time): dict(points) for time, points in self.preroll.items()} or None,
+            _CUTS: {path: list(times) for path, times in self.cuts.items() if times} or None,
         }
 
 
@@ -61,11 +69,13 @@ class Frame:
         time: The time code.
         points: Positions of the garments that have a sample there.
         heat: Their heat maps by name, each of shape (V,), by the path of the fine mesh.
+        cuts: Paths of the fine meshes whose cloth jumps here from the sample before.
     """
 
     time: float
     points: Points
     heat: Mapping[str, Mapping[str, np.ndarray]]
+    cuts: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +128,7 @@ class ChunkLayer:
             if found is not None:
                 maps = ((name, _latest(self.layer, f"{path}.{PREFIX}{name}", time)) for name in HEAT)
                 points[path], heat[path] = found, {name: values for name, values in maps if values is not None}
-        return Frame(time, points, heat)
+        return Frame(time, points, heat, frozenset(path for path, cuts in self.chunk.cuts.items() if time in cuts))
 
     @cached_property
     def _sampled(self) -> dict[str, frozenset[float]]:
@@ -171,9 +181,10 @@ def read_chunk(layer: Sdf.Layer) -> Chunk | None:
             for time, points in dict(entry.get(_PREROLL, {})).items()
         }
         times, every = (tuple(float(time) for time in entry.get(name, ())) for name in (_TIMES, _ALL))
+        cuts = {str(path): tuple(map(float, found)) for path, found in dict(entry.get(_CUTS, {})).items()}
     except (TypeError, ValueError):  # Somebody else wrote it.
         return None
-    return Chunk(times, every, preroll)
+    return Chunk(times, every, preroll, cuts)
 
 
 def points_at(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
@@ -189,6 +200,13 @@ def points_at(layer: Sdf.Layer, path: str, time: float) -> np.ndarray | None:
     if isinstance(value, Sdf.ValueBlock) or (low != time and value != after):
         return None
     return np.asarray(value)
+
+
+def samples_and_blocks(layer: Sdf.Layer, name: str) -> tuple[list[float], list[float]]:
+    """Time codes at which a layer has values of an attribute, and those at which it has blocks."""
+    every = layer.ListTimeSamplesForPath(name)
+    blocks = [time for time in every if isinstance(layer.QueryTimeSample(name, time), Sdf.ValueBlock)]
+    return [time for time in every if time not in blocks], blocks
 
 
 def _latest(layer: Sdf.Layer, name: str, time: float) -> np.ndarray | None:
@@ -216,5 +234,5 @@ def topology_of(layer: Sdf.Layer, path: str) -> tuple[np.ndarray, np.ndarray]:
 def vertex_count(layer: Sdf.Layer, path: str) -> int:
     """Number of a fine mesh's vertices."""
     name = f"{path}.points"
-    times = layer.ListTimeSamplesForPath(name)
+    times, _ = samples_and_blocks(layer, name)
     return len(layer.QueryTimeSample(name, times[0]) if times else layer.GetAttributeAtPath(name).default)

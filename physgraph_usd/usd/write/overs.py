@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from ...errors import LayerError
 from ...solver.scene import Garment, GarmentFrame
 from ..schema import GARMENT, GARMENT_API, fabric_values
-from ..stage import GarmentSource, Notice
+from ..stage import GarmentSource, Notice, value_at
 from .primvars import FineMap
 from .stream import LayerStream
 
@@ -73,14 +73,19 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
         name = attribute.GetName()
         if not attribute.GetTypeName().isArray or name in EMPTIED or name in _REWRITTEN or name.startswith(_ELSEWHERE):
             continue
-        value = attribute.Get()
-        if value is None or len(value) not in sizes:
+        value = value_at(attribute, None)
+        if value is None or len(value) < 2:
+            continue
+        if len(value) not in sizes:
+            if np.asarray(value).dtype.kind in "iu":
+                message = f"{name} may number points or faces of the coarse mesh and stays as authored"
+                notices.append(Notice(str(prim.GetPath()), None, message))
             continue
         if name == REST_POINTS and len(value) == fine.count("vertex"):
             path = target.AppendProperty(name)
             stream.attribute(path, attribute.GetTypeName())
             stream.set(path, Vt.Vec3fArray.FromNumpy(fine.interpolate(np.asarray(value, np.float32))))
-        elif len(value) > 1:
+        else:
             message = f"{name} has one entry per {sizes[len(value)]} element of the coarse mesh and stays as authored"
             notices.append(Notice(str(prim.GetPath()), None, message))
     return notices

@@ -49,6 +49,10 @@ def carry_primvars(
         attribute = primvar.GetAttr()
         if attribute.GetName() in STALE:
             _hide(stream, target, primvar)
+        elif fine.stencil is not None and _numbers_points(primvar):
+            _hide(stream, target, primvar)
+            message = f"{attribute.GetName()} has another whole number for each point of the coarse mesh"
+            notices.append(Notice(str(prim.GetPath()), None, f"{message}; hidden, since points would share them"))
         elif primvar.GetInterpolation() != UsdGeom.Tokens.constant and attribute.GetTypeName().isArray:
             try:
                 _carry(stream, target, primvar, fine, span)
@@ -56,6 +60,14 @@ def carry_primvars(
                 _hide(stream, target, primvar)
                 notices.append(Notice(str(prim.GetPath()), None, f"{attribute.GetName()} {error}; hidden"))
     return notices
+
+
+def _numbers_points(primvar: UsdGeom.Primvar) -> bool:
+    """Whether a primvar is a number for each point that no other point has, as ids are."""
+    if primvar.GetInterpolation() not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
+        return False
+    values = np.asarray(primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()))
+    return values.ndim == 1 and values.dtype.kind in "iu" and 1 < len(values) == len(np.unique(values))
 
 
 def _hide(stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar) -> None:

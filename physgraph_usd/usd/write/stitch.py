@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from ..stage import is_there, paths_in
 from ..times import within
 from ..view import StageView
 from .atomic import prepare_target, temporary_path
-from .chunk import CHUNK, ChunkLayer, Frame, topology_of
+from .chunk import CHUNK, ChunkLayer, Frame, samples_and_blocks, topology_of
 from .normals import VertexNormals
 from .stream import LayerStream
 from .track import ATTRIBUTE as HINT
@@ -174,7 +175,7 @@ def _write_frames(stream: LayerStream, parts: Sequence[ChunkLayer], frames: Iter
             if path not in tracks:
                 tracks[path] = _tracks(stream, parts, path)
             point_track, heat_track = tracks[path]
-            point_track.write(frame.time, points, None)
+            point_track.write(frame.time, points, None, cut=path in frame.cuts)
             heat_track.write(frame.time, frame.heat[path])
     for point_track, heat_track in tracks.values():
         point_track.finish()
@@ -183,20 +184,29 @@ def _write_frames(stream: LayerStream, parts: Sequence[ChunkLayer], frames: Iter
 
 def _tracks(stream: LayerStream, parts: Sequence[ChunkLayer], path: str) -> tuple[PointTrack, HeatTrack]:
     """Tracks of a fine mesh, with defaults, velocities and normals as the chunks have them."""
-    layers = [part.layer for part in parts if part.layer.ListTimeSamplesForPath(f"{path}.points")]
+    sampled = {part.layer: samples_and_blocks(part.layer, f"{path}.points") for part in parts}
+    layers = [layer for layer, (times, _) in sampled.items() if times]
+    absent = sorted(time for _, blocks in sampled.values() for time in blocks)
     normals = _normals(layers[0], path)
     rate = (
         layers[0].timeCodesPerSecond if any(each.GetAttributeAtPath(f"{path}.velocities") for each in layers) else None
     )
     rest = np.asarray(layers[0].GetAttributeAtPath(f"{path}.points").default)
     target = Sdf.Path(path)
-    points = PointTrack(stream, target, normals, rest=rest, still=False, rate=rate)
+    moves = {"rate": rate, "own": partial(_velocities, layers, path), "absent": absent}
+    points = PointTrack(stream, target, normals, rest=rest, still=False, **moves)
     return points, HeatTrack(stream, target, normals.vertex_count, still=False)
+
+
+def _velocities(layers: Sequence[Sdf.Layer], path: str, time: float | None) -> np.ndarray | None:
+    """Velocities of a fine mesh that one of the layers has at a time code."""
+    found = [] if time is None else [layer.QueryTimeSample(f"{path}.velocities", time) for layer in layers]
+    return next((np.asarray(each) for each in found if isinstance(each, Vt.Vec3fArray)), None)
 
 
 def _normals(layer: Sdf.Layer, path: str) -> VertexNormals:
     """Normals of a fine mesh, on the side on which the layer has them."""
-    time = layer.ListTimeSamplesForPath(f"{path}.normals")[0]
+    time = samples_and_blocks(layer, f"{path}.normals")[0][0]
     points, there = (np.asarray(layer.QueryTimeSample(f"{path}.{name}", time)) for name in ("points", "normals"))
     mesh = PolygonMesh(*topology_of(layer, path), len(points))
     found = VertexNormals(mesh)
@@ -306,5 +316,6 @@ def _check_clips(clips: Sequence[_Clip], garments: Sequence[str], shot: Path, ou
         name = f"{path}.points"
         for clip, times in _shown(clips, path):
             for time in (times[0], times[-1]):
-                if stage.GetAttributeAtPath(name).Get(time) != clip.layer.QueryTimeSample(name, time):
+                held = clip.layer.QueryTimeSample(name, time)
+                if stage.GetAttributeAtPath(name).Get(time) != (None if isinstance(held, Sdf.ValueBlock) else held):
                     raise LayerError(f"{out} does not show <{path}> at time code {time:g} as {clip.file} holds it")

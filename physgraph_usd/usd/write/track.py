@@ -6,7 +6,7 @@ Points, normals, extent and velocities; heat maps, which show how deep vertices 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -23,6 +23,13 @@ PREFIX = "primvars:physgraph:"
 HEAT = ("penetration", "crossing")
 """Depth in the deepest body [mm], 0 outside; and 1 at the corners of edges and faces that cross, 0 elsewhere."""
 ATTRIBUTE = "extentsHint"
+TYPES = {
+    "points": Sdf.ValueTypeNames.Point3fArray,
+    "normals": Sdf.ValueTypeNames.Normal3fArray,
+    "extent": Sdf.ValueTypeNames.Float3Array,
+    "velocities": Sdf.ValueTypeNames.Vector3fArray,
+}
+"""Attributes of a garment whose samples come frame by frame."""
 _FIRST = Usd.TimeCode.EarliestTime()
 _PURPOSES = ("default", "render", "proxy", "guide")
 
@@ -40,6 +47,14 @@ class PointTrack:
 
     A run of equal samples is written by its first and last only; USD gives the same value between them. With
     velocities every sample is written, since a velocity belongs to its own time.
+
+    Velocities are differences of samples between which the cloth moves on. A sample with none beside it has the shot's
+    own velocity, or a block.
+
+    Attributes:
+        box: Extent of the last sample.
+        cuts: Time codes of the samples to which the cloth jumps from the one before, where there are velocities.
+        unknown: Time codes of the samples whose velocities are blocked.
     """
 
     def __init__(
@@ -51,6 +66,8 @@ class PointTrack:
         rest: np.ndarray | None,
         still: bool,
         rate: float | None,
+        own: Callable[[float | None], np.ndarray | None] = lambda _: None,
+        absent: Sequence[float] = (),
     ) -> None:
         """Author the attributes, still without values.
 
@@ -61,14 +78,18 @@ class PointTrack:
             rest: Local points for the default time, shape (V, 3); None takes the first that come.
             still: Whether the garment's input has no samples: only a default is written until something moves.
             rate: Time codes per second for velocities; None leaves them out.
+            own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None where it has none.
+            absent: Time codes to block, ascending: the garment is not there.
         """
         self._stream, self._normals, self._count = stream, normals, normals.vertex_count
-        types = Sdf.ValueTypeNames
-        self._paths = {name: target.AppendProperty(name) for name in ("points", "normals", "extent", "velocities")}
-        stream.attribute(self._paths["points"], types.Point3fArray)
-        stream.attribute(self._paths["normals"], types.Normal3fArray, interpolation=UsdGeom.Tokens.vertex)
-        stream.attribute(self._paths["extent"], types.Float3Array)
-        self._rest, self._still, self._rate = rest, still, rate
+        self._paths = {name: target.AppendProperty(name) for name in TYPES}
+        stream.attribute(self._paths["points"], TYPES["points"])
+        stream.attribute(self._paths["normals"], TYPES["normals"], interpolation=UsdGeom.Tokens.vertex)
+        stream.attribute(self._paths["extent"], TYPES["extent"])
+        self._rest, self._still, self._rate, self._own = rest, still, rate, own
+        self._absent = list(absent)
+        self.cuts: list[float] = []
+        self.unknown: list[float] = []
         self._has_default = False
         self._last: _Sample | None = None
         self._matrix: np.ndarray | None = None
@@ -83,7 +104,13 @@ class PointTrack:
             raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {self._count} vertices")
 
     def write(
-        self, time: float | None, points: np.ndarray, to_metres: np.ndarray | None, *, changed: bool = True
+        self,
+        time: float | None,
+        points: np.ndarray,
+        to_metres: np.ndarray | None,
+        *,
+        changed: bool = True,
+        cut: bool = False,
     ) -> None:
         """Write one time code.
 
@@ -93,10 +120,16 @@ class PointTrack:
             to_metres: Local space to world metres, shape (4, 4), for column vectors; None where the points are local
                 ones, float32.
             changed: False when the world points are known to equal the last ones.
+            cut: Whether the cloth jumps here from the sample before.
 
         Raises:
             LayerError: The points are not finite, or the matrix cannot be inverted.
         """
+        if time is not None:
+            self._block_until(time)
+        if cut and self._rate is not None and time is not None:
+            self._end_stretch()
+            self.cuts.append(time)
         same_matrix = self._matrix is not None and to_metres is not None and np.array_equal(self._matrix, to_metres)
         if not changed and same_matrix and self._last is not None and time is not None:
             self._take(_Sample(time, self._last.points), moved=False)
@@ -107,6 +140,8 @@ class PointTrack:
         if not self._has_default:
             self._author(None, points if self._rest is None else self._rest)
             self._has_default, self._rest = True, None
+            if self._still and self._rate is not None and (velocity := self._own(time)) is not None:
+                self._set_velocity(None, velocity)
         if time is None:
             self.box = extent_of(points)
             return
@@ -149,11 +184,30 @@ class PointTrack:
 
     def finish(self, *, hold: bool = False) -> None:
         """Author the last velocity, and with ``hold`` the end of a run of equal samples that others are to follow."""
-        if hold:
+        if hold or self._absent:
             self._end_run()
+        self._end_stretch()
+        self._block_until(np.inf)
+
+    def _end_stretch(self) -> None:
+        """Author the velocity of the last sample before a cut, a block or the end."""
         if self._queue:
             self._author_velocity(self._queue[-1], self._queue[0], self._queue[-1])
             self._queue.clear()
+
+    def _block_until(self, time: float) -> None:
+        """Author blocks where the garment is not there before a time code; samples after one begin anew."""
+        while self._absent and self._absent[0] < time:
+            self._end_run()
+            self._end_stretch()
+            self._last = self._matrix = None
+            blocked = self._absent.pop(0)
+            for name in ("points", "normals", "extent", *(["velocities"] if self._rate is not None else [])):
+                self._block(name, blocked)
+
+    def _block(self, name: str, time: float) -> None:
+        self._stream.attribute(self._paths[name], TYPES[name])
+        self._stream.set(self._paths[name], Sdf.ValueBlock(), time=time)
 
     def _author(self, time: float | None, points: np.ndarray) -> None:
         """Author points, normals and extent at one time."""
@@ -163,13 +217,19 @@ class PointTrack:
             self._stream.set(self._paths[name], Vt.Vec3fArray.FromNumpy(value), time=time)
 
     def _author_velocity(self, at: _Sample, before: _Sample, after: _Sample) -> None:
-        """Author the velocity at one time by finite differences [units/s]."""
-        path = self._paths["velocities"]
-        self._stream.attribute(path, Sdf.ValueTypeNames.Vector3fArray)
+        """Author the velocity of a sample by finite differences [units/s], or the shot's own where it is alone."""
         seconds = (after.time - before.time) / (self._rate or 24.0)
-        moved = after.points.astype(np.float64) - before.points
-        velocity = moved / seconds if seconds else np.zeros_like(moved)
-        self._stream.set(path, Vt.Vec3fArray.FromNumpy(velocity.astype(np.float32)), time=at.time)
+        velocity = (after.points.astype(np.float64) - before.points) / seconds if seconds else self._own(at.time)
+        if velocity is not None:
+            self._set_velocity(at.time, velocity)
+        else:
+            self._block("velocities", at.time)
+            self.unknown.append(at.time)
+
+    def _set_velocity(self, time: float | None, velocity: np.ndarray) -> None:
+        self._stream.attribute(self._paths["velocities"], TYPES["velocities"])
+        values = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(velocity, np.float32))
+        self._stream.set(self._paths["velocities"], values, time=time)
 
 
 def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,8 +22,10 @@ from ...solver.mesh.subdivide import Refinement
 from .. import provenance
 from ..check.validate import check_layer
 from ..files import check_targets, files_of
+from ..read.absence import named_times
 from ..read.reader import Shot
-from ..stage import Notice, pxr_errors
+from ..stage import Notice, first_value, pxr_errors, value_at
+from ..times import within
 from . import overs
 from .chunk import CHUNK, Chunk
 from .normals import VertexNormals
@@ -94,7 +97,9 @@ class LayerWriter:
         options = {"sibling": self._mode == "sibling", "velocities": self._velocities}
         with pxr_errors(f"cannot read {self._shot.path}"):
             for index in _garments_in(self._shot, self._chunk):
-                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **options)
+                absent = self._shot.sources[index].absent
+                absent = absent if self._chunk is None else self._chunk.holds(absent)
+                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], absent=absent, **options)
                 self.notices += mesh.notices
                 self._meshes[index] = mesh
 
@@ -104,6 +109,7 @@ class LayerWriter:
         points: Sequence[np.ndarray | None],
         *,
         changed: Sequence[bool] | None = None,
+        cuts: Sequence[bool] = (),
         heat: Sequence[Mapping[str, np.ndarray] | None] = (),
     ) -> None:
         """Write one time code.
@@ -113,6 +119,7 @@ class LayerWriter:
             points: Per garment, fine points [m], world space, shape (V_fine, 3), or None where the garment has no
                 sample at this time.
             changed: Per garment, False where the points are known to equal the last ones.
+            cuts: Per garment, whether the cloth jumps here from its sample before; () for none.
             heat: Per garment, its heat maps by name, each of shape (V_fine,), or None; () for no heat maps.
 
         Raises:
@@ -131,7 +138,8 @@ class LayerWriter:
         for index, mesh in self._meshes.items():
             if (array := points[index]) is not None:
                 different = True if changed is None else bool(changed[index])
-                mesh.write(time, array, (heat[index] if heat else None) or {}, changed=different)
+                how = {"changed": different, "cut": bool(cuts) and cuts[index]}
+                mesh.write(time, array, (heat[index] if heat else None) or {}, **how)
         self._time = np.inf if time is None else time
 
     def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
@@ -170,6 +178,9 @@ class LayerWriter:
             raise LayerError(f"no time code was written to {self._stream.target}")
         for mesh in self._meshes.values():
             mesh.finish(hold=self._chunk is not None)
+            self.notices += mesh.unknown_velocities()
+        if self._chunk is not None:
+            self._chunk = replace(self._chunk, cuts={str(mesh.target): mesh.cuts for mesh in self._meshes.values()})
         facts = _facts(self._shot, self.targets, self._stream.target)
         facts |= {CHUNK: self._chunk.record()} if self._chunk is not None else {}
         provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
@@ -224,13 +235,17 @@ class _RefinedMesh:
         index: int,
         *,
         steps: Sequence[Refinement],
+        absent: Sequence[float],
         sibling: bool,
         velocities: bool,
     ) -> None:
-        """Author the defaults of a garment, by number and refinements, coarse to fine, and start its tracks."""
+        """Author the defaults of a garment, by number and refinements, coarse to fine, and start its tracks.
+
+        It is blocked at the time codes at which it is absent.
+        """
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
-        counts = np.asarray(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()))
+        counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()))
         fine = FineMap(shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
         self.notices = overs.open_instances(stream, source)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
@@ -243,16 +258,19 @@ class _RefinedMesh:
         rest = None if source.skinned or not source.times else _refined_default(prim, fine)
         normals = VertexNormals(fine.fine, left_handed=left)
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
-        self.notices += overs.speed_notices(prim, written=rate is not None and bool(source.times))
-        self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, rate=rate)
+        self.notices += overs.speed_notices(prim, written=rate is not None)
+        moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}
+        self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, **moves)
         self._heat = HeatTrack(stream, target, normals.vertex_count, still=not source.times)
         purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
         self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
         self._shot, self._index = shot, index
 
-    def write(self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool) -> None:
+    def write(
+        self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool, cut: bool
+    ) -> None:
         """Write one time code, as `LayerWriter.write` takes it."""
-        self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed)
+        self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed, cut=cut)
         self._hints.write(time, self._track.box)
         self._heat.write(time, heat)
 
@@ -272,6 +290,18 @@ class _RefinedMesh:
         """Author what waited for a next sample; ``hold`` as `PointTrack.finish` takes it."""
         self._track.finish(hold=hold)
         self._heat.finish(hold=hold)
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Time codes of samples to which the cloth jumps, where there are velocities."""
+        return tuple(self._track.cuts)
+
+    def unknown_velocities(self) -> list[Notice]:
+        """A notice of samples alone between cuts, at which the shot has no velocities either."""
+        if not self._track.unknown:
+            return []
+        message = f"its velocities are blocked at {named_times(self._track.unknown)}: it has no sample beside that one"
+        return [Notice(str(self.target), None, f"{message} without a cut, and the shot has no velocities there")]
 
 
 def _check_sizes(
@@ -309,6 +339,22 @@ def _garments_in(shot: Shot, chunk: Chunk | None) -> list[int]:
         return [*every]
     first = shot.scene.times[0]
     return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(chunk.times)]
+
+
+def _own_velocities(prim: Usd.Prim, fine: FineMap, time: float | None) -> np.ndarray | None:
+    """Velocities of the coarse mesh at a time code between its first and last sample, refined linearly [units/s].
+
+    Returns:
+        Shape (V_fine, 3), float32; None where there are none that fit.
+    """
+    attribute = UsdGeom.Mesh(prim).GetVelocitiesAttr()
+    samples, value = attribute.GetTimeSamples(), value_at(attribute, time)
+    if time is not None and samples and not within([time], (samples[0], samples[-1])):
+        return None
+    if value is None or len(value) != fine.cage.vertex_count:
+        return None
+    velocities = fine.interpolate(np.asarray(value, np.float32))
+    return velocities if np.isfinite(velocities).all() else None
 
 
 def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:

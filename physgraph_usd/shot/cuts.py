@@ -1,0 +1,97 @@
+"""Frames to which cloth jumps from the sample before: no velocity is taken across a jump."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import pairwise, zip_longest
+from typing import Any
+
+import numpy as np
+
+from ..errors import GarmentError
+from ..solver.frame.settings import Reset
+from ..usd.read.reader import Shot
+
+JUMP = Reset().move
+"""RMS over a garment's points by which a step departs from the steps beside it, in mean cage edges, to be a jump: the
+solver, too, takes cloth that moves so far for another pose."""
+_STARTED_ANEW = "cold: "
+"""In the start of a frame of the telemetry, before the reason why cloth was not carried from the last one."""
+
+
+class Cuts:
+    """Jumps of a shot's garments, of those with velocities."""
+
+    def __init__(self, opened: Shot, *, velocities: bool) -> None:
+        """Look for the cages' jumps; ``velocities``: whether garments have them where the shot has none, too."""
+        self._jumps = [
+            jumps(opened, index) if velocities or source.velocities else frozenset[float]()
+            for index, source in enumerate(opened.sources)
+        ]
+
+    def __call__(self, records: Sequence[Mapping[str, Any]]) -> list[bool]:
+        """For each garment, whether its cloth jumps to the last frame of some telemetry, or is solved anew there."""
+        before, now = (list(record.get("garments", ())) for record in ({}, *records)[-2:])
+        return [
+            records[-1]["time"] in jumps
+            or _STARTED_ANEW in str(entry.get("start", ""))
+            or "broken_before" in entry
+            or any("collapsed" in each or "not_solved" in each for each in (earlier, entry))
+            for jumps, earlier, entry in zip_longest(self._jumps, before[: len(now)], now, fillvalue={})
+        ]
+
+
+def jumps(opened: Shot, index: int) -> frozenset[float]:
+    """Time codes to which a garment's cage, by number, jumps in its own space.
+
+    A cage that moves on evenly does not jump, however fast it is: a step is compared with those before and after it. Of
+    two steps that have none other beside them, the larger is the jump.
+    """
+    ends, lasted, lengths, away = _steps(_samples(opened, index))
+    if len(ends) < 2:
+        return frozenset()
+    least = JUMP * _mean_edge(opened, index)
+    found = set[float]()
+    for step, end in enumerate(ends):
+        beside = [other for other in (step - 1, step + 1) if 0 <= other < len(ends)]
+        departs = lasted[step] * min(away[min(step, other)] for other in beside) > least
+        if departs and (len(beside) > 1 or lengths[step] > lengths[beside[0]]):
+            found.add(end)
+    return frozenset(found)
+
+
+def _samples(opened: Shot, index: int) -> Iterator[tuple[float, np.ndarray]]:
+    """Time codes and positions of a cage in its own space, without frames that cannot be read."""
+    source = opened.sources[index]
+    for time in sorted({*source.times, *source.left_out}):
+        with suppress(GarmentError):
+            yield time, opened.local(index, time)
+
+
+def _steps(samples: Iterable[tuple[float, np.ndarray]]) -> tuple[list[float], list[float], list[float], list[float]]:
+    """Where steps between samples end, how long they last, their speeds, and by how much each next one's differs.
+
+    Speeds are RMS over the points, per time code; there is one difference fewer.
+    """
+    ends, lasted, lengths, away = [], [], [], []
+    last: np.ndarray | None = None
+    for (start, before), (end, x) in pairwise(samples):
+        speed = (x - before) / (end - start)
+        ends.append(end)
+        lasted.append(end - start)
+        lengths.append(_rms(speed))
+        away += [] if last is None else [_rms(speed - last)]
+        last = speed
+    return ends, lasted, lengths, away
+
+
+def _mean_edge(opened: Shot, index: int) -> float:
+    """Mean edge of a cage in its own units at its first sample that can be read."""
+    edges = opened.scene.garments[index].mesh.half_edges.edges
+    _, first = next(_samples(opened, index))
+    return float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean())
+
+
+def _rms(vectors: np.ndarray) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))

@@ -1,0 +1,84 @@
+"""Time codes at which a prim has no shape, and why: nothing is read from another time in its place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ...errors import counted
+from ..stage import Notice, timecode
+from ..times import transform_chain
+from .placement import flattened
+
+_SHAPE = ("points", "faceVertexCounts", "faceVertexIndices")
+_MOST_NAMED = 3
+"""Most time codes that a notice names."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Authored time codes of a garment.
+
+    Attributes:
+        times: Those at which it has a shape, ascending.
+        absent: The others, ascending, with the reason in words.
+    """
+
+    times: tuple[float, ...] = ()
+    absent: Mapping[float, str] = field(default_factory=dict)
+
+    @staticmethod
+    def of(prim: Usd.Prim, times: Iterable[float]) -> Samples:
+        """Sort the time codes of a garment's mesh prim."""
+        reasons = {time: absence(prim, time) for time in times}
+        there = tuple(time for time, reason in reasons.items() if not reason)
+        return Samples(there, {time: reason for time, reason in reasons.items() if reason})
+
+    def notices(self, path: str, times: Sequence[float]) -> list[Notice]:
+        """Notices of those of some time codes at which it is absent, one for each reason."""
+        found = []
+        for reason in dict.fromkeys(self.absent[time] for time in times):
+            named = named_times([time for time in times if self.absent[time] == reason])
+            message = f"is not there at {named}: {reason}; left out, and blocked in the layer"
+            found.append(Notice(path, None, message))
+        return found
+
+
+def absence(prim: Usd.Prim, time: float) -> str:
+    """Why a garment's mesh has no shape at a time code, in words; "" where it has one.
+
+    A value is missing (`missing_value`), or the transform to the world scales the mesh to nothing or flat.
+    """
+    matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(prim), dtype=np.float64).T
+    return missing_value(prim, time) or flattened(matrix)
+
+
+def missing_value(prim: Usd.Prim, time: float) -> str:
+    """Which part of a prim's shape or of the transforms that place it has no value at a time code; "" for none.
+
+    An attribute without a value is blocked there. An empty array of a mesh that is not empty at all times is no shape.
+    """
+    code = timecode(time)
+    for name in _SHAPE if UsdGeom.Mesh(prim) else ():
+        attribute = prim.GetAttribute(name)
+        if attribute.GetNumTimeSamples() and not (value := attribute.Get(code)):
+            return f"its {name} {'have no value' if value is None else 'are empty'}"
+    for transform in transform_chain(prim):
+        for op in transform.GetOrderedXformOps():
+            attribute = op.GetAttr()
+            if attribute.GetNumTimeSamples() and attribute.Get(code) is None:
+                return f"{attribute.GetName()} of <{transform.GetPath()}> has no value"
+    return ""
+
+
+def named_times(times: Sequence[float]) -> str:
+    """Time codes in words, the first few of many."""
+    names = [f"{time:g}" for time in times]
+    if len(names) == 1:
+        return f"time code {names[0]}"
+    if len(names) > _MOST_NAMED:
+        return f"time codes {', '.join(names[:_MOST_NAMED])} and {counted(len(names) - _MOST_NAMED, 'other')}"
+    return f"time codes {', '.join(names[:-1])} and {names[-1]}"

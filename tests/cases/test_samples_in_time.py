@@ -1,0 +1,343 @@
+"""Frames without a garment, bodies and garments whose samples do not meet, velocities where the cloth jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layers import errors, write_layer
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from shots import CLOTH, refine, sample_times
+from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_points, vec3
+
+from physgraph_usd.errors import GarmentError, SchemaError
+from physgraph_usd.shot.cuts import jumps
+from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.solver.contact.passed import Passed
+from physgraph_usd.usd.check.validate import validate_layer
+from physgraph_usd.usd.read.reader import Shot, open_shot
+
+TIMES = (1.0, 2.0, 3.0, 4.0)
+STEP = np.array([0.5, 0.0, 0.0])
+"""Motion of a sheet of unit squares from sample to sample: 12 units a second."""
+
+
+def block(stage: Usd.Stage, name: str, time: float) -> None:
+    stage.GetRootLayer().SetTimeSample(name, time, Sdf.ValueBlock())
+
+
+def sample_topology(mesh: UsdGeom.Mesh, name: str, odd: float) -> None:
+    """Sample an array of a mesh's topology at all times, empty at one of them."""
+    attribute = mesh.GetPrim().GetAttribute(name)
+    value = attribute.Get()
+    for time in TIMES:
+        attribute.Set(Vt.IntArray() if time == odd else value, time)
+
+
+def hide_by_block(mesh: UsdGeom.Mesh, time: float) -> None:
+    block(mesh.GetPrim().GetStage(), f"{CLOTH}.points", time)
+
+
+def hide_by_no_points(mesh: UsdGeom.Mesh, time: float) -> None:
+    mesh.GetPointsAttr().Set(Vt.Vec3fArray(), time)
+
+
+def hide_by_no_faces(mesh: UsdGeom.Mesh, time: float) -> None:
+    for name in ("faceVertexCounts", "faceVertexIndices"):
+        sample_topology(mesh, name, time)
+
+
+def hide_by_scale(mesh: UsdGeom.Mesh, time: float) -> None:
+    scale = UsdGeom.Xformable(mesh.GetPrim().GetParent()).AddScaleOp()
+    for each in TIMES:
+        scale.Set(Gf.Vec3f(0.0 if each == time else 1.0), each)
+
+
+def hide_by_blocked_transform(mesh: UsdGeom.Mesh, time: float) -> None:
+    move = UsdGeom.Xformable(mesh.GetPrim().GetParent()).AddTranslateOp()
+    for each in TIMES:
+        move.Set(Gf.Vec3d(each, 0.0, 0.0), each)
+    block(mesh.GetPrim().GetStage(), str(move.GetAttr().GetPath()), time)
+
+
+HIDES = {
+    hide_by_block: "its points have no value",
+    hide_by_no_points: "its points are empty",
+    hide_by_no_faces: "its faceVertexCounts are empty",
+    hide_by_scale: "it scales by 0, 0 and 0",
+    hide_by_blocked_transform: "xformOp:translate of </World> has no value",
+}
+
+
+def said(shot: Shot) -> str:
+    return "\n".join(map(str, shot.warnings))
+
+
+class TestFramesWithoutTheGarment:
+    @pytest.mark.parametrize("time", TIMES)
+    @pytest.mark.parametrize(("hide", "reason"), HIDES.items())
+    def test_are_named_and_left_out(
+        self, tmp_path: Path, hide: Callable[[UsdGeom.Mesh, float], None], reason: str, time: float
+    ):
+        stage = new_stage(tmp_path / "s.usda")
+        hide(add_sheet(stage, times=TIMES), time)
+        path, others = save(stage), tuple(each for each in TIMES if each != time)
+        shot = open_shot(path)
+        assert shot.scene.times == others
+        assert f"<{CLOTH}>: is not there at time code {time:g}: " in said(shot)
+        assert reason in said(shot)
+        assert all(np.ptp(shot.frame(each).garments[0].points, axis=0).max() > 1.0 for each in others)
+        alone = open_shot(path, frames=(others[0], others[0]))
+        assert (alone.scene.times, "is not there" in said(alone)) == (others[:1], False)
+
+    def test_of_a_shot_without_others_are_refused(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES[:1])
+        block(stage, f"{CLOTH}.points", 1.0)
+        with pytest.raises(GarmentError, match="at time code 1: its points have no value; it is there at no time code"):
+            open_shot(save(stage))
+
+    @pytest.mark.parametrize("hidden", [(1.0, 2.0), (3.0,), (4.0,)])
+    def test_are_blocked_in_the_layer(self, tmp_path: Path, hidden: tuple[float, ...]):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES)
+        for time in hidden:
+            block(stage, f"{CLOTH}.points", time)
+        shot = Path(save(stage))
+        layer = Sdf.Layer.FindOrOpen(str(write_layer(shot, tmp_path / "fine.usdc", velocities=True)))
+        for name in ("points", "normals", "extent", "velocities"):
+            values = [layer.QueryTimeSample(f"{CLOTH}.{name}", time) for time in TIMES]
+            gone = [time for time, value in zip(TIMES, values, strict=True) if isinstance(value, Sdf.ValueBlock)]
+            alone = [] if name != "velocities" or hidden != (3.0,) else [4.0]
+            assert (name, gone) == (name, sorted([*hidden, *alone]))
+        assert errors(tmp_path / "fine.usdc", shot) == []
+
+    def test_end_a_run_of_equal_samples(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = add_sheet(stage, times=())
+        for time in TIMES:
+            mesh.GetPointsAttr().Set(vec3(sheet_points(1.0)), time)
+        block(stage, f"{CLOTH}.points", 3.0)
+        layer = Sdf.Layer.FindOrOpen(str(write_layer(Path(save(stage)), tmp_path / "fine.usdc")))
+        held = [layer.QueryTimeSample(f"{CLOTH}.points", time) for time in sample_times(tmp_path / "fine.usdc")]
+        assert [type(each) for each in held[-2:]] == [Sdf.ValueBlock, Vt.Vec3fArray]
+
+    def test_that_another_garment_has_are_solved_without_it(self, tmp_path: Path):
+        """Of two sheets that lie on one another one is not there for a frame; the run is content."""
+        stage = new_stage(tmp_path / "s.usda", metres=0.05)
+        for name, height in (("cloth", 0.0), ("lining", 0.02)):
+            mesh = add_sheet(stage, f"/World/{name}", times=TIMES)
+            for time in TIMES:
+                mesh.GetPointsAttr().Set(vec3(sheet_points(time) + np.array([0.0, 0.0, height])), time)
+        block(stage, "/World/lining.points", 3.0)
+        shot, out = Path(save(stage)), tmp_path / "fine.usdc"
+        report = refine(shot, out, level=0)
+        assert report.exit_code == 0
+        assert [bool(frame["garments"][0].get("together")) for frame in report.frames] == [True, True, False, True]
+        layer = Sdf.Layer.FindOrOpen(str(out))
+        assert isinstance(layer.QueryTimeSample("/World/lining.points", 3.0), Sdf.ValueBlock)
+        assert not any(problem.severity == "error" for problem in validate_layer(out, shot))
+
+    def test_are_no_way_through_a_body(self, tmp_path: Path):
+        """A ball lies between the sheet's border and its middle, and another sheet has the frame."""
+        stage = new_stage(tmp_path / "s.usda")
+        for name in ("cloth", "other"):
+            add_sheet(stage, f"/World/{name}", times=TIMES)
+        block(stage, f"{CLOTH}.points", 3.0)
+        ball = UsdGeom.Sphere.Define(stage, "/World/ball")
+        ball.CreateRadiusAttr(0.3)
+        UsdGeom.XformCommonAPI(ball).SetTranslate((1.0, 0.75, 0.0))
+        ball.GetPrim().AddAppliedSchema(COLLIDER_API)
+        shot = open_shot(save(stage))
+        passed = Passed(shot.scene.garments, shot.scene.colliders)
+        assert [passed.look(shot.frame(time))[0] for time in TIMES] == [{}] * len(TIMES)
+
+    def test_are_an_error_of_a_layer_that_has_cloth_there(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES)
+        shot = Path(save(stage))
+        write_layer(shot, tmp_path / "fine.usdc")
+        block(stage, f"{CLOTH}.points", 3.0)
+        stage.Save()
+        assert any(
+            "the garment is not there: its points have no value" in each
+            for each in errors(tmp_path / "fine.usdc", shot)
+        )
+
+
+class TestValuesOfAnotherTime:
+    def body(self, stage: Usd.Stage, times: tuple[float, ...] = TIMES) -> UsdGeom.Mesh:
+        mesh = add_sheet(stage, "/World/floor", times=times, tagged=False, default=False)
+        mesh.GetPrim().AddAppliedSchema(COLLIDER_API)
+        return mesh
+
+    @pytest.mark.parametrize("name", ["points", "xformOp:translate", "xformOp:scale"])
+    def test_are_no_pose_of_a_body(self, tmp_path: Path, name: str):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES)
+        body = self.body(stage)
+        ops = {"xformOp:translate": body.AddTranslateOp(), "xformOp:scale": body.AddScaleOp()}
+        for time in TIMES if name in ops else ():
+            ops[name].Set(Gf.Vec3d(1.0) if name == "xformOp:translate" else Gf.Vec3f(float(time != 3.0)), time)
+        if name != "xformOp:scale":
+            block(stage, f"/World/floor.{name}", 3.0)
+        shot = open_shot(save(stage))
+        assert [shot.frame(time).colliders[0] is None for time in TIMES] == [False, False, True, False]
+        assert "</World/floor> at time code 3: this collider is left out here: " in said(shot)
+
+    def test_are_no_size_of_a_body(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES)
+        ball = UsdGeom.Sphere.Define(stage, "/World/ball")
+        ball.GetPrim().AddAppliedSchema(COLLIDER_API)
+        for time in TIMES:
+            ball.CreateRadiusAttr().Set(0.1, time)
+        block(stage, "/World/ball.radius", 3.0)
+        shot = open_shot(save(stage))
+        assert [shot.frame(time).colliders[0] is None for time in TIMES] == [False, False, True, False]
+
+    def test_are_no_value_of_an_attribute(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = add_sheet(stage, times=TIMES)
+        for time in TIMES:
+            author(mesh.GetPrim(), "physgraph:guide:stiffness", 1000.0 * time, time=time)
+            author(mesh.GetPrim(), "physgraph:refine:level", round(time), kind="int", time=time)
+        block(stage, f"{CLOTH}.physgraph:guide:stiffness", 3.0)
+        shot = open_shot(save(stage))
+        assert shot.frame(2.0).garments[0].guide == 2000.0
+        assert "physgraph:refine:level changes in time; its first sample is used throughout" in said(shot)
+        with pytest.raises(SchemaError, match="guide:stiffness at time code 3 is blocked"):
+            shot.frame(3.0)
+
+    def test_are_named_where_a_still_garment_takes_them(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=())
+        self.body(stage)
+        shot = open_shot(save(stage))
+        assert shot.frame(None).colliders[0] is not None
+        assert "</World/floor>: has no points by default" in said(shot)
+
+
+class TestSamplesOfBodies:
+    @pytest.mark.parametrize(
+        ("times", "message"),
+        [
+            (
+                (11.0, 12.0),
+                "run from 11 to 12, those of </World/cloth> from 1 to 4, and share no time; it stands still",
+            ),
+            ((1.5, 2.5, 3.5), "share no time; it stands still before 1.5 and after 3.5"),
+            ((0.5, 1.5, 4.5), "share no time; its poses are interpolated"),
+            ((1.0, 2.0), "it stands still after 2"),
+            ((3.0, 4.0, 5.0), "it stands still before 3"),
+            ((0.0, 1.0, 4.0), ""),
+            ((2.0,), ""),
+        ],
+    )
+    def test_that_miss_the_garments_are_named(self, tmp_path: Path, times: tuple[float, ...], message: str):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES)
+        body = add_sheet(stage, "/World/floor", times=times, tagged=False)
+        body.GetPrim().AddAppliedSchema(COLLIDER_API)
+        warnings = [each for each in inspect_shot(save(stage))["warnings"] if "</World/floor>: its samples" in each]
+        assert [message in each for each in warnings] == [True] * bool(message)
+
+    def test_that_a_file_of_another_rate_moves_are_named(self, tmp_path: Path):
+        for name, rate in (("cloth", 25.0), ("floor", None)):
+            part = new_stage(tmp_path / f"{name}.usda", rate=rate or 24.0)
+            mesh = add_sheet(part, f"/World/{name}", times=(1001.0, 1002.0), tagged=name == "cloth")
+            mesh.GetPrim().AddAppliedSchema(COLLIDER_API) if rate is None else None
+            save(part)
+        root = Sdf.Layer.CreateNew(str(tmp_path / "root.usda"))
+        root.subLayerPaths[:] = ["./cloth.usda", "./floor.usda"]
+        root.Save()
+        found = said(open_shot(root.realPath))
+        assert "cloth.usda@ has 25 time codes per second, @root.usda@ has no rate, which counts as 24" in found
+        assert (
+            "</World/floor>: its samples run from 1001 to 1002, those of </World/cloth> from 960.96 to 961.92" in found
+        )
+
+
+def moving(stage: Usd.Stage, *, cut: float = 9.0) -> UsdGeom.Mesh:
+    """A sheet that moves by `STEP` from sample to sample, and by 100 units more at a cut."""
+    mesh = add_sheet(stage, times=())
+    for time in TIMES:
+        points = sheet_points(0.0) + STEP * time + np.array([0.0, 100.0 * (time >= cut), 0.0])
+        mesh.GetPointsAttr().Set(vec3(points), time)
+    return mesh
+
+
+def velocities(layer: Path) -> dict[float, list[float] | None]:
+    """Mean velocity in a layer at each sample, None where it is blocked."""
+    name, found = f"{CLOTH}.velocities", Sdf.Layer.FindOrOpen(str(layer))
+    values = {time: found.QueryTimeSample(name, time) for time in found.ListTimeSamplesForPath(name)}
+    return {
+        time: None if isinstance(value, Sdf.ValueBlock) else np.asarray(value).mean(axis=0).round(2).tolist()
+        for time, value in values.items()
+    }
+
+
+class TestVelocities:
+    RIGHT = [12.0, 0.0, 0.0]  # noqa: RUF012
+
+    @pytest.mark.parametrize("cut", [2.0, 3.0, 4.0])
+    def test_are_never_taken_across_a_cut(self, tmp_path: Path, cut: float):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = moving(stage, cut=cut)
+        mesh.CreateVelocitiesAttr([self.RIGHT] * len(mesh.GetPointsAttr().Get(1.0)))
+        shot, out = Path(save(stage)), tmp_path / "fine.usdc"
+        assert jumps(open_shot(str(shot)), 0) == {cut}
+        refine(shot, out, level=0, temporal="off")
+        found = velocities(out)
+        assert tuple(found) == TIMES
+        assert all(np.allclose(each, self.RIGHT, atol=0.3) for each in found.values() if each is not None)
+        assert None not in found.values()
+
+    def test_of_cloth_that_is_fast_are_no_cuts(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = moving(stage)
+        UsdGeom.Xformable(mesh).AddTranslateOp()
+        for time in TIMES:
+            mesh.GetPointsAttr().Set(vec3(sheet_points(0.0) + 1000.0 * STEP * time), time)
+        assert not jumps(open_shot(save(stage)), 0)
+
+    @pytest.mark.parametrize("samples", [(None,), (1.0, 2.0, 3.0, 4.0), (2.0, 4.0)])
+    def test_of_a_frame_alone_are_the_shots_own(self, tmp_path: Path, samples: tuple[float | None, ...]):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = moving(stage)
+        own = Vt.Vec3fArray([self.RIGHT] * len(mesh.GetPointsAttr().Get(1.0)))
+        for time in samples:
+            mesh.CreateVelocitiesAttr().Set(own, Usd.TimeCode.Default() if time is None else time)
+        save(stage)
+        shot = open_shot(str(tmp_path / "s.usda"), frames=(3.0, 3.0))
+        assert shot.sources[0].velocities
+        refine(tmp_path / "s.usda", tmp_path / "fine.usdc", frames=(3.0, 3.0), level=1)
+        assert velocities(tmp_path / "fine.usdc") == {3.0: self.RIGHT}
+
+    def test_of_a_frame_alone_are_blocked_with_a_word_where_the_shot_has_none(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = moving(stage)
+        mesh.CreateVelocitiesAttr().Set([self.RIGHT] * len(mesh.GetPointsAttr().Get(1.0)), 4.0)
+        shot = Path(save(stage))
+        report = refine(shot, tmp_path / "fine.usdc", frames=(3.0, 3.0), level=0)
+        assert velocities(tmp_path / "fine.usdc") == {3.0: None}
+        assert any("its velocities are blocked at time code 3: " in warning for warning in report.warnings)
+
+    def test_that_begin_at_the_second_sample_are_the_shots(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = moving(stage)
+        mesh.CreateVelocitiesAttr().Set(Vt.Vec3fArray(), 1.0)
+        mesh.GetVelocitiesAttr().Set([self.RIGHT] * len(mesh.GetPointsAttr().Get(1.0)), 2.0)
+        write_layer(Path(save(stage)), tmp_path / "fine.usdc")
+        assert velocities(tmp_path / "fine.usdc") == dict.fromkeys(TIMES, self.RIGHT)
+
+    def test_of_a_still_garment_are_its_default(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = add_sheet(stage, times=())
+        mesh.CreateVelocitiesAttr([self.RIGHT] * len(mesh.GetPointsAttr().Get()))
+        out = write_layer(Path(save(stage)), tmp_path / "fine.usdc")
+        layer = Sdf.Layer.FindOrOpen(str(out))
+        value = np.asarray(layer.GetAttributeAtPath(f"{CLOTH}.velocities").default)
+        assert np.unique(value, axis=0).tolist() == [self.RIGHT]
