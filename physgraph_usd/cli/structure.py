@@ -12,7 +12,7 @@ from typing import Any, Never
 import click
 
 from ..errors import PhysGraphError
-from ..interrupts import SIGNALLED
+from ..interrupts import SIGNALLED, importing
 
 DONE, FAILED = 0, 1
 EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
@@ -50,7 +50,8 @@ def imports_uncollected() -> Iterator[None]:
     """Keep the garbage collector from torch's million objects, which live as long as the process: 3 s become 2."""
     gc.disable()
     try:
-        yield
+        with importing():
+            yield
     finally:
         gc.freeze()
         gc.enable()

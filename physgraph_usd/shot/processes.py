@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from ..errors import PhysGraphError, SolveError
-from ..interrupts import signals_raise
+from ..interrupts import leave_if_asked, signals_noted
 
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0
@@ -95,6 +95,7 @@ def call_each(
     try:
         for index in range(len(jobs)):
             while not (index < len(calls) and calls[index].ready):
+                leave_if_asked()
                 if len(calls) < len(jobs) and sum(not call.ready for call in calls) < workers:
                     calls.append(Call(function, *jobs[len(calls)]))
                 else:
@@ -131,7 +132,7 @@ def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ..
     """Call the function and send its result; Ctrl-C is the business of the process that started this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_outlast_parent, daemon=True).start()
-    with signals_raise(), _Sent(there), memory_is_named():
+    with signals_noted(), _Sent(there), memory_is_named():
         there.send((function(*args), None))
 
 
