@@ -65,6 +65,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--short", action="store_true")
     count = 8 if parser.parse_args().short else 40
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # A shell lets its background jobs ignore Ctrl-C.
     rng, lines, wrong = np.random.default_rng(0), [], 0
     with tempfile.TemporaryDirectory() as folder:
         known = list(commands(Path(folder)).items())

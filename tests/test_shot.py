@@ -301,7 +301,7 @@ class TestOptions:
         assert frames == []
 
     def test_a_folder_that_is_not_there(self, shot: Path, tmp_path: Path):
-        with pytest.raises(LayerError, match="does not exist"):
+        with pytest.raises(UsageError, match="does not exist"):
             refine(shot, tmp_path / "no" / "fine.usdc")
 
     def test_the_shot_itself_is_never_the_output(self, shot: Path):
