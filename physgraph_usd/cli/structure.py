@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import gc
+import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Never
@@ -26,6 +28,7 @@ class Commands(click.Group):
         """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
         from ..shot.processes import memory_is_named
 
+        _open_closed_streams()
         try:
             with memory_is_named():
                 return super().invoke(ctx)
@@ -43,6 +46,17 @@ class Commands(click.Group):
             if missing not in EXTRAS:
                 raise
             _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
+
+
+def _open_closed_streams() -> None:
+    """Let output go nowhere where its stream was closed by who started this: a file opened later would get it."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            os.dup2(nowhere, number)
+            if nowhere != number:
+                os.close(nowhere)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))
 
 
 @contextmanager
