@@ -13,7 +13,7 @@ from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_times
 from stages import author
 
-from physgraph_usd.errors import LayerError, SchemaError, StageError, UsageError
+from physgraph_usd.errors import SchemaError, StageError, UsageError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.usd.check.validate import validate_layer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import re
@@ -18,9 +19,10 @@ from typing import Any
 from ..errors import PhysGraphError, SolveError
 from ..interrupts import leave_if_asked, signals_noted
 
+LOG = logging.getLogger("physgraph_usd")
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0
-"""How long a process that was asked to end may clear up."""
+"""How long a process that was asked to end may clear up, and one that is stopped may pause before a warning."""
 _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
 
 
@@ -41,11 +43,37 @@ class Call:
         self._process.start()
         there.close()
         self._answer: tuple[Any, PhysGraphError | None] | None = None
+        self._stopped_since: float | None = None
+        self._told = False
 
     @property
     def ready(self) -> bool:
-        """Whether it has returned, failed or died."""
-        return self._answer is not None or self._here.poll()
+        """Whether it has returned, failed or died; of one that is stopped a warning tells."""
+        if self._answer is not None or self._here.poll():
+            return True
+        self._warn_if_stopped()
+        return False
+
+    def _warn_if_stopped(self) -> None:
+        """Warn once of a process that somebody stopped for so long that it is no pause of the whole run."""
+        if self._told or not self._is_stopped():
+            self._stopped_since = None
+            return
+        now = time.monotonic()
+        self._stopped_since = self._stopped_since or now
+        if now - self._stopped_since >= PATIENCE_SECONDS:
+            from .warnings import WARNINGS  # noqa: PLC0415  It imports USD, which most commands need later or not at all.
+
+            LOG.warning(WARNINGS["stopped"](pid=self._process.pid, seconds=PATIENCE_SECONDS))
+            self._told = True
+
+    def _is_stopped(self) -> bool:
+        if not hasattr(os, "waitid") or self._process.pid is None:
+            return False
+        try:  # WNOWAIT leaves the process's end to multiprocessing.
+            return os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+        except ChildProcessError:  # It has ended.
+            return False
 
     def result(self) -> Any:
         """The function's result; waits for it.
@@ -69,6 +97,8 @@ class Call:
     def ask_to_end(self) -> None:
         """Ask it to clear up and end, and do not wait."""
         self._process.terminate()
+        if self._is_stopped() and self._process.pid is not None:
+            os.kill(self._process.pid, signal.SIGCONT)
 
     def end(self) -> None:
         """End it, with time to clear up."""
