@@ -42,6 +42,10 @@ class Work(Protocol):
         """The function's result; raises what ended it."""
         ...
 
+    def ask_to_end(self) -> None:
+        """Ask it to end, and do not wait."""
+        ...
+
     def end(self) -> None:
         """End it, if it is still at work."""
         ...
@@ -132,6 +136,8 @@ def solve_in_chunks(
                 outcome = outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight))
             yield outcome
     finally:
+        for call in calls:
+            call.ask_to_end()
         for call in calls:
             call.end()
 

@@ -66,9 +66,13 @@ class FarmCall:
             raise error
         return value
 
-    def end(self) -> None:
+    def ask_to_end(self) -> None:
         """End it where it has not begun; a frame that a worker is solving is finished first."""
         self._future.cancel()
+
+    def end(self) -> None:
+        """The same: nothing here waits for a worker."""
+        self.ask_to_end()
 
 
 @contextmanager

@@ -226,7 +226,7 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
     """
     options = RefineOptions(**given)
     source = str(shot) if isinstance(shot, Path) else shot
-    files_of(source)  # A named pipe among them is an error here, and a wait for ever when opened.
+    files_of(source)  # A pipe among them is an error here, and a wait for ever when opened.
     try:
         with closing(open_for(source, options)) as opened:
             found = describe(opened, options)

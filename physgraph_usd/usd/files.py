@@ -30,7 +30,7 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
     open is its only one.
 
     Raises:
-        StageError: One is a named pipe, at which USD would wait for ever.
+        StageError: One is a pipe, at which USD would wait for ever.
     """
     found: set[Path] = set()
     if isinstance(shot, Usd.Stage):
@@ -41,7 +41,7 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
         while waiting:
             file = Path(Ar.SplitPackageRelativePathOuter(waiting.pop())[0])
             if file.is_fifo():
-                raise StageError(f"{file} is a named pipe, and no file that USD can read")
+                raise StageError(f"{file} is no file: it is a pipe, which has no end")
             if file not in found and not (found and _is_result(file)):
                 found.add(file)
                 waiting += _named_in(file)
