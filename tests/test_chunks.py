@@ -155,9 +155,7 @@ def test_a_worker_that_is_stopped_is_told_of_once_and_ends_all_the_same(
     monkeypatch.undo()
     call.end()
     told = [record.message for record in caplog.records]
-    assert told == [
-        f"the worker process {pid} has been stopped for 0 s, and the run waits for it; kill -CONT {pid} lets it go on"
-    ]
+    assert told == [f"the worker process {pid} is stopped and the run waits; kill -CONT {pid} lets it go on"]
     assert not multiprocessing.active_children()
 
 

@@ -56,15 +56,14 @@ class Call:
 
     def _warn_if_stopped(self) -> None:
         """Warn once of a process that somebody stopped for so long that it is no pause of the whole run."""
+        pid = self._process.pid
         if self._told or not self._is_stopped():
             self._stopped_since = None
             return
         now = time.monotonic()
         self._stopped_since = self._stopped_since or now
         if now - self._stopped_since >= PATIENCE_SECONDS:
-            from .warnings import WARNINGS  # noqa: PLC0415  It imports USD, which most commands need later or not at all.
-
-            LOG.warning(WARNINGS["stopped"](pid=self._process.pid, seconds=PATIENCE_SECONDS))
+            LOG.warning("the worker process %d is stopped and the run waits; kill -CONT %d lets it go on", *2 * (pid,))
             self._told = True
 
     def _is_stopped(self) -> bool:

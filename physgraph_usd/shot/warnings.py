@@ -140,12 +140,6 @@ WARNINGS = {
         "{kept} are those of a run that was interrupted; the others are solved{again}",
         "folds that can lie in several ways may lie otherwise there than in an undisturbed run",
     ),
-    "stopped": Kind(
-        "a worker process is stopped",
-        "`kill -CONT` with its number; a debugger, or a job control of the farm, has stopped it",
-        "the worker process {pid} has been stopped for {seconds:.0f} s, and the run waits for it",
-        "kill -CONT {pid} lets it go on",
-    ),
     "slower": Kind(
         "cholespy is not installed",
         "install it, where it has a wheel: solves take less time",
