@@ -44,7 +44,7 @@ class Call:
         there.close()
         self._answer: tuple[Any, PhysGraphError | None] | None = None
         self._stopped_since: float | None = None
-        self._told = False
+        self._has_warned = False
 
     @property
     def ready(self) -> bool:
@@ -57,14 +57,14 @@ class Call:
     def _warn_if_stopped(self) -> None:
         """Warn once of a process that somebody stopped for so long that it is no pause of the whole run."""
         pid = self._process.pid
-        if self._told or not self._is_stopped():
+        if self._has_warned or not self._is_stopped():
             self._stopped_since = None
             return
         now = time.monotonic()
         self._stopped_since = self._stopped_since or now
         if now - self._stopped_since >= PATIENCE_SECONDS:
             LOG.warning("the worker process %d is stopped and the run waits; kill -CONT %d lets it go on", *2 * (pid,))
-            self._told = True
+            self._has_warned = True
 
     def _is_stopped(self) -> bool:
         if not hasattr(os, "waitid") or self._process.pid is None:
