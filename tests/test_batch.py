@@ -180,6 +180,16 @@ class TestLogging:
         done = run("refine", shot, "-o", tmp_path / "o.usdc", "--log-file", shot, *SMALL)
         assert (done.exit_code, "the log" in done.stderr, shot.read_bytes()) == (2, True, before)
 
+    def test_it_is_appended_to_logs_alone(self, tmp_path: Path) -> None:
+        shot, log, other = cloth_shot(tmp_path / "good.usda", times=(1.0,)), tmp_path / "log", tmp_path / "notes.txt"
+        other.write_text("buy milk\n")
+        for count in (1, 2):
+            done = run("refine", shot, "-o", tmp_path / "o.usdc", "--log-file", log, "--overwrite", *SMALL)
+            assert (done.exit_code, log.read_text().count("frame 1 of 1")) == (0, count)
+        done = run("refine", shot, "-o", tmp_path / "o.usdc", "--log-file", other, "--overwrite", *SMALL)
+        assert (done.exit_code, f"{other} exists and is no log" in done.stderr) == (2, True)
+        assert other.read_text() == "buy milk\n"
+
     def test_more_is_said_when_asked(self, tmp_path: Path) -> None:
         shot = cloth_shot(tmp_path / "good.usda", times=(1.0, 2.0))
         said = run("refine", shot, "-o", tmp_path / "o.usdc", "-v", *SMALL).stderr

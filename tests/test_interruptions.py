@@ -171,6 +171,56 @@ def test_interrupted_at_any_moment_of_kernels_on_several_threads(
         says_interrupted(out, report, summary, code=code, of=24)
 
 
+IMPORT = """
+import signal
+from physgraph_usd.interrupts import at_end, importing, signals_noted
+with signals_noted(), at_end(lambda code: print("ends with", code)):
+    signal.raise_signal(signal.{number}) if {early} else None
+    with importing():
+        try:
+            signal.raise_signal(signal.{number})
+        except BaseException:
+            pass
+        print("went on")
+"""
+
+
+@pytest.mark.parametrize("early", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_amid_imports_ends_the_process_whatever_they_catch(number: signal.Signals, early: bool):
+    """One that came before them raises where they begin."""
+    program = [sys.executable, "-c", IMPORT.format(number=number.name, early=early)]
+    done = subprocess.run(program, capture_output=True, text=True, check=False, preexec_fn=let_interrupt)
+    code = done.returncode if done.returncode >= 0 else 128 - done.returncode
+    assert (code, done.stdout) == (128 + number, "" if early else f"ends with {128 + number}\n")
+
+
+def let_interrupt() -> None:
+    """A shell lets its background jobs ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.mark.slow
+def test_every_signal_at_any_moment_of_any_command_ends_it():
+    """Must hold 4 in brief; all of it is the program itself."""
+    line = [sys.executable, "-m", "benchmarks.signals", "--short"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.slow
+def test_closed_streams_cost_nothing(shot: Path, tmp_path: Path):
+    out = tmp_path / "fine.usdc"
+    line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), "--frames", "1:3", "-v"]
+
+    def close() -> None:
+        for number in range(3):
+            os.close(number)
+
+    assert subprocess.run(line, check=False, preexec_fn=close).returncode == 0
+    assert faults(out, shot) == []
+
+
 def test_a_second_run_leaves_the_frames_of_the_first_alone(shot: Path, whole: bytes):
     """Two processes with one output; the first one waits where it is until the second has ended, then goes on."""
     out = shot.parent / "two" / "fine.usdc"

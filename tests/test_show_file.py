@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,14 @@ def test_what_it_cannot_mean_is_refused_by_name(shot: Path, text: str, said: str
     file = write(shot.parent, text)
     done = run("refine", shot, "-o", shot.parent / "o.usdc")
     assert (done.exit_code, str(file) in done.stderr, said in done.stderr) == (2, True, True), done.stderr
+
+
+def test_a_pipe_and_values_nested_too_deep_are_refused(shot: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    deep = write(tmp_path, f"[refine]\nset = {'[' * 5000}{']' * 5000}\n", "deep.toml")
+    for file in (tmp_path / "pipe.toml", deep):
+        done = run("refine", shot, "-o", tmp_path / "o.usdc", "--config", file)
+        assert (done.exit_code, f"cannot read {file}" in done.stderr) == (2, True), done.stderr
 
 
 def test_a_file_that_is_named_and_not_there_is_refused(shot: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from shots import CLOTH, EDGE, cloth_shot, faults, fine, refine, run, sample_tim
 from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.cli import main
-from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageError
+from physgraph_usd.errors import AbsentError, LayerError, PhysGraphError, UsageError
 from physgraph_usd.shot.stitch import SEAM_BOUND, check_seams, stitch
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record
@@ -119,6 +119,29 @@ class TestOneLayer:
         assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["seam at 9", "seam at 17"]
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
 
+    @pytest.mark.parametrize("time", [12.0, 16.0])
+    def test_a_value_that_is_not_finite_is_refused_by_frame(self, runs: Runs, tmp_path: Path, time: float):
+        """In the middle of a chunk, and where two are joined with the body."""
+        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
+        broken = points(copies[1], time).copy()
+        broken[7, 1] = np.nan
+        layer = Sdf.Layer.FindOrOpen(str(copies[1]))
+        layer.SetTimeSample(f"{CLOTH}.points", time, vec3(broken))
+        layer.Save()
+        with pytest.raises(
+            LayerError, match=rf"{copies[1]}: <{CLOTH}> at time code {time:g}: points: value 7 is \[.*nan"
+        ):
+            stitch(copies, tmp_path / "joined.usdc")
+        assert not (tmp_path / "joined.usdc").exists()
+
+    def test_a_chunk_that_was_changed_is_refused(self, runs: Runs, tmp_path: Path):
+        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
+        layer = Sdf.Layer.FindOrOpen(str(copies[1]))
+        layer.EraseTimeSample(f"{CLOTH}.points", 12.0)
+        layer.Save()
+        with pytest.raises(LayerError, match=rf"{copies[1]} was changed after refine wrote it"):
+            stitch(copies, tmp_path / "joined.usdc")
+
     def test_without_the_shot_it_is_made_too(self, runs: Runs, tmp_path: Path):
         """Chunks that were copied elsewhere: what they hold is enough."""
         copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
@@ -205,7 +228,7 @@ class TestRefused:
     def test_a_range_without_a_frame(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc")
         with pytest.raises(
-            StageError, match=r"no sample of the shot lies in frames 7:9; its 6 samples run from 1 to 6"
+            AbsentError, match=r"no sample of the shot lies in frames 7:9; its 6 samples run from 1 to 6"
         ):
             refine_chunks(shot, tmp_path, [(7.0, 9.0)])
 

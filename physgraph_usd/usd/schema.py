@@ -283,7 +283,12 @@ COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.sch
 
 def fabric_values(fabric: Fabric) -> dict[str, float]:
     """Values of a fabric by the schema's short names, without those that it has not."""
-    values = {
+    return {name: value for name, value in every_fabric_value(fabric).items() if value is not None}
+
+
+def every_fabric_value(fabric: Fabric) -> dict[str, float | None]:
+    """Values of a fabric by the schema's short names, None for those that it has not."""
+    return {
         "stretchStiffness": fabric.stretch,
         "weftStretchStiffness": fabric.weft_stretch,
         "shearStiffness": fabric.shear,
@@ -296,7 +301,6 @@ def fabric_values(fabric: Fabric) -> dict[str, float]:
         "rest:weftEase": 100.0 * fabric.weft_ease or None,
         "rest:creaseTime": fabric.crease_time or None,
     }
-    return {name: value for name, value in values.items() if value is not None}
 
 
 def find_property(text: str) -> Property:

@@ -20,6 +20,7 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
+from ...interrupts import leave_if_asked
 from ...solver.colliders.choose_side import choose_side
 from ...solver.colliders.pose import MeshPose
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
@@ -142,6 +143,7 @@ class Shot:
             SchemaError: When an animated value cannot be used.
             StageError: When USD cannot read the files any more.
         """
+        leave_if_asked()
         garments, notices = [], []
         with pxr_errors(f"cannot read {self.path}" + at_time(time)):
             for index, reader in enumerate(self._readers):
@@ -401,7 +403,7 @@ def _read(
             readers.append(read_garment(prim, instances, samples, request))
     if request.frames and every and not within(every, request.frames):
         message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
-        raise StageError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
+        raise AbsentError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")
