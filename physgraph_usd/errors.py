@@ -2,7 +2,7 @@
 
     PhysGraphError
     |-- UsageError          an option or argument is wrong (exit code 2)
-    |   `-- AbsentError     a file or a prim that was named is not there; a StageError too
+    |   `-- AbsentError     a file, a prim or a frame that was named is not there; a StageError too
     |-- StageError          the input stage cannot be read as asked
     |   |-- GarmentError    one garment prim is broken: names prim, time code and remedy
     |   `-- SchemaError     an attribute has an unusable type or value
@@ -49,7 +49,7 @@ class StageError(PhysGraphError):
 
 
 class AbsentError(UsageError, StageError):
-    """A file or a prim that was named is not there."""
+    """A file, a prim or a frame that was named is not there."""
 
 
 class GarmentError(StageError):

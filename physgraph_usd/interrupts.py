@@ -1,59 +1,76 @@
-"""Signals that end a run: Ctrl-C and a polite termination become exceptions, when leaving frees nothing in use.
+"""Ctrl-C and polite terminations: the signal handler notes them, and the run asks between frames and rounds.
 
-Python runs signal handlers between any two lines. An exception raised while other threads work on arrays of the
-interrupted call would free these under them; so inside `undisturbed` a signal is only noted, and raised at its end.
+Python runs signal handlers between any two lines. An exception raised there is lost in a destructor and in foreign
+code that catches it, and frees arrays that other threads work on. So the handler raises nothing: `leave_if_asked`
+raises, at places where leaving is safe, and `is_asked` ends the loops of a frame. While modules are imported, which
+takes seconds, nothing can be asked; the handler ends the process there.
 """
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType, TracebackType
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Never
 
 SIGNALLED = 128
 """A shell reports the end by a signal as this plus the signal's number."""
-_MAIN = threading.main_thread().ident
 
 
 class _Signals:
-    """Signals noted in the main thread, where Python runs all handlers.
+    """State of the signal handler.
 
     Attributes:
-        noted: Those that came, until the block that handles them ends.
-        depth: How many `undisturbed` blocks the main thread is in.
-        waiting: Whether the last one noted has yet to be raised.
+        noted: Number of the last signal, or None.
+        importing: Number of `importing` blocks around the current line.
+        at_end: Functions to call before the handler ends the process, each with the exit code.
     """
 
     def __init__(self) -> None:
-        self.noted: list[int] = []
-        self.depth, self.waiting = 0, False
+        self.noted: int | None = None
+        self.importing = 0
+        self.at_end: list[Callable[[int], object]] = []
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Signal handler."""
-        self.noted.append(number)
-        if self.depth:
-            self.waiting = True
-        else:
-            _leave(number)
+        """Note a signal; while modules are imported, end the process."""
+        self.noted = number
+        if self.importing:
+            _end(SIGNALLED + number)
 
 
 _SIGNALS = _Signals()
 
 
-def _leave(number: int) -> None:
+def _end(code: int) -> Never:
+    for function in reversed(_SIGNALS.at_end):
+        function(code)
+    with suppress(OSError, ValueError, RuntimeError):  # Closed, full, or amid a write.
+        if code == SIGNALLED + signal.SIGINT:
+            sys.stderr.write("interrupted\n")
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+    os._exit(code)
+
+
+def _leave(number: int) -> Never:
     if number == signal.SIGINT:
         raise KeyboardInterrupt
     raise SystemExit(SIGNALLED + number)
 
 
 @contextmanager
-def signals_raise() -> Iterator[None]:
-    """Turn a polite termination into SystemExit, as Ctrl-C is a KeyboardInterrupt, so that ``with`` blocks clean up.
+def signals_noted() -> Iterator[None]:
+    """Note Ctrl-C and a polite termination inside the block; one that was not asked for is raised at its end.
 
-    An exception that a signal raises while a destructor runs is lost; `leave_if_asked` raises it again. Does nothing
-    outside the main thread, or to a signal that the host program handles itself.
+    Does nothing outside the main thread, nor with a signal that the host program handles itself.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C came.
+        SystemExit: A termination came; with the code by which a shell reports it.
     """
     taken = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
     ours = threading.current_thread() is threading.main_thread()
@@ -65,20 +82,47 @@ def signals_raise() -> Iterator[None]:
     finally:
         for number, before in taken.items():
             signal.signal(number, before)
-        if taken:
-            _SIGNALS.noted.clear()
-            _SIGNALS.waiting = False
+        noted = _SIGNALS.noted if taken else None
+        if noted is not None:
+            _SIGNALS.noted = None
+            _leave(noted)
+
+
+def is_asked() -> bool:
+    """Whether a signal asked the run to end."""
+    return _SIGNALS.noted is not None
 
 
 def leave_if_asked() -> None:
-    """Leave where a signal came and its exception was lost.
+    """Leave where a signal asked for it; the main thread leaves, others end with it.
 
     Raises:
-        KeyboardInterrupt: It was Ctrl-C.
-        SystemExit: It was a termination, with the code by which a shell reports it.
+        KeyboardInterrupt: Ctrl-C came.
+        SystemExit: A termination came; with the code by which a shell reports it.
     """
-    if _SIGNALS.noted:
-        _leave(_SIGNALS.noted[-1])
+    if _SIGNALS.noted is not None and threading.current_thread() is threading.main_thread():
+        _leave(_SIGNALS.noted)
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Let a noted signal end the process inside the block: imports take too long to wait for, and break when left."""
+    leave_if_asked()
+    _SIGNALS.importing += 1
+    try:
+        yield
+    finally:
+        _SIGNALS.importing -= 1
+
+
+@contextmanager
+def at_end(function: Callable[[int], object]) -> Iterator[None]:
+    """Call a function with the exit code where a signal ends the process inside the block, in place of leaving it."""
+    _SIGNALS.at_end.append(function)
+    try:
+        yield
+    finally:
+        _SIGNALS.at_end.pop()
 
 
 def exit_code_of(error: BaseException | None) -> int | None:
@@ -87,26 +131,3 @@ def exit_code_of(error: BaseException | None) -> int | None:
         return SIGNALLED + signal.SIGINT
     code = error.code if isinstance(error, SystemExit) else None
     return code if isinstance(code, int) and code > SIGNALLED else None
-
-
-class Undisturbed:
-    """A block that no signal leaves in the middle; one that came is raised at its end."""
-
-    def __enter__(self) -> None:
-        """Note signals from now on."""
-        if threading.get_ident() == _MAIN:
-            _SIGNALS.depth += 1
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Raise what was noted."""
-        if threading.get_ident() == _MAIN:
-            _SIGNALS.depth -= 1
-            if _SIGNALS.waiting and not _SIGNALS.depth:
-                _SIGNALS.waiting = False
-                leave_if_asked()
-
-
-undisturbed = Undisturbed()
-"""The block to use; it holds no state of its own."""

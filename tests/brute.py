@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from physgraph_usd.solver.level import Level
 
@@ -35,21 +36,30 @@ class Soup:
 
 
 def crossing_points(x: np.ndarray, edges: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges that pass through faces with which they share no vertex: numbers of both, and where, shape (N, 3)."""
-    found: list[tuple[np.ndarray, ...]] = []
-    p, q, r = (x[faces[:, i]] for i in range(3))
-    for number, (a, b) in enumerate(edges):
-        along = x[b] - x[a]
-        matrix = np.stack([q - p, r - p, np.broadcast_to(-along, p.shape)], axis=2)
-        det = np.linalg.det(matrix)
-        safe = np.abs(det) > 1e-18
-        u, v, t = np.full((3, len(faces)), -1.0)
-        u[safe], v[safe], t[safe] = np.linalg.solve(matrix[safe], (x[a] - p[safe])[:, :, None])[:, :, 0].T
-        through = (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
-        which = np.flatnonzero(through & ~((faces == a) | (faces == b)).any(axis=1))
-        found.append((np.full(len(which), number), which, x[a] + t[which, None] * along))
-    edge, face, point = (np.concatenate(part) for part in zip(*found, strict=True))
-    return edge, face, point
+    """Edges that pass through faces with which they share no vertex: numbers of both, and where, shape (N, 3).
+
+    Those in one plane, as on a table, do not cross.
+    """
+    edge, face = _near(x, edges, faces)
+    apart = (edges[edge][:, :, None] != faces[face][:, None, :]).all(axis=(1, 2))
+    edge, face = edge[apart], face[apart]
+    (a, b), (p, q, r) = x[edges[edge].T], x[faces[face].T]
+    matrix = np.stack([q - p, r - p, a - b], axis=2)
+    safe = np.abs(np.linalg.det(matrix)) > 1e-12 * np.linalg.norm(matrix, axis=1).prod(axis=1)
+    u, v, t = np.full((3, len(edge)), -1.0)
+    u[safe], v[safe], t[safe] = np.linalg.solve(matrix[safe], (a - p)[safe, :, None])[:, :, 0].T
+    through = (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
+    return edge[through], face[through], (a + t[:, None] * (b - a))[through]
+
+
+def _near(points: np.ndarray, edges: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges and triangles whose balls meet."""
+    middle, centre = points[edges].mean(axis=1), points[faces].mean(axis=1)
+    half = 0.5 * np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
+    round_ = np.linalg.norm(points[faces] - centre[:, None], axis=2).max(axis=1)
+    found = cKDTree(middle).sparse_distance_matrix(cKDTree(centre), half.max() + round_.max(), output_type="ndarray")
+    kept = found["v"] <= half[found["i"]] + round_[found["j"]]
+    return found["i"][kept], found["j"][kept]
 
 
 def crossings(soup: Soup, meets: np.ndarray | None = None) -> set[tuple[int, int]]:

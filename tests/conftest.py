@@ -9,6 +9,9 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+# Tests run side by side, each on one core, and so do the commands that they start. numpy reads this as it is imported.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
 import numpy as np
 import pytest
 import torch
@@ -56,13 +59,15 @@ def real_data() -> Path:
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """A function from a sample's name to its shot file, written once per session; do not change the file."""
     pytest.importorskip("pxr", reason="samples are written with usd-core")
-    from physgraph_usd.lab.samples import write_sample
+    from stages import built
+
+    from physgraph_usd.usd.write.sample_stage import write_stage
 
     written: dict[str, Path] = {}
 
     def write(name: str) -> Path:
         if name not in written:
-            written[name] = write_sample(name, tmp_path_factory.mktemp(name))
+            written[name] = write_stage(built(name), tmp_path_factory.mktemp(name) / f"{name}.usdc")
         return written[name]
 
     return write

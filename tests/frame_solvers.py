@@ -87,3 +87,14 @@ def as_named(shot: str, *_: object) -> Any:
     if shot == "raises":
         raise KeyError("a bug")
     return shot
+
+
+def fails(kind: str) -> int:
+    """What a task of a farm may do."""
+    if kind == "garment":
+        raise GarmentError("/World/cloth", "torn", time=5.0)
+    if kind == "bug":
+        raise ValueError("a bug")
+    if kind == "dies":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()

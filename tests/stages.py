@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
+from physgraph_usd.usd.write.plain import PlainStage
+
 GARMENT_API = "PhysGraphGarmentAPI"
 COLLIDER_API = "PhysGraphColliderAPI"
 SIZE = (4, 3)
 KINDS = ("quads", "triangles", "ngons", "mixed")
+
+
+@cache
+def built(sample: str) -> PlainStage:
+    """A sample's record, made once in a process; do not change it."""
+    module, _, variant = sample.partition("_")
+    return import_module(f"physgraph_usd.lab.samples.{module}").build(*filter(None, [variant]))
 
 
 def new_stage(path: Path, *, metres: float | None = 1.0, up: str = "Y", rate: float = 24.0) -> Usd.Stage:

@@ -34,9 +34,8 @@ def beside(points: np.ndarray) -> np.ndarray:
     return points + np.array([np.ptp(points[:, 0]), 0.0, 0.0])
 
 
-SHEET = square(5)
+SHEET = square(4)
 SCENES: dict[str, tuple[Sequence[Cloth], Sequence[np.ndarray]]] = {
-    "on a ball": ([SHEET], [SHEET[1] + OVER]),
     "crumpled on a ball": ([SHEET], [crumpled(SHEET[1]) + OVER]),
     "one through the other": ([SHEET] * 2, [SHEET[1], tilted(SHEET[1])]),
     "sewn on a ball": ([SHEET] * 2, [SHEET[1] + OVER, beside(SHEET[1]) + OVER]),

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from layers import vec3
 from pxr import Sdf
 
 from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.interrupts import leave_if_asked, signals_raise
+from physgraph_usd.interrupts import leave_if_asked, signals_noted
 from physgraph_usd.usd.write.atomic import HOST, remove_stale, temporary_path
 from physgraph_usd.usd.write.stream import LayerStream
 
@@ -128,10 +127,10 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from pxr import Sdf, Vt
-from physgraph_usd.interrupts import signals_raise
+from physgraph_usd.interrupts import signals_noted
 from physgraph_usd.usd.write.stream import LayerStream
 points = Sdf.Path("/World/coat.points")
-with signals_raise(), LayerStream(Path(sys.argv[1]), overwrite=True) as stream:
+with signals_noted(), LayerStream(Path(sys.argv[1]), overwrite=True) as stream:
     stream.attribute(points, Sdf.ValueTypeNames.Point3fArray)
     for frame in range(100000):
         stream.set(points, Vt.Vec3fArray.FromNumpy(np.full((1000, 3), frame, np.float32)), time=float(frame))
@@ -171,21 +170,35 @@ def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path, number: s
     assert names(tmp_path) == ["out.usdc"]
 
 
-def write_on(target: Path) -> None:
-    """Write although a termination signal came: its exception is lost, as it is in a destructor."""
-    with signals_raise(), LayerStream(target) as stream:
-        with suppress(SystemExit):
-            signal.raise_signal(signal.SIGTERM)
+class Destroyed:
+    """An object in whose destructor a termination signal comes."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def write_on(target: Path, reached: list[str]) -> None:
+    with signals_noted(), LayerStream(target) as stream:
+        Destroyed()
         fill(stream, 2)
+        reached.append("flush")
         stream.flush()
+        reached.append("end")
 
 
-def test_a_signal_whose_exception_was_lost_ends_the_next_flush(tmp_path: Path) -> None:
+def test_a_signal_in_a_destructor_ends_the_next_flush(tmp_path: Path) -> None:
+    reached: list[str] = []
     with pytest.raises(SystemExit) as caught:
-        write_on(tmp_path / "out.usdc")
+        write_on(tmp_path / "out.usdc", reached)
     assert caught.value.code == 128 + signal.SIGTERM
     assert names(tmp_path) == []
-    leave_if_asked()
+    assert reached == ["flush"]
+    leave_if_asked()  # The next run of this process is not asked to end.
+
+
+def test_a_signal_that_nobody_asked_for_is_raised_at_the_end() -> None:
+    with pytest.raises(KeyboardInterrupt), signals_noted():
+        signal.raise_signal(signal.SIGINT)
 
 
 FULL = """

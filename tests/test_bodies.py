@@ -34,6 +34,7 @@ def add_box(stage: Usd.Stage, path: str = BODY, *, times: tuple[float, ...] = ()
     """A box of triangles tagged as a collider; it moves along x by its time."""
     points, triangles = box((1.0, 2.0, 3.0))
     mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateSubdivisionSchemeAttr("none")
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))
     mesh.CreatePointsAttr(vec3(points))

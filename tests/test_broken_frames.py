@@ -13,16 +13,16 @@ from pxr import Usd
 from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine
 from stages import add_sheet, new_stage, save, vec3
 
-from benchmarks.glitches import BEFORE, GLITCHES, run
+from benchmarks.glitches import GLITCHES, run
 
-AFTER = 5
+AT, AFTER = 2, 5
 FAST = ("ball 10 cm higher", "cage inside out", "cage a hundred times its size")
 """One glitch of each kind: a body that moves, a cage that turns, one that is blown up."""
 
 
 @pytest.fixture(scope="module")
 def clean() -> list[np.ndarray]:
-    return [points for points, _ in run(1, AFTER, travel=0.0)]
+    return [points for points, _ in run(1, AFTER, travel=0.0, at=AT)]
 
 
 @pytest.mark.parametrize(
@@ -30,9 +30,9 @@ def clean() -> list[np.ndarray]:
 )
 def test_cloth_is_back_after_five_frames(clean: list[np.ndarray], name: str):
     """Unmended, cloth that a body swallowed for one frame stayed 34 mm from its place for good."""
-    told = run(1, AFTER, travel=0.0, glitch=GLITCHES[name])
+    told = run(1, AFTER, travel=0.0, glitch=GLITCHES[name], at=AT)
     assert np.linalg.norm(told[-1][0] - clean[-1], axis=1).max() < 1e-3
-    assert told[BEFORE + 1][1].get("broken_before", BEFORE) == BEFORE
+    assert told[AT + 1][1].get("broken_before", AT) == AT
 
 
 @pytest.mark.parametrize(
@@ -77,11 +77,11 @@ def test_a_warning_names_the_frame(tmp_path: Path, scale: float):
 
 def test_a_cage_in_one_point_is_upsampled_at_once():
     """Solved, each of its boxes overlaps all others: level 2 took over four minutes."""
-    told = run(2, 1, travel=0.0, glitch=GLITCHES["cage in one point"])
-    points, entry = told[BEFORE]
+    told = run(2, 1, travel=0.0, glitch=GLITCHES["cage in one point"], at=AT)
+    points, entry = told[AT]
     assert np.ptp(points, axis=0).max() < 1e-9
     assert entry["start"].startswith("not solved")
-    assert told[BEFORE + 1][1]["start"] == "warm"
+    assert told[AT + 1][1]["start"] == "warm"
 
 
 @pytest.mark.parametrize("frozen", [False, True])

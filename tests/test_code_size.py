@@ -6,6 +6,7 @@ import ast
 import re
 import tokenize
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,8 +24,11 @@ MACHINE_PATH = re.compile(r"(?<![\w.}])/(?:home|Users|work|farm|tmp|opt|mnt|scra
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def code_files() -> list[Path]:
-    return sorted(file for folder in CODE_FOLDERS for file in (ROOT / folder).rglob("*.py"))
+@cache
+def trees() -> dict[str, ast.Module]:
+    """The code of each file, by the file's name from the root."""
+    files = sorted(file for folder in CODE_FOLDERS for file in (ROOT / folder).rglob("*.py"))
+    return {str(file.relative_to(ROOT)): ast.parse(file.read_text(encoding="utf-8")) for file in files}
 
 
 def text_files() -> list[Path]:
@@ -103,19 +107,15 @@ def test_rule_tells_bad_from_good(rule: str) -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_code_keeps_rule(rule: str) -> None:
-    complaints = [
-        f"{file.relative_to(ROOT)}:{complaint}"
-        for file in code_files()
-        for complaint in RULES[rule](ast.parse(file.read_text(encoding="utf-8")))
-    ]
+    complaints = [f"{name}:{complaint}" for name, tree in trees().items() for complaint in RULES[rule](tree)]
     assert not complaints, "\n".join(complaints)
 
 
 def test_classes_are_short() -> None:
     long = {
         node.name: (node.end_lineno or 0) - node.lineno + 1
-        for file in code_files()
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for tree in trees().values()
+        for node in ast.walk(tree)
         if isinstance(node, ast.ClassDef) and (node.end_lineno or 0) - node.lineno + 1 >= MAX_CLASS_LINES
     }
     assert not long

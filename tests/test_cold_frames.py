@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -49,14 +48,6 @@ def of_others(refiner: Refiner, frames: list) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["torus", "tshirt"])
-def test_a_frame_by_itself_is_the_same_after_any_other(sample: Callable[[str], Path], name: str):
-    shot = open_shot(str(sample(name)), level=1)
-    frames = [shot.frame(time) for time in shot.scene.times[4::6]][:3]
-    alone, after = (of_others(Refiner(shot.scene, COLD, levels=[1]), each) for each in (frames[-1:], frames))
-    assert np.array_equal(alone, after)
-
-
 @pytest.mark.real_data
 def test_a_frame_by_itself_is_the_same_in_any_process(real_data: Path):
     """Frame 30 differed by 4.5 mm by which frames a process had solved before it."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +15,13 @@ from piercing import depths, parts, piercings, place, signed, triangles_of
 from pxr import Usd
 from scipy.spatial import cKDTree
 from shots import faults, refine, sample_times
+from stages import built
 
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.lab.samples.panel import sew
 from physgraph_usd.lab.samples.shapes import box, join, lathe, off_box, off_torus, torus
 from physgraph_usd.lab.samples.tshirt import SHIRT, dress
-from physgraph_usd.usd.write.plain import Look, PlainMesh, PlainStage
+from physgraph_usd.usd.write.plain import Look, PlainMesh
 
 DEEP = 1e-4
 
@@ -49,13 +48,8 @@ SHOTS = {
 }
 
 
-@cache
-def build(name: str) -> PlainStage:
-    return import_module(f"physgraph_usd.lab.samples.{name}").build()
-
-
 def of_role(name: str, role: str) -> list[PlainMesh]:
-    return [mesh for mesh in build(name).meshes if mesh.role == role]
+    return [mesh for mesh in built(name).meshes if mesh.role == role]
 
 
 def sides(mesh: PlainMesh) -> np.ndarray:
@@ -78,7 +72,7 @@ def test_parts(name: str) -> None:
     garments, bodies = of_role(name, "garment"), of_role(name, "collider")
     assert tuple(mesh.name for mesh in garments) == told.garments
     assert tuple(mesh.name for mesh in bodies) == told.bodies
-    assert len(build(name).times) == told.frames
+    assert len(built(name).times) == told.frames
     for mesh in garments:
         assert set(mesh.counts) == {4}
         assert 150 <= len(mesh.points) <= 2500
@@ -144,10 +138,10 @@ def test_schemas_are_applied(sample: Callable[[str], Path], name: str) -> None:
 
 @pytest.mark.parametrize("name", SHOTS)
 def test_one_frame_is_refined(sample: Callable[[str], Path], tmp_path: Path, name: str) -> None:
-    middle = float(build(name).times[SHOTS[name].frames // 2])
+    middle = float(built(name).times[SHOTS[name].frames // 2])
     layer = tmp_path / "fine.usdc"
-    refine(sample(name), layer, frames=(middle, middle))
-    root = build(name).name
+    refine(sample(name), layer, frames=(middle, middle), level=0)
+    root = built(name).name
     assert all(sample_times(layer, f"/{root}/{mesh}") == (middle,) for mesh in SHOTS[name].garments)
     assert faults(layer, sample(name)) == []
 
@@ -199,7 +193,7 @@ def test_the_hood_lies_on_itself_and_the_head_turns_in_it() -> None:
 
 
 def test_the_armpit_is_pinched_in_the_middle_and_open_at_the_ends() -> None:
-    shirt, form = build("armpit").meshes
+    shirt, form = built("armpit").meshes
     assert form.samples is not None
     faces, level = triangles_of(form), dress(sew(SHIRT))
     part = parts(form)

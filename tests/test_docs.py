@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
+from glob import glob
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 from pxr import UsdGeom, Vt
+from shots import run
 from stages import GARMENT_API, add_sheet, new_stage, save
 
 from benchmarks import trouble
@@ -25,8 +27,6 @@ FOR_USERS = (
 )  # fmt: skip
 FOR_RESEARCHERS = ("chart", "collisions", "frames", "learned", "solver")
 PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in (*FOR_USERS, *FOR_RESEARCHERS))]
-REPEATED = {"index"}
-"""Pages whose commands another one has too."""
 MOST_WORDS, MOST_WORDS_OF_NOTES = 14_000, 8_000
 MOST_WORDS_OF_README, MOST_WORDS_OF_A_PAGE = 1_200, 2_000
 MOST_BYTES_OF_A_FILM, MOST_BYTES_OF_FILMS = 1_600_000, 6_000_000
@@ -67,33 +67,30 @@ def folder(tmp_path: Path, page: Path) -> Path:
     return tmp_path
 
 
-def run(block: Block, folder: Path, before: list[str]) -> subprocess.CompletedProcess[str]:
-    """Run a block in a folder; Python goes on from the blocks before it on its page."""
-    paths = [str(ROOT), str(ROOT / "plugins"), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    given = os.environ | {"PATH": path, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
-    line = ["bash", "-euc", block.code]
+def run_block(block: Block, names: dict[str, object]) -> None:
+    """Run a block in the present folder; Python goes on with the names of the blocks before it on its page."""
     if block.kind == "python":
-        before.append(block.code)
-        line = [sys.executable, "-c", "\n".join(before)]
+        exec(block.code, names)
+        return
     if block.kind == "toml":
-        (folder / "physgraph.toml").write_text(block.code, "utf-8")
-        line = [str(Path(sys.executable).with_name("physgraph-usd")), "inspect", "shot.usda"]
-    return subprocess.run(line, cwd=folder, env=given, capture_output=True, text=True, check=False, timeout=240)
+        Path("physgraph.toml").write_text(block.code, "utf-8")
+    commands = "physgraph-usd inspect shot.usda" if block.kind == "toml" else block.code
+    for line in filter(None, commands.splitlines()):
+        name, *given = shlex.split(line, comments=True)
+        assert name == "physgraph-usd"
+        done = run(*(found for each in given for found in sorted(glob(each)) or [each]))
+        assert done.exit_code == 0, f"{line}\n{done.output}"
 
 
-@pytest.mark.parametrize(
-    "page",
-    [pytest.param(page, marks=pytest.mark.slow) if page.stem in REPEATED else page for page in PAGES],
-    ids=lambda page: page.stem,
-)
-def test_code_runs_or_says_why_not(page: Path, folder: Path):
-    before: list[str] = []
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_code_runs_or_says_why_not(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(ROOT / "plugins")
+    names: dict[str, object] = {}
     for block in blocks(page):
         assert block.kind in ("", "sh", "python", "toml")
         if block.why is None:
-            done = run(block, folder, before)
-            assert done.returncode == 0, f"{block.code}\n{done.stdout}\n{done.stderr}"
+            run_block(block, names)
 
 
 def test_the_blocks_are_found():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from frame_solvers import fails
 from shots import cloth_shot, command, faults, refine
 
 from physgraph_usd.errors import GarmentError, PhysGraphError, SolveError, UsageError
@@ -39,17 +40,6 @@ def layer_of(shot: Path, folder: Path, **options: Any) -> Path:
     folder.mkdir()
     assert refine(shot, folder / "fine.usdc", **options).exit_code == 0
     return folder / "fine.usdc"
-
-
-def fails(kind: str) -> int:
-    """What a task may do."""
-    if kind == "garment":
-        raise GarmentError("/World/cloth", "torn", time=5.0)
-    if kind == "bug":
-        raise ValueError("a bug")
-    if kind == "dies":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return os.getpid()
 
 
 @pytest.mark.slow
@@ -124,7 +114,7 @@ def test_workers_of_another_version_or_checkout_are_refused(
 def test_workers_of_several_threads_are_refused():
     with (
         distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0", host="127.0.0.1"
+            n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp", host="127.0.0.1"
         ) as two,
         connected(two.scheduler_address) as start,
     ):

@@ -60,6 +60,15 @@ def contents(folder: Path) -> dict[str, str]:
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of POSIX")
+@pytest.mark.parametrize("command", ["refine", "inspect"])
+def test_a_pipe_among_them_is_named_in_place_of_a_wait(tmp_path: Path, command: str) -> None:
+    os.mkfifo(tmp_path / "pipe.usda")
+    (tmp_path / "shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@./pipe.usda@]\n)\n")
+    done = run(command, tmp_path / "shot.usda", *(("-o", tmp_path / "o.usdc") if command == "refine" else ()))
+    assert (done.exit_code, "pipe.usda is no file: it is a pipe" in done.stderr) == (1, True)
+
+
 def test_every_file_of_a_shot_is_found(shot: Path) -> None:
     assert {file.name for file in files_of(shot)} == {file.name for file in shot.parent.iterdir()}
 

@@ -14,6 +14,11 @@ from scenes import BODIES, SCENES, inside, refined, shot_of, soup_of, triangles,
 
 ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
 scenes = pytest.mark.parametrize("name", SCENES)
+some = pytest.mark.parametrize(
+    "name",
+    [name if name in ("layers", "torus", "tangle") else pytest.param(name, marks=pytest.mark.slow) for name in SCENES],
+)
+"""Fast: garments over one another on a body, one garment on a body, and cloth that crosses cloth."""
 
 
 def crossings(points: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> int:
@@ -59,6 +64,9 @@ class TestEveryFrame:
             moved = np.linalg.norm(b - a, axis=1).max()
             assert np.linalg.norm(d - c, axis=1).max() < moved + 0.05
 
+
+@some
+class TestAnotherRefiner:
     def test_a_fresh_refiner_gives_the_same_bytes_in_two_threads(self, name: str):
         made = shot_of(name)
         for answer, again in zip(refined(name), made.refiner(threads=2).refine(made.frames), strict=True):

@@ -12,7 +12,7 @@ REST = 1e-4
 """Move of the farthest vertex from frame to frame that nobody sees [m]."""
 
 
-@pytest.mark.parametrize("name", ["hood", "armpit"])
+@pytest.mark.parametrize("name", ["hood", pytest.param("armpit", marks=pytest.mark.slow)])
 def test_it_rests(name: str, tmp_path: Path):
     moves = held(name, tmp_path, level=1)
     assert moves.vertices > 1000

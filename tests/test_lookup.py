@@ -148,7 +148,7 @@ def test_animated_sources_are_told(stage: Usd.Stage) -> None:
             "may mean stretchStiffness, weftStretchStiffness, shearStiffness, bendStiffness, weftBendStiffness",
         ),
         ("offset=0.1", "may mean contact:offset, collider:offset; write one"),
-        ("side=1", "unknown attribute 'side'"),
+        ("side=left", "must be one of auto, winding, start, front, back"),
         ("bendStiffness=soft", "cannot use"),
         ("bendStiffness=-1", r"must be finite and in \[0, 100000\]"),
         ("level=1.5", "whole number"),

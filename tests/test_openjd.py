@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from shots import CLOTH, cloth_shot, command, faults, refine, sample_times
+from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
 
 pytest.importorskip("openjd.cli", reason="needs openjd-cli, which runs the templates")
 TEMPLATE = Path(__file__).resolve().parents[1] / "plugins" / "openjd" / "refine.yaml"
@@ -52,8 +52,8 @@ def test_its_reader_finds_progress_and_status_of_a_chunk(tmp_path: Path):
     shot = cloth_shot(tmp_path / "shot.usdc", times=TIMES[:4])
     empty = [word for option in ("--garment", "--collider", "--level") for word in (option, "")]
     line = ["--frames", "1-2", "--preroll", "1", *empty, "--openjd", "--steps", "1"]
-    done = command("refine", shot, "-o", tmp_path / "c.usdc", *line)
-    assert done.returncode == 0, done.stderr
+    done = run("refine", shot, "-o", tmp_path / "c.usdc", *line)
+    assert done.exit_code == 0, done.stderr
     for text in done.stderr.splitlines():
         record = logging.makeLogRecord({"msg": text, "levelno": logging.INFO, "session_id": "s"})
         reader.filter(record)

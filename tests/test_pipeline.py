@@ -136,11 +136,12 @@ class TestTime:
         assert starts([again]) == ["cold"]
         assert again.points[0].tobytes() == first.points[0].tobytes()
 
-    def test_a_teleport_resets_one_garment_and_not_the_other(self):
+    def test_a_cage_that_is_torn_out_of_shape_resets_one_garment_and_not_the_other(self):
         two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
         two.solve(pair(wave(REST), wave(OTHER_REST), 1.0))
-        state = two.solve(pair(wave(REST) + 40 * EDGE, wave(OTHER_REST, phase=0.1), 2.0))
-        assert str(state.telemetry[0]["start"]).startswith("cold: the cage moved")
+        torn = np.random.default_rng(0).permutation(wave(REST)) + 40 * EDGE
+        state = two.solve(pair(torn, wave(OTHER_REST, phase=0.1), 2.0))
+        assert str(state.telemetry[0]["start"]).startswith("cold: ")
         assert state.telemetry[1]["start"] == "warm"
 
 

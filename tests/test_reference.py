@@ -23,7 +23,7 @@ from physgraph_usd.solver.scene import Frame, Scene
 def squeezed() -> tuple[Problem, Frame]:
     """A sheet of 6 by 4 cells that is squeezed by a fifth and buckles."""
     mesh, rest = sheet(6, 4)
-    problem = Problem(Scene((garment_of(mesh, rest),), DOWN, ()), [2], device="cpu", threads=1, dtype=torch.float64)
+    problem = Problem(Scene((garment_of(mesh, rest),), DOWN, ()), [1], device="cpu", threads=1, dtype=torch.float64)
     return problem, frame_of(wave(rest, squeeze=0.2))
 
 
@@ -48,7 +48,7 @@ def bounded() -> Reference:
 )
 def test_no_method_with_any_budget_ends_below_it(found: Reference, method: str):
     problem, frame = squeezed()
-    for steps in (12, 24, 48, 96):
+    for steps in (12, 96):
         points, _ = problem.go_on(frame, replace(ALONE, method=METHODS[method], steps=steps), [None])
         assert found.gap(problem.judge(frame, points, ALONE).energy) > -1e-4
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from pxr import Usd, UsdGeom
-from shots import CLOTH, cloth_shot, command, faults, refine
+from shots import CLOTH, cloth_shot, faults, refine, run
 
 from physgraph_usd.errors import UsageError
 
@@ -37,15 +37,15 @@ def test_a_batch_goes_on_at_the_shot_where_it_ended(tmp_path: Path):
     for number, steps in ((0, 6), (1, 5)):
         refine(shots[number], layers[number], steps=steps)
     before = [layer.stat().st_mtime_ns for layer in layers[:2]]
-    ended = command(*line, "--resume")
-    assert ended.returncode == 3, ended.stderr
+    ended = run(*line, "--resume")
+    assert ended.exit_code == 3, ended.stderr
     assert f"{layers[0]} is taken as done" in ended.stderr
     assert f"error: {shots[1]}: {layers[1]} exists; choose another name" in ended.stderr
     assert ended.stdout.split() == [str(layers[0]), str(layers[2])]
     assert [layer.stat().st_mtime_ns for layer in layers[:2]] == before
     assert faults(layers[2], shots[2]) == []
-    again = command(*line, "--resume", "--overwrite")
-    assert again.returncode == 0, again.stderr
+    again = run(*line, "--resume", "--overwrite")
+    assert again.exit_code == 0, again.stderr
     assert again.stderr.count("is taken as done") == 2
     assert [layer.stat().st_mtime_ns for layer in layers[:2]] != before
 

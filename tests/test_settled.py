@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from shots import CLOTH, cloth_shot, command, refine
+from shots import CLOTH, cloth_shot, refine, run
 
 from physgraph_usd.shot.notes import of_energy
 from physgraph_usd.shot.report import RefineReport
@@ -65,8 +65,8 @@ def test_a_frame_that_settles_is_not_told_of(gentle: Path, tmp_path: Path):
 @pytest.mark.parametrize(("steps", "code"), [(0, 3), (96, 0)])
 def test_strict_counts_in_the_exit_code(gentle: Path, tmp_path: Path, steps: int, code: int):
     out = tmp_path / "fine.usdc"
-    done = command("refine", gentle, "-o", out, "--level", 1, "--steps", steps, "--strict")
-    assert (done.returncode, out.is_file()) == (code, True)
+    done = run("refine", gentle, "-o", out, "--level", 1, "--steps", steps, "--strict")
+    assert (done.exit_code, out.is_file()) == (code, True)
     assert ("did not settle" in done.stderr) == (code == 3)
 
 

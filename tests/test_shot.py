@@ -13,7 +13,7 @@ from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_times
 from stages import author
 
-from physgraph_usd.errors import LayerError, SchemaError, StageError, UsageError
+from physgraph_usd.errors import SchemaError, StageError, UsageError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.usd.check.validate import validate_layer
@@ -301,7 +301,7 @@ class TestOptions:
         assert frames == []
 
     def test_a_folder_that_is_not_there(self, shot: Path, tmp_path: Path):
-        with pytest.raises(LayerError, match="does not exist"):
+        with pytest.raises(UsageError, match="does not exist"):
             refine(shot, tmp_path / "no" / "fine.usdc")
 
     def test_the_shot_itself_is_never_the_output(self, shot: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from click.testing import CliRunner, Result
 from shots import cloth_shot
 
 from physgraph_usd import cli
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.report import RefineReport
 
 
 @pytest.fixture
@@ -65,16 +68,19 @@ def test_what_is_named_goes_before_the_environment_and_that_before_the_folders(
     assert (report["options"]["steps"], report["options"]["frames"]) == (3, [1.0, 1.0])
 
 
-def test_each_shot_has_its_own(shot: Path, tmp_path: Path) -> None:
+def test_each_shot_has_its_own(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    levels: dict[str, int | None] = {}
+
+    def refine_shots(jobs: list[tuple[str, Path, RefineOptions]], **_: object) -> list[RefineReport]:
+        levels.update({Path(each).stem: options.level for each, _, options in jobs})
+        return [RefineReport(each, out, {}) for each, out, _ in jobs]
+
+    monkeypatch.setattr("physgraph_usd.shot.refine.refine_shots", refine_shots)
     other = cloth_shot(tmp_path / "other.usda", times=(1.0, 2.0))
     write(shot.parent, "[refine]\nlevel = 0\n")
     write(tmp_path, "[refine]\nlevel = 1\n")
-    done = run("refine", shot, other, "-o", tmp_path, "--report", tmp_path / "reports")
+    done = run("refine", shot, other, "-o", tmp_path)
     assert done.exit_code == 0, done.output
-    levels = {
-        name: json.loads((tmp_path / "reports" / name / "report.json").read_text())["options"]["level"]
-        for name in ("s", "other")
-    }
     assert levels == {"s": 0, "other": 1}
 
 
@@ -111,6 +117,14 @@ def test_what_it_cannot_mean_is_refused_by_name(shot: Path, text: str, said: str
     file = write(shot.parent, text)
     done = run("refine", shot, "-o", shot.parent / "o.usdc")
     assert (done.exit_code, str(file) in done.stderr, said in done.stderr) == (2, True, True), done.stderr
+
+
+def test_a_pipe_and_values_nested_too_deep_are_refused(shot: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    deep = write(tmp_path, f"[refine]\nset = {'[' * 5000}{']' * 5000}\n", "deep.toml")
+    for file in (tmp_path / "pipe.toml", deep):
+        done = run("refine", shot, "-o", tmp_path / "o.usdc", "--config", file)
+        assert (done.exit_code, f"cannot read {file}" in done.stderr) == (2, True), done.stderr
 
 
 def test_a_file_that_is_named_and_not_there_is_refused(shot: Path, tmp_path: Path) -> None:

@@ -72,6 +72,20 @@ def test_a_guide_that_lets_the_garment_fall_is_refused(tmp_path: Path, options: 
         refine(cloth_shot(tmp_path / "s.usda"), tmp_path / "fine.usdc", **options)
 
 
+SOFT = ("stretchStiffness=1e-3", "physgraph:guide:stiffness=0")
+HEAVY = ("density=1e5",)
+
+
+@pytest.mark.parametrize("overrides", [SOFT, HEAVY])
+def test_cloth_on_a_body_that_cannot_carry_its_weight_is_refused(tmp_path: Path, overrides: tuple[str, ...]):
+    shot = cloth_shot(tmp_path / "s.usda")
+    stage = Usd.Stage.Open(str(shot))
+    UsdGeom.Sphere.Define(stage, "/World/ball")
+    stage.Save()
+    with pytest.raises(PhysGraphError, match=r"N/m cannot carry its weight of .* N/m\^2: where it hangs it would be"):
+        refine(shot, tmp_path / "fine.usdc", overrides=overrides, colliders=("/World/ball",))
+
+
 def test_a_rest_frame_shrunk_to_nothing_fails_those_that_are_not(tmp_path: Path):
     shot = cloth_shot(tmp_path / "s.usda", times=(1.0, 2.0, 3.0), size=(7, 7), broken={1.0: 1e-6})
     report = refine(shot, tmp_path / "fine.usdc", rest_frame=1.0)

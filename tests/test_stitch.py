@@ -13,11 +13,11 @@ from click.testing import CliRunner
 from cloth import rms
 from layers import open_over
 from pxr import Sdf, Usd, UsdGeom
-from shots import CLOTH, EDGE, cloth_shot, command, faults, fine, refine, sample_times
+from shots import CLOTH, EDGE, cloth_shot, faults, fine, refine, run, sample_times
 from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.cli import main
-from physgraph_usd.errors import LayerError, PhysGraphError, StageError, UsageError
+from physgraph_usd.errors import AbsentError, LayerError, PhysGraphError, UsageError
 from physgraph_usd.shot.stitch import SEAM_BOUND, check_seams, stitch
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record
@@ -59,11 +59,10 @@ def points_in(stage: Usd.Stage, path: str, time: float) -> Any:
 
 
 class Runs(NamedTuple):
-    """24 frames of a sheet: as one run, with three workers, and as three chunks that were stitched."""
+    """24 frames of a sheet: as one run, and as three chunks that were stitched."""
 
     shot: Path
     one: Path
-    workers: Path
     chunks: list[Path]
     joined: Path
 
@@ -73,11 +72,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folder = tmp_path_factory.mktemp("stitch")
     shot = cloth_shot(folder / "shot.usdc", times=TIMES)
     refine(shot, folder / "one.usdc")
-    refine(shot, folder / "workers.usdc", workers=3)
     (folder / "parts").mkdir()
     chunks = refine_chunks(shot, folder / "parts")
     stitch(chunks[::-1], folder / "joined.usdc")
-    return Runs(shot, folder / "one.usdc", folder / "workers.usdc", chunks, folder / "joined.usdc")
+    return Runs(shot, folder / "one.usdc", chunks, folder / "joined.usdc")
 
 
 class TestOneLayer:
@@ -86,7 +84,7 @@ class TestOneLayer:
         assert max(apart[:2]) == 0.0
         assert 0.0 < max(apart) < SEAM_BOUND, apart
 
-    def test_holds_the_chunks_positions_and_those_of_as_many_workers(self, runs: Runs):
+    def test_holds_the_chunks_positions(self, runs: Runs):
         assert sample_times(runs.joined) == TIMES
         for span, chunk in zip(SPANS, runs.chunks, strict=True):
             own = [time for time in TIMES if span[0] <= time <= span[1]]
@@ -94,7 +92,13 @@ class TestOneLayer:
             for time in own:
                 joined = points(runs.joined, time)
                 assert np.array_equal(points(chunk, time), joined) == (time + 6 <= span[1] or time > 16), time
-                assert np.allclose(points(runs.workers, time), joined, rtol=0, atol=1e-6)
+
+    @pytest.mark.slow
+    def test_holds_the_positions_of_as_many_workers(self, runs: Runs, tmp_path: Path):
+        refine(runs.shot, tmp_path / "workers.usdc", workers=3)
+        for time in TIMES:
+            by_workers = points(tmp_path / "workers.usdc", time)
+            assert np.allclose(by_workers, points(runs.joined, time), rtol=0, atol=1e-6)
 
     def test_is_valid_and_records_what_it_was_made_from(self, runs: Runs):
         assert validate_layer(runs.joined) == []
@@ -109,11 +113,34 @@ class TestOneLayer:
         assert "is a chunk, with 8 of the shot's 24 frames" in problem.message
 
     def test_the_command_says_how_far_seams_move(self, runs: Runs, tmp_path: Path):
-        done = command("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc")
-        assert done.returncode == 0, done.stderr
+        done = run("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc")
+        assert done.exit_code == 0, done.stderr
         assert done.stdout.strip() == str(tmp_path / "joined.usdc")
         assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["seam at 9", "seam at 17"]
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
+
+    @pytest.mark.parametrize("time", [12.0, 16.0])
+    def test_a_value_that_is_not_finite_is_refused_by_frame(self, runs: Runs, tmp_path: Path, time: float):
+        """In the middle of a chunk, and where two are joined with the body."""
+        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
+        broken = points(copies[1], time).copy()
+        broken[7, 1] = np.nan
+        layer = Sdf.Layer.FindOrOpen(str(copies[1]))
+        layer.SetTimeSample(f"{CLOTH}.points", time, vec3(broken))
+        layer.Save()
+        with pytest.raises(
+            LayerError, match=rf"{copies[1]}: <{CLOTH}> at time code {time:g}: points: value 7 is \[.*nan"
+        ):
+            stitch(copies, tmp_path / "joined.usdc")
+        assert not (tmp_path / "joined.usdc").exists()
+
+    def test_a_chunk_that_was_changed_is_refused(self, runs: Runs, tmp_path: Path):
+        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
+        layer = Sdf.Layer.FindOrOpen(str(copies[1]))
+        layer.EraseTimeSample(f"{CLOTH}.points", 12.0)
+        layer.Save()
+        with pytest.raises(LayerError, match=rf"{copies[1]} was changed after refine wrote it"):
+            stitch(copies, tmp_path / "joined.usdc")
 
     def test_without_the_shot_it_is_made_too(self, runs: Runs, tmp_path: Path):
         """Chunks that were copied elsewhere: what they hold is enough."""
@@ -201,7 +228,7 @@ class TestRefused:
     def test_a_range_without_a_frame(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc")
         with pytest.raises(
-            StageError, match=r"no sample of the shot lies in frames 7:9; its 6 samples run from 1 to 6"
+            AbsentError, match=r"no sample of the shot lies in frames 7:9; its 6 samples run from 1 to 6"
         ):
             refine_chunks(shot, tmp_path, [(7.0, 9.0)])
 

@@ -11,7 +11,7 @@ import pytest
 from meshes import grid
 from pxr import UsdGeom, Vt
 from sheets import garment_of
-from shots import command, fine, refine, sample_times
+from shots import fine, refine, run, sample_times
 from stages import GARMENT_API, new_stage, save, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
@@ -188,22 +188,24 @@ def test_a_fit_comes_near_medians_that_no_pose_has():
 def test_the_command_tells_before_the_first_frame_and_once(tmp_path: Path):
     shot, out = puffed_shot(tmp_path / "a.usda"), tmp_path / "a.usdc"
     report = tmp_path / "a.json"
-    done = command("refine", shot, "-o", out, "--level", "1", "--steps", "2", "--progress", "--report", report)
-    assert done.returncode == 0
+    done = run("refine", shot, "-o", out, "--level", "1", "--steps", "2", "--progress", "--report", report)
+    assert done.exit_code == 0
     assert done.stderr.count("--rest auto") == 1
     assert done.stderr.index("--rest auto") < done.stderr.index("1 of 7 frames")
     assert any("--rest auto" in warning for warning in json.loads(report.read_text())["warnings"])
-    done = command("refine", shot, "-o", out, "--level", "0", "--rest", "auto", "--overwrite")
-    assert done.returncode == 0
+    done = run("refine", shot, "-o", out, "--level", "0", "--rest", "auto", "--overwrite")
+    assert done.exit_code == 0
     assert "--rest" not in done.stderr
 
 
 @pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_the_command_tells_once_of_each_of_several_shots(tmp_path: Path, workers: int):
+def test_the_command_tells_once_of_each_of_several_shots(
+    tmp_path: Path, workers: int, capfd: pytest.CaptureFixture[str]
+):
     shots = [puffed_shot(tmp_path / name) for name in ("a.usda", "b.usda")]
-    done = command("refine", *shots, "-o", tmp_path / "out", "--level", "0", "--workers", str(workers))
-    assert done.returncode == 0
-    told = [line for line in done.stderr.splitlines() if "--rest auto" in line]
+    done = run("refine", *shots, "-o", tmp_path / "out", "--level", "0", "--workers", str(workers))
+    assert done.exit_code == 0
+    told = [line for line in (done.stderr + capfd.readouterr().err).splitlines() if "--rest auto" in line]
     assert sorted(line.partition(": in most")[0] for line in told) == [f"warning: {shot}" for shot in shots]
 
 

@@ -56,6 +56,16 @@ def test_a_preset_is_authored_on_garments_only(untagged: Path, tmp_path: Path) -
     assert not stage.GetPrimAtPath("/World/ball").GetAttribute("physgraph:material:bendStiffness").HasAuthoredValue()
 
 
+def test_a_preset_replaces_all_of_another_one(untagged: Path, tmp_path: Path) -> None:
+    """Denim differs between warp and weft and has a shear stiffness, jersey has neither."""
+    denim = tag(untagged, tmp_path / "denim.usda", garments=[COAT], preset="denim")
+    again = tag(denim, tmp_path / "jersey.usda", preset="jersey")
+    alone = tag(untagged, tmp_path / "alone.usda", garments=[COAT], preset="jersey")
+    fabrics = [open_shot(str(file)).frame(TIMES[0]).garments[0].fabric for file in (denim, again, alone)]
+    assert fabrics[0] != fabrics[2]
+    assert fabrics[1] == fabrics[2]
+
+
 def test_a_collider_can_be_tagged_alone(untagged: Path, tmp_path: Path) -> None:
     stage = Usd.Stage.Open(str(tag(untagged, tmp_path / "tagged.usda", colliders=["/World/ball"])))
     assert schemas(stage, "/World/ball") == ["PhysGraphColliderAPI"]

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layers import COAT, dress_up, errors, make_shot, vec3, write_layer
-from pxr import Sdf, Tf, Usd, UsdSkel, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdSkel, Vt
+from shots import CLOTH, cloth_shot, refine
 
 from physgraph_usd.errors import AbsentError, LayerError
 from physgraph_usd.usd.check.validate import Problem, validate_layer
@@ -331,3 +332,15 @@ def test_a_file_that_is_no_layer_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "cut.usdc").write_bytes(b"PXR-USDC cut")
     with pytest.raises(LayerError, match="cannot read"):
         validate_layer(tmp_path / "cut.usdc")
+
+
+def test_cloth_is_compared_with_its_cage_in_the_world(tmp_path: Path) -> None:
+    """Flattened a thousand times, cloth that sags by a millimetre sags by a metre in the garment's own space."""
+    shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0))
+    stage = Usd.Stage.Open(str(shot))
+    matrix = Gf.Matrix4d(1.0)
+    matrix[1, 1], matrix[1, 0] = 1e-3, 1e-2
+    UsdGeom.Xformable(stage.GetPrimAtPath(CLOTH)).MakeMatrixXform().Set(matrix)
+    stage.Save()
+    assert refine(shot, tmp_path / "fine.usdc").exit_code == 0
+    assert errors(tmp_path / "fine.usdc", shot) == []

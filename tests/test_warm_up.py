@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 from shots import cloth_shot, command
+
+from physgraph_usd.errors import PhysGraphError
+from physgraph_usd.solver.mesh.kernels import start_warp
+
+
+def test_a_folder_that_cannot_be_made_for_kernels_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def init() -> None:
+        raise OSError(errno.EROFS, "Read-only file system", "/cache/warp")
+
+    monkeypatch.setattr("warp.init", init)
+    with pytest.raises(
+        PhysGraphError, match="/cache/warp: Read-only file system; WARP_CACHE_PATH names another folder"
+    ):
+        start_warp.__wrapped__()
 
 
 @pytest.mark.slow

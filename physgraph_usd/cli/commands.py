@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from ..errors import UsageError
+from ..interrupts import signals_noted
 from ..shot.plain_json import to_json
 from ..solver.fabric import PRESETS
 from .options import (
@@ -52,16 +53,18 @@ def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, sea
 
     A folder stands for all layers in it. How far each seam moves goes to stderr.
     """
-    from ..shot import stitch as chunk
+    with signals_noted():
+        with imports_uncollected():
+            from ..shot import stitch as chunk
 
-    if check_seams:
-        for seam in chunk.check_seams(chunks, seam_bound=seam_bound):
+        if check_seams:
+            for seam in chunk.check_seams(chunks, seam_bound=seam_bound):
+                click.echo(seam, err=True)
+            return
+        if out is None:
+            raise UsageError("give a layer to write by -o, or --check-seams")
+        for seam in chunk.stitch(chunks, out, seam_bound=seam_bound, **options):
             click.echo(seam, err=True)
-        return
-    if out is None:
-        raise UsageError("give a layer to write by -o, or --check-seams")
-    for seam in chunk.stitch(chunks, out, seam_bound=seam_bound, **options):
-        click.echo(seam, err=True)
     click.echo(out)
 
 
@@ -91,7 +94,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 @out_option("OUT", "Layer to write.")
 @of_field("garments", help=PRIMS)
 @of_field("colliders", help=PRIMS, metavar="PATH")
-@click.option("--preset", metavar="FABRIC", help=f"Fabric of the garments: {', '.join(PRESETS)}.")
+@click.option("--preset", metavar="FABRIC", help=f"Fabric of the garments, or of all tagged: {', '.join(PRESETS)}.")
 @click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
 @click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
 @of_field("asset_paths")
@@ -116,13 +119,15 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
 
     Prints the page's address, and serves it to this machine alone until it is interrupted.
     """
-    from ..studio.page import serve
-    from ..studio.session import TuneSession
+    with signals_noted():
+        with imports_uncollected():
+            from ..studio.page import serve
+            from ..studio.session import TuneSession
 
-    with closing(TuneSession(shot, **options)) as session:
-        if session.warning:
-            click.echo(f"warning: {session.warning}", err=True)
-        serve(session, port=port, say=click.echo)
+        with closing(TuneSession(shot, **options)) as session:
+            if session.warning:
+                click.echo(f"warning: {session.warning}", err=True)
+            serve(session, port=port, say=click.echo)
 
 
 @click.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -13,7 +14,7 @@ from typing import Any, TextIO
 
 import click
 
-from ..errors import NOTICE, PhysGraphError, counted
+from ..errors import NOTICE, PhysGraphError, UsageError, counted
 
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
@@ -21,6 +22,8 @@ LOGGER = "physgraph_usd"
 _LEVELS = (NOTICE, logging.INFO, logging.DEBUG)
 _CLEAR_LINE = "\r\033[K"
 _LINE = "%(asctime)s %(levelname)s %(shot)s: %(message)s"
+_LOGGED = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ .*: ")
+"""Beginning of a log's first line."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Output:
 
         Raises:
             OSError: The file cannot be written.
-            UsageError: The file is a link.
+            UsageError: The file is a link, or there already and no log.
         """
         from ..usd.write.atomic import check_no_link
 
@@ -55,6 +58,7 @@ class Output:
         handlers: list[logging.Handler] = [on_stderr]
         if self.log_file is not None:
             check_no_link(self.log_file)
+            _check_log(self.log_file)
             into_file = _IntoFile(self.log_file, encoding="utf-8")
             into_file.setLevel(_LEVELS[max(min(self.verbose, 2), 1)])
             into_file.setFormatter(logging.Formatter(_LINE, defaults={"shot": "-"}))
@@ -124,6 +128,15 @@ class _IntoFile(logging.FileHandler):
         """Close the file, whatever became of it."""
         with suppress(OSError):
             super().close()
+
+
+def _check_log(file: Path) -> None:
+    """Refuse (UsageError) to append to a file that does not begin with a line of a log."""
+    if not file.is_file() or not file.stat().st_size:
+        return
+    with file.open(encoding="utf-8", errors="replace") as stream:
+        if not _LOGGED.match(stream.readline(4096)):
+            raise UsageError(f"{file} exists and is no log of this program; choose another name")
 
 
 def say(text: str, *, err: bool = False) -> None:

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import LayerError, PhysGraphError, UsageError, counted
+from ..interrupts import at_end, signals_noted
+from ..interrupts import exit_code_of as signal_code_of
 from .options import HEADINGS, out_option, run_options, together, under
 from .printing import LOGGER, Output, say
 from .show_file import values_for
-from .structure import FAILED, GroupedCommand, imports_uncollected
+from .structure import DONE, FAILED, GroupedCommand, imports_uncollected
 
 if TYPE_CHECKING:
     from ..shot.options import RefineOptions
@@ -45,20 +47,21 @@ def refine(
     Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
     comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
     """
-    from ..interrupts import signals_raise
-    from ..shot.finished import check_jobs
+    with signals_noted():
+        with imports_uncollected():
+            from ..shot.finished import check_jobs
 
-    jobs = _jobs(ctx, shots, out)
-    layers = [layer for _, layer, _ in jobs]
-    verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
-    output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, openjd=ctx.params["openjd"])
-    also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
-    if also:
-        check_jobs(jobs, also=also)
-    with signals_raise(), _folder_of(layers, out, dry_run=dry_run), output.logged():
-        code = _refine_each(jobs, output, summary=None if dry_run else summary)
-        if not dry_run:
-            _check_seams(layers, ctx.params["seam_bound"], openjd=output.openjd)
+        jobs = _jobs(ctx, shots, out)
+        layers = [layer for _, layer, _ in jobs]
+        verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
+        output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, openjd=ctx.params["openjd"])
+        also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
+        if also:
+            check_jobs(jobs, also=also)
+        with _folder_of(layers, out, dry_run=dry_run), output.logged():
+            code = _refine_each(jobs, output, summary=None if dry_run else summary)
+            if not dry_run:
+                _check_seams(layers, ctx.params["seam_bound"], openjd=output.openjd)
     sys.exit(code)
 
 
@@ -96,23 +99,27 @@ def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known:
 
 def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -> int:
     """Refine the jobs and say of each what became of it; returns the exit code."""
-    from .. import interrupts
     from ..shot.summary import check_summary, exit_code_of, row_of
 
     if summary is not None:
         check_summary(summary, overwrite=jobs[0][2].overwrite)
     rows: list[Row] = []
     failed: list[PhysGraphError] = []
+
+    def interrupted(code: int) -> None:
+        left = [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
+        _summarise([*rows, *left], output, summary, exit_code=code)
+
     try:
-        for (shot, layer, _), done in zip(jobs, _results(jobs, output), strict=True):
-            rows.append(row_of(shot, layer, done))
-            if isinstance(done, PhysGraphError):
-                failed.append(done)
-            else:
-                say(done.to_json() if done.out is None else str(done.out))
+        with at_end(interrupted):
+            for (shot, layer, _), done in zip(jobs, _results(jobs, output), strict=True):
+                rows.append(row_of(shot, layer, done))
+                if isinstance(done, PhysGraphError):
+                    failed.append(done)
+                else:
+                    say(done.to_json() if done.out is None else str(done.out))
     except (KeyboardInterrupt, SystemExit) as error:
-        rows += [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
-        _summarise(rows, output, summary, exit_code=interrupts.exit_code_of(error) or FAILED)
+        interrupted(signal_code_of(error) or FAILED)
         raise
     _summarise(rows, output, summary, exit_code=exit_code_of(rows))
     if failed and not output.several:
@@ -215,17 +222,22 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
     from ..shot.lock import is_held
 
     made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
-    try:
-        try:
-            for folder in reversed(made):
-                folder.mkdir()
-        except OSError as error:
-            raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
-        yield
-    finally:
+
+    def leave(_code: int = DONE) -> None:
         for frames in filter(None, map(kept_for, layers)):
             if not is_held(frames.folder):
                 say(str(frames), err=True)
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()
+
+    try:
+        try:
+            for folder in reversed(made):
+                folder.mkdir()
+        except OSError as error:
+            raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error
+        with at_end(leave):
+            yield
+    finally:
+        leave()

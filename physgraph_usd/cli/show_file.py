@@ -67,9 +67,11 @@ def _key(param: click.Parameter) -> str:
 
 def _read(file: Path, known: click.Command) -> Mapping[str, Any]:
     """The table of a file, whose keys are all options."""
+    if file.exists() and not file.is_file():
+        raise UsageError(f"cannot read {file}: it is a folder or a pipe, and no file")
     try:
         tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # The last from values nested too deep.
         raise UsageError(f"cannot read {file}: {error}") from error
     _check_names(file, "table", tables, [TABLE])
     table = tables.get(TABLE, {})

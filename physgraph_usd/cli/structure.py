@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import gc
+import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Never
@@ -12,7 +14,7 @@ from typing import Any, Never
 import click
 
 from ..errors import PhysGraphError
-from ..interrupts import SIGNALLED
+from ..interrupts import SIGNALLED, importing
 
 DONE, FAILED = 0, 1
 EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
@@ -26,6 +28,7 @@ class Commands(click.Group):
         """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
         from ..shot.processes import memory_is_named
 
+        _open_closed_streams()
         try:
             with memory_is_named():
                 return super().invoke(ctx)
@@ -45,12 +48,24 @@ class Commands(click.Group):
             _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
 
 
+def _open_closed_streams() -> None:
+    """Let output go nowhere where its stream was closed by who started this: a file opened later would get it."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            os.dup2(nowhere, number)
+            if nowhere != number:
+                os.close(nowhere)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))
+
+
 @contextmanager
 def imports_uncollected() -> Iterator[None]:
     """Keep the garbage collector from torch's million objects, which live as long as the process: 3 s become 2."""
     gc.disable()
     try:
-        yield
+        with importing():
+            yield
     finally:
         gc.freeze()
         gc.enable()

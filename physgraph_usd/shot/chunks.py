@@ -17,6 +17,7 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 
 from ..errors import SolveError
+from ..interrupts import leave_if_asked
 from .frames import FrameFolder, Lead, Outcome
 from .processes import POLL_SECONDS, Call, memory_is_named
 
@@ -39,6 +40,10 @@ class Work(Protocol):
 
     def result(self) -> Any:
         """The function's result; raises what ended it."""
+        ...
+
+    def ask_to_end(self) -> None:
+        """Ask it to end, and do not wait."""
         ...
 
     def end(self) -> None:
@@ -132,6 +137,8 @@ def solve_in_chunks(
             yield outcome
     finally:
         for call in calls:
+            call.ask_to_end()
+        for call in calls:
             call.end()
 
 
@@ -165,6 +172,7 @@ def _collect(
     """Read a frame's file once its owner, or without one ``solved``, has made it; ``seam`` as `FrameFolder.read`."""
     ended: float | None = None
     while True:
+        leave_if_asked()
         over = owner is not None and owner.ready
         outcome = frames.read(index, time, seam=seam)
         if outcome is not None:

@@ -28,7 +28,7 @@ from .estimate import cannot_fit, estimate
 from .notes import of_fabrics, of_slack
 from .options import RefineOptions
 from .report import RefineReport, of_a_kind
-from .untagged import Beside, bodies_beside, command_of, proposal, rest_options
+from .untagged import FAR, Candidate, command_of, find_candidates, proposal, rest_options
 from .up_axis import across_gravity
 from .warnings import of_gravity, of_strain, of_unfelt
 
@@ -60,7 +60,13 @@ def begin_report(
     crowding = _crowding(opened, frames, options) if before_a_run else ()
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=crowding).plain()
     known = _strained(opened, report, frames)
-    beside = bodies_beside(opened, frames)
+    candidates = find_candidates(opened)
+    report.candidates = {
+        each.path: f"{'taken' if each.is_taken else 'left'}: {each.reason}"
+        for each in candidates
+        if not each.reason.startswith(FAR)
+    }
+    beside = [each for each in candidates if each.is_taken]
     known += _unfelt(report, beside) if options.contact != "off" else []
     known += _across(opened, frames, beside)
     report.note(*of_slack([garment.path for garment in opened.scene.garments], choices), *of_fabrics(opened))
@@ -122,6 +128,7 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
         "estimate": report.estimate,
         "garments": report.garments,
         "colliders": list(opened.colliders),
+        "candidates": report.candidates,
         "modelled": report.modelled,
         "left_out": report.left_out,
         "variants": report.variants,
@@ -231,14 +238,14 @@ def _crowding(opened: Shot, frames: Sequence[Frame], options: RefineOptions) -> 
     return found
 
 
-def _unfelt(report: RefineReport, beside: Sequence[Beside]) -> list[str]:
-    """Add to the report the closed meshes that garments touch and do not feel; returns a warning of them."""
+def _unfelt(report: RefineReport, beside: Sequence[Candidate]) -> list[str]:
+    """Add to the report the meshes that garments touch and do not feel; returns a warning of them."""
     for garment in report.garments:
         garment["unfelt"] = [each.path for each in beside if garment["path"] in each.shares]
     return of_unfelt(beside)
 
 
-def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Beside]) -> list[str]:
+def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Candidate]) -> list[str]:
     """A warning where bodies and garments stand across gravity that nobody chose."""
     chosen = opened.gravity_source == GRAVITY_OPTION or opened.gravity_source.endswith(GARMENT["gravity"].name)
     found = None if chosen else across_gravity(opened.scene, frames, beside)

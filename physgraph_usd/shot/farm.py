@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import Any
 
 from ..errors import PhysGraphError, SolveError, UsageError
+from ..interrupts import leave_if_asked
 from ..version import __version__, code_digest
 
 RETRIES = 2
@@ -65,9 +66,13 @@ class FarmCall:
             raise error
         return value
 
-    def end(self) -> None:
+    def ask_to_end(self) -> None:
         """End it where it has not begun; a frame that a worker is solving is finished first."""
         self._future.cancel()
+
+    def end(self) -> None:
+        """The same: nothing here waits for a worker."""
+        self.ask_to_end()
 
 
 @contextmanager
@@ -108,6 +113,7 @@ def _client(address: str) -> Iterator[Any]:
     with client:
         limit = time.monotonic() + CONNECT_SECONDS
         while not client.nthreads():
+            leave_if_asked()
             if time.monotonic() > limit:
                 raise UsageError(f"the Dask scheduler at {address} has no workers; start some: dask worker {address}")
             time.sleep(0.1)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import re
 import zipfile
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ RUN = "run.json"
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
 _BEFORE = ".before"
+_DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""Errors of numpy and zipfile over a file that is not what `FrameFolder.write` left."""
 _OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
 """Names of finished frames and of the record, also while they are written."""
 
@@ -120,13 +123,21 @@ class FrameFolder:
     """
 
     def __init__(
-        self, folder: Path, run: Mapping[str, Any], *, resume: bool = False, drop: bool = False, keep: bool = True
+        self,
+        folder: Path,
+        run: Mapping[str, Any],
+        *,
+        counts: Sequence[int] = (),
+        resume: bool = False,
+        drop: bool = False,
+        keep: bool = True,
     ) -> None:
         """Take a folder for a run, empty or with the frames of one that was interrupted.
 
         Args:
             folder: Where; made where it is not there.
             run: Everything that decides the frames, ready for JSON.
+            counts: Number of fine vertices of each garment; a frame with other ones is damaged.
             resume: Use finished frames that are there.
             drop: Remove finished frames that are there, whatever run they are of.
             keep: Leave finished frames there when the run is interrupted.
@@ -135,7 +146,7 @@ class FrameFolder:
             UsageError: The folder holds finished frames of another run, or is not ours.
             LayerError: The folder cannot be made, or another run is at work in it.
         """
-        self.folder, self._keep = folder, keep
+        self.folder, self._keep, self._counts = folder, keep, tuple(counts)
         try:
             self._check_ours()
             self._lock = FolderLock(folder, layer=folder.with_name(folder.name.removesuffix(_FRAMES)))
@@ -233,9 +244,18 @@ class FrameFolder:
                 names = [f"points{k}" for k in range(len(reused))]
                 points = tuple(data[name] if name in data.files else None for name in names)
                 heat = tuple(_heat_of(data, k) if points[k] is not None else None for k in range(int(data["heated"])))
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise LayerError(f"{file} is damaged; remove it and --resume") from error
+            self._check_points(points)
+        except _DAMAGED as error:
+            raise LayerError(f"{file} is damaged ({error}); remove it and --resume") from error
         return Outcome(time, points, reused, record, heat)
+
+    def _check_points(self, points: Sequence[np.ndarray | None]) -> None:
+        """Refuse (ValueError) points that no kernel may see: these read where a face's corner says."""
+        if points and self._counts and len(points) != len(self._counts):
+            raise ValueError(f"points of {len(points)} garments, not of {len(self._counts)}")
+        for each, count in zip(points, self._counts, strict=False):
+            if each is not None and (each.shape != (count, 3) or each.dtype.kind != "f" or not np.isfinite(each).all()):
+                raise ValueError(f"points of shape {each.shape}, not {count} finite positions")
 
     def _clear(self) -> None:
         """Remove our files but the locked one."""

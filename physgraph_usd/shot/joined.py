@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..interrupts import leave_if_asked
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import start_warp
 from ..usd.read.reader import Shot
@@ -61,6 +62,7 @@ def join(both: Sequence[tuple[Outcome, Lead]], move: Mover) -> Joint:
         wanted = [a if a is None or b is None else _between(a, b, lead.weight) for a, b in pairs]
         near, far = [a for a, _ in pairs], [b for _, b in pairs]
         points, why = move(outcome.time, *((near, far) if lead.weight < 0.5 else (far, near)), wanted)
+        leave_if_asked()  # before a move is taken that a signal broke off
         frames.append(replace(outcome, points=tuple(points), reused=(False,) * len(points)))
     return Joint(tuple(replace(each, lead=None) for each in ([own for own, _ in both] if why else frames)), why)
 

@@ -77,7 +77,7 @@ class RefineOptions:
     )
     colliders: Sequence[str] = _scene(
         (),
-        f"Prim path, glob or collection; auto: what the shot names and closed meshes that garments touch{LIST}.",
+        f"Prim path, glob or collection; auto: what the shot names and drawn meshes that garments touch{LIST}.",
         flag="collider",
         metavar="PATH|auto",
     )
@@ -103,7 +103,7 @@ class RefineOptions:
     device: str = _solver("cpu", "Where to compute.", metavar="cpu|cuda")
     overrides: Sequence[str] = _scene(
         (),
-        f"Override an attribute, such as bendStiffness=2e-4 for all garments{LIST}.",
+        f"Override an attribute of garments or colliders, such as bendStiffness=2e-4 for all garments{LIST}.",
         flag="set",
         metavar="PRIM.ATTR=VALUE",
     )

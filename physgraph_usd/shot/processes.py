@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import re
@@ -16,11 +17,12 @@ from types import TracebackType
 from typing import Any
 
 from ..errors import PhysGraphError, SolveError
-from ..interrupts import signals_raise
+from ..interrupts import leave_if_asked, signals_noted
 
+LOG = logging.getLogger("physgraph_usd")
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0
-"""How long a process that was asked to end may clear up."""
+"""How long a process that was asked to end may clear up, and one that is stopped may pause before a warning."""
 _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
 
 
@@ -41,11 +43,36 @@ class Call:
         self._process.start()
         there.close()
         self._answer: tuple[Any, PhysGraphError | None] | None = None
+        self._stopped_since: float | None = None
+        self._has_warned = False
 
     @property
     def ready(self) -> bool:
-        """Whether it has returned, failed or died."""
-        return self._answer is not None or self._here.poll()
+        """Whether it has returned, failed or died; of one that is stopped a warning tells."""
+        if self._answer is not None or self._here.poll():
+            return True
+        self._warn_if_stopped()
+        return False
+
+    def _warn_if_stopped(self) -> None:
+        """Warn once of a process that somebody stopped for so long that it is no pause of the whole run."""
+        pid = self._process.pid
+        if self._has_warned or not self._is_stopped():
+            self._stopped_since = None
+            return
+        now = time.monotonic()
+        self._stopped_since = self._stopped_since or now
+        if now - self._stopped_since >= PATIENCE_SECONDS:
+            LOG.warning("the worker process %d is stopped and the run waits; kill -CONT %d lets it go on", *2 * (pid,))
+            self._has_warned = True
+
+    def _is_stopped(self) -> bool:
+        if not hasattr(os, "waitid") or self._process.pid is None:
+            return False
+        try:  # WNOWAIT leaves the process's end to multiprocessing.
+            return os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+        except ChildProcessError:  # It has ended.
+            return False
 
     def result(self) -> Any:
         """The function's result; waits for it.
@@ -69,6 +96,8 @@ class Call:
     def ask_to_end(self) -> None:
         """Ask it to clear up and end, and do not wait."""
         self._process.terminate()
+        if self._is_stopped() and self._process.pid is not None:
+            os.kill(self._process.pid, signal.SIGCONT)
 
     def end(self) -> None:
         """End it, with time to clear up."""
@@ -95,6 +124,7 @@ def call_each(
     try:
         for index in range(len(jobs)):
             while not (index < len(calls) and calls[index].ready):
+                leave_if_asked()
                 if len(calls) < len(jobs) and sum(not call.ready for call in calls) < workers:
                     calls.append(Call(function, *jobs[len(calls)]))
                 else:
@@ -131,7 +161,7 @@ def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ..
     """Call the function and send its result; Ctrl-C is the business of the process that started this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_outlast_parent, daemon=True).start()
-    with signals_raise(), _Sent(there), memory_is_named():
+    with signals_noted(), _Sent(there), memory_is_named():
         there.send((function(*args), None))
 
 

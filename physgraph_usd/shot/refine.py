@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LayerError, PhysGraphError, StageError, UsageError
-from ..interrupts import SIGNALLED, exit_code_of, signals_raise
+from ..interrupts import SIGNALLED, exit_code_of, signals_noted
 from ..solver.integrate.metric import FACTOR
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import is_result_of, write_root
@@ -120,7 +120,7 @@ def _run(
     report = RefineReport(shot_name(shot), None, options.plain(), options.value_sources())
     began = clock.perf_counter()
     try:
-        with signals_raise(), memory_is_named(), closing(open_for(shot, options)) as opened:
+        with signals_noted(), memory_is_named(), closing(open_for(shot, options)) as opened:
             warnings = begin_report(report, opened, options, before_a_run=options.dry_run)
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
@@ -174,7 +174,7 @@ def refine_shots(
 def _check_places(out: Path, options: RefineOptions) -> None:
     """Refuse before the work, not after an hour of frames, what could not be written then."""
     if not out.resolve().parent.is_dir():
-        raise LayerError(f"the folder {out.resolve().parent} does not exist")
+        raise UsageError(f"the folder {out.resolve().parent} does not exist")
     if not options.resume:
         _check_new(out, options)
     for _, path in options.targets(out):
@@ -226,6 +226,7 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
     """
     options = RefineOptions(**given)
     source = str(shot) if isinstance(shot, Path) else shot
+    files_of(source)  # A pipe among them is an error here, and a wait for ever when opened.
     try:
         with closing(open_for(source, options)) as opened:
             found = describe(opened, options)

@@ -69,6 +69,7 @@ class RefineReport:
         failed: Time codes that have no sample in the layer, with the error.
         unsettled: Frames that were written though the solver left them unsettled: path, time and in what way.
         strict: Whether a run with unsettled frames counts as done in part.
+        candidates: Why ``--collider auto`` takes or leaves meshes that are neither garments nor colliders, by path.
         variants: Variant selections in force on what the garments depend on, as paths ``/World/coat{fit=loose}``.
         warnings: What the user should know; what is so of several prims is one of them, which names a few.
         notes: What could look otherwise, though nothing is wrong: slack of the cages, fabrics by name, the level.
@@ -92,6 +93,7 @@ class RefineReport:
     failed: dict[str, str] = field(default_factory=dict)
     unsettled: list[dict[str, Any]] = field(default_factory=list)
     strict: bool = False
+    candidates: dict[str, str] = field(default_factory=dict)
     variants: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -87,7 +87,11 @@ class Run:
             if self.out is not None:
                 decides = {"levels": self._solver.levels, "times": times, "report": options.report is not None}
                 settings = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames}
-                frames = stack.enter_context(FrameFolder(frames_folder(self.out), provenance | decides, **settings))
+                meshes = zip(self.shot.scene.garments, refinements, strict=True)
+                counts = [[cage, *steps][-1].mesh.vertex_count for cage, steps in meshes]
+                frames = stack.enter_context(
+                    FrameFolder(frames_folder(self.out), provenance | decides, counts=counts, **settings)
+                )
             writer = stack.enter_context(LayerWriter(self.shot, refinements, self.out, provenance=provenance, **made))
             solved = stack.enter_context(closing(self._solved(times, frames)))
             for _ in range(leads):

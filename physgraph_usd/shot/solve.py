@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from ..errors import SolveError, StageError, UsageError
+from ..interrupts import leave_if_asked
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import start_warp
@@ -86,11 +87,12 @@ class ShotSolver:
                 frame = shot.frame(time)
                 read_ms = round(1e3 * (clock.perf_counter() - began), 3)
                 state = refiner.solve(frame, sampled_at(shot, time))
+                record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
+                outcome = Outcome(time, state.points, state.reused, record, state.heat)
             except (SolveError, StageError) as error:
-                yield Outcome(time, (), (), {"time": time, "error": str(error)})
-                continue
-            record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
-            yield Outcome(time, state.points, state.reused, record, state.heat)
+                outcome = Outcome(time, (), (), {"time": time, "error": str(error)})
+            leave_if_asked()  # before a frame is taken that a signal broke off
+            yield outcome
 
     def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
         """Begin in the middle of a shot, where its cage crosses, with the cage walked there from an earlier frame."""

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import LayerError, UsageError, counted
+from ..interrupts import signals_noted
 from ..solver.mesh.subdivide import subdivide_times
 from ..usd.files import LAYER_SUFFIXES, check_targets, files_of
-from ..usd.provenance import recorded_shot, write_root
+from ..usd.provenance import is_only_ours, recorded_shot, write_root
 from ..usd.read.reader import Shot
 from ..usd.stage import is_there, pxr_errors, quiet
 from ..usd.times import within
@@ -101,7 +102,7 @@ def stitch(
         LayerError: A chunk cannot be read, a seam moves too far, or the layer cannot be written or is invalid.
     """
     out = Path(out)
-    with pxr_errors("cannot read the chunks", LayerError), quiet():
+    with signals_noted(), pxr_errors("cannot read the chunks", LayerError), quiet():
         parts = _opened(chunks)
         shot = _check_alike(parts)
         _check_frames(parts, frames)
@@ -183,8 +184,12 @@ def _layers_in(place: Path) -> list[Path]:
 
 
 def _check_alike(parts: Sequence[ChunkLayer]) -> Path:
-    """Refuse chunks of other shots, versions or options; returns the shot."""
+    """Refuse chunks that were changed, or are of other shots, versions or options; returns the shot."""
     first = parts[0]
+    for part in parts:
+        if not is_only_ours(part.layer):
+            raise LayerError(f"{part.file} was changed after refine wrote it; refine it anew")
+        part.check_preroll()
     shots = [recorded_shot(part.layer) for part in parts]
     for part, shot in zip(parts[1:], shots[1:], strict=True):
         one, other = _decisive(first), _decisive(part)

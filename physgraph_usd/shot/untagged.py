@@ -1,11 +1,11 @@
-"""Closed meshes that garments touch and that nothing names as colliders: found, named, and taken by ``auto``."""
+"""Meshes that garments touch and that nothing names as colliders: found, named, and taken by ``auto``."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import join
 from typing import Any
@@ -13,44 +13,59 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..errors import StageError
+from ..errors import StageError, counted
 from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import MeshPose, Pose
 from ..solver.colliders.sign import signed_distances
-from ..solver.contact.broad_phase import bounds_of, mean_edge
+from ..solver.contact.broad_phase import bounds_of
 from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
-from ..solver.scene import Frame, Garment
+from ..solver.scene import Frame, Garment, GarmentFrame
 from ..solver.strain import StrainedPart, strained_parts
 from ..usd.read.reader import Shot, open_shot
 from ..usd.read.rest import FITTED
-from ..usd.read.untagged import meshes_beside
+from ..usd.read.untagged import unnamed_meshes
+from ..usd.stage import at_time
 from ..usd.view import Stage
 
 AUTO = "auto"
-"""In place of a collider: all that the shot names, and closed meshes that garments touch."""
+"""In place of a collider: all that the shot names, and the meshes that garments touch."""
 MOST_ASKED = 32
 """Most open meshes that are tried as garments."""
 NEAR = 0.025
 """How near a body is taken for one that cloth lies on [m]: solvers keep up to 2 cm, and rounding adds."""
-TRIM = 4.0
-"""Bodies without a side of so many of the cage's edges are buttons and buckles: no cloth drapes over them."""
+FAR = f"no cloth comes within {1e3 * NEAR:.0f} mm of it"
+"""Reason for which a mesh is left that cloth does not touch."""
+MOST_FRAMES = 10
+"""Most frames, spread over the shot, in which it is looked what cloth touches."""
+LIES_ALONG = 2.0
+"""Distance within which a mesh lies along cloth, in what cloth keeps from a body, its offset and thickness: the outer
+skin of a thick export and a button on the cloth are about as far again."""
+MOST_OF = 0.95
+"""Fraction of a mesh's points that lies along cloth and moves with it."""
 
 
 @dataclass(frozen=True)
-class Beside:
-    """A closed mesh that a garment touches and does not feel.
+class Candidate:
+    """A mesh that is neither a garment nor a collider.
 
     Attributes:
         path: The mesh.
-        shares: For each garment that touches it, the share of its vertices that is in it or near it, in the first frame
-            looked at where any is.
-        pose: Where the mesh is in that frame.
+        reason: Why `AUTO` takes it, or leaves it.
+        shares: For each garment that touches it, the fraction of its vertices that is in it or near it, in the first
+            frame looked at where any is; empty where it is left.
+        pose: Where the mesh is in that frame, or None.
     """
 
     path: str
-    shares: Mapping[str, float]
-    pose: Pose
+    reason: str
+    shares: Mapping[str, float] = field(default_factory=dict)
+    pose: Pose | None = None
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether `AUTO` takes it."""
+        return bool(self.shares)
 
     @property
     def garment(self) -> str:
@@ -58,12 +73,13 @@ class Beside:
         return max(self.shares, key=lambda path: self.shares[path])
 
 
-def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
-    """Closed meshes that are neither garments nor colliders and that garments overlap or lie within `NEAR` of.
+def find_candidates(shot: Shot) -> list[Candidate]:
+    """Meshes that are neither garments nor colliders, taken where cloth overlaps them or lies within `NEAR` of them.
+
+    Not taken are meshes that are not drawn, and trims and second skins: they lie along the cloth and move with it.
 
     Args:
         shot: An open shot.
-        frames: A few of its frames, of which the first, the middle and the last are read.
 
     Returns:
         What was found, the one that most of a garment touches first.
@@ -71,27 +87,74 @@ def bodies_beside(shot: Shot, frames: Sequence[Frame]) -> list[Beside]:
     Raises:
         StageError: USD cannot read the files any more.
     """
-    sampled = list(dict.fromkeys(frames[k] for k in (0, len(frames) // 2, -1) if frames))
-    boxes = [bounds_of(np.concatenate([garment.points for garment in frame.garments])) for frame in sampled]
+    frames = sample_frames(shot.every_time, shot.frame, most=MOST_FRAMES)
+    if not frames:
+        return []
+    boxes = [bounds_of(np.concatenate([garment.points for garment in frame.garments])) for frame in frames]
     boxes = [box + np.array([[-NEAR], [NEAR]]) for box in boxes]
-    least, found = _smallest_body(shot.scene.garments), []
-    for path, poses in meshes_beside(shot, [frame.time for frame in sampled], boxes, least=least):
-        start_warp()
-        body = MeshBody(device="cpu", threads=1)
-        for index, pose in poses:
-            cages = zip(shot.scene.garments, sampled[index].garments, strict=True)
-            shares = {
-                g.path: _fraction_at(body, pose, g, cage.points) for g, cage in cages if isinstance(pose, MeshPose)
-            }
-            touched = {path: share for path, share in shares.items() if share}
-            if touched:
-                found.append(Beside(path, touched, pose))
-                break
-    return sorted(found, key=lambda each: -max(each.shares.values()))
+    found = []
+    for path, why, poses in unnamed_meshes(shot, [frame.time for frame in frames], boxes):
+        found.append(Candidate(path, why) if why else _judged(path, poses, shot.scene.garments, frames=frames))
+    return sorted(found, key=lambda each: -max(each.shares.values(), default=0.0))
+
+
+def _judged(
+    path: str, poses: Iterator[tuple[int, Pose]], garments: Sequence[Garment], *, frames: Sequence[Frame]
+) -> Candidate:
+    """A mesh that is drawn, given its poses by number of the frame, taken or left."""
+    start_warp()
+    body = MeshBody(device="cpu", threads=1)
+    for index, pose in poses:
+        cages = [cage.points for cage in frames[index].garments]
+        fractions = [_fraction_at(body, pose, *each) for each in zip(garments, cages, strict=True)]
+        if any(fractions):
+            most = int(np.argmax(fractions))
+            garment = garments[most]
+            seen = [(index, pose), *poses]
+            if _moves_with(garment, [(frames[k].garments[most], each) for k, each in seen]):
+                why = f"it lies on <{garment.path}> and moves with it: a trim, or the garment's own skin"
+                return Candidate(path, why)
+            where = f"{fractions[most]:.0%} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
+            shares = {g.path: fraction for g, fraction in zip(garments, fractions, strict=True) if fraction}
+            return Candidate(path, where + at_time(frames[index].time), shares, pose)
+    return Candidate(path, f"{FAR} in {counted(len(frames), 'frame')}")
+
+
+def _moves_with(garment: Garment, frames: Sequence[tuple[GarmentFrame, Pose]]) -> bool:
+    """Whether a mesh lies along a cage in the first of some frames, and stays near the same places of it in all."""
+    (cloth, pose), *later = frames
+    triangles = garment.mesh.triangulate(garment.rest).triangles
+    surfaces = MeshBody(side="start", device="cpu", threads=1).pose(MeshPose(cloth.points, triangles))
+    if not isinstance(pose, MeshPose) or not surfaces:
+        return False
+    used = np.unique(pose.triangles)
+    points = torch.as_tensor(pose.points[used] - surfaces[0].origin)
+    reach = LIES_ALONG * (cloth.offset + cloth.fabric.thickness)
+    found = surfaces[0].closest(points, torch.full_like(points[:, 0], reach))
+    near = found.distance.isfinite().numpy()
+    if near.mean() < MOST_OF:
+        return False
+    corners = surfaces[0].triangles[found.face.numpy()[near]]
+    weights = _weights(cloth.points[corners], found.point.numpy()[near] + surfaces[0].origin)
+    for other, moved in later:
+        if not isinstance(moved, MeshPose) or moved.points.shape != pose.points.shape:
+            return False
+        places = np.einsum("nk,nkd->nd", weights, other.points[corners])
+        away = np.linalg.norm(moved.points[used][near] - places, axis=1)
+        if np.quantile(away, MOST_OF) > reach:
+            return False
+    return True
+
+
+def _weights(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates of points on triangles of shape (N, 3, 3), one a triangle, shape (N, 3)."""
+    spokes = triangles - points[:, None]
+    areas = np.linalg.norm(np.cross(np.roll(spokes, -1, axis=1), np.roll(spokes, -2, axis=1)), axis=2)
+    return areas / np.maximum(areas.sum(axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequence[str] = (), **options: Any) -> Shot:
-    """Open a shot, where `AUTO` among the colliders stands for the meshes of `bodies_beside`.
+    """Open a shot, where `AUTO` among the colliders stands for the candidates that are taken.
 
     Args:
         shot: As `open_shot` takes it.
@@ -105,8 +168,7 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     if AUTO not in colliders:
         return open_shot(shot, colliders=colliders, **options)
     with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **options)) as first:
-        beside = bodies_beside(first, sample_frames(first.every_time, first.frame))
-        named = [*first.colliders, *(each.path for each in beside)]
+        named = [*first.colliders, *(each.path for each in find_candidates(first) if each.is_taken)]
     return open_shot(shot, colliders=named, **options)
 
 
@@ -124,7 +186,7 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
     try:
         with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
             sampled = sample_frames(opened.every_time, opened.frame)
-            found = bodies_beside(opened, sampled)
+            found = [each for each in find_candidates(opened) if each.is_taken]
             lying = {path for each in found for path in each.shares}
             garments = [garment.path for garment in opened.scene.garments if garment.path in lying]
             bodies, rest = [each.path for each in found], rest_options(_strained(opened, sampled, garments))
@@ -165,13 +227,8 @@ def _strained(
             yield source.sources["rest"], strained_parts(garment, cages, source.subsets, up=-shot.scene.gravity)
 
 
-def _smallest_body(garments: Sequence[Garment]) -> float:
-    """Longest side of the smallest body that some garment could drape over [m]."""
-    return TRIM * min(map(mean_edge, garments), default=0.0)
-
-
-def _fraction_at(body: MeshBody, pose: MeshPose, garment: Garment, cage: np.ndarray) -> float:
-    """Fraction of a cage's vertices that is in a body's closed part or near it.
+def _fraction_at(body: MeshBody, pose: Pose, garment: Garment, cage: np.ndarray) -> float:
+    """Fraction of a cage's vertices that is in a body's closed part or near it or its open part.
 
     Args:
         body: The body.
@@ -184,9 +241,8 @@ def _fraction_at(body: MeshBody, pose: MeshPose, garment: Garment, cage: np.ndar
         is not touched.
     """
     fraction, edges = 0.0, torch.as_tensor(garment.mesh.half_edges.edges)
-    for surface in body.pose(pose):
-        if surface.closed:
-            signed = signed_distances(surface, torch.as_tensor(cage - surface.origin), edges, reach=2.0 * NEAR)
-            touches = (signed.abs() <= NEAR).any() or ((signed < 0).any() and (signed > 0).any())
-            fraction = max(fraction, float((signed <= NEAR).double().mean())) if bool(touches) else fraction
+    for surface in body.pose(pose) if isinstance(pose, MeshPose) else ():
+        signed = signed_distances(surface, torch.as_tensor(cage - surface.origin), edges, reach=2.0 * NEAR)
+        touches = (signed.abs() <= NEAR).any() or ((signed < 0).any() and (signed > 0).any())
+        fraction = max(fraction, float((signed <= NEAR).double().mean())) if bool(touches) else fraction
     return fraction

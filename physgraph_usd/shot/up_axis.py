@@ -13,14 +13,14 @@ import numpy as np
 
 from ..solver.colliders.pose import Pose
 from ..solver.scene import Frame, Garment, Scene
-from .untagged import Beside
+from .untagged import Candidate
 
 TWICE = 2.0
 """Ratio from which a body stands and a garment goes round. Points of people who stand, walk or dance spread 2.4 to 8
 times as far upwards as forwards; a four-legged animal is at most half as long again as it is high."""
 
 
-def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Beside]) -> tuple[str, str, str] | None:
+def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Candidate]) -> tuple[str, str, str] | None:
     """A garment, a body inside it, and the axis, "Y" or "Z", along which both stand, where gravity pulls across.
 
     A garment goes round an axis if `TWICE` as much of it faces both ways along gravity as both ways along the axis, in
@@ -35,7 +35,7 @@ def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Besid
     for index, garment in enumerate(scene.garments):
         cages = [frame.garments[index].points for frame in frames]
         rest, moving = _faces(garment, garment.rest), sum((_faces(garment, points) for points in cages), np.zeros(3))
-        bodies = [(each.path, [each.pose]) for each in beside if garment.path in each.shares]
+        bodies = [(each.path, [each.pose]) for each in beside if each.pose and garment.path in each.shares]
         bodies += [(collider.path, _around(frames, index, number)) for number, collider in enumerate(scene.colliders)]
         for axis in {1, 2} - {down}:
             if all(TWICE * faced[axis] < faced[down] for faced in (rest, moving)):

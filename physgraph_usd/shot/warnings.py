@@ -15,7 +15,7 @@ from ..solver.strain import StrainedPart
 from ..usd.read.rest import FITTED
 from .report import RefineReport, is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
-from .untagged import AUTO, NEAR, Beside, options_of
+from .untagged import AUTO, NEAR, Candidate, options_of
 
 MOST_NAMED = 3
 """Most prims, parts or time codes that one warning names."""
@@ -117,7 +117,7 @@ WARNINGS = {
         "{remedy}",
     ),
     "unfelt": Kind(
-        "cloth is inside or near a closed mesh that it does not feel",
+        "cloth is inside or near a mesh that it does not feel",
         "`--collider auto`, or the command that the warning names",
         "cloth is inside or within {near:.0f} mm of {meshes} that it does not feel, for {why}: {named}",
         "give --collider {auto}, or by name {options}",
@@ -177,7 +177,7 @@ def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) ->
     return WARNINGS["gravity"](garment, body=body, axis=axis, pull=pull, source=source)
 
 
-def of_unfelt(found: Sequence[Beside]) -> list[str]:
+def of_unfelt(found: Sequence[Candidate]) -> list[str]:
     """A warning of the meshes that touch cloth unfelt, with what to type."""
     if not found:
         return []
@@ -185,7 +185,7 @@ def of_unfelt(found: Sequence[Beside]) -> list[str]:
     named += [f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
     options = join(options_of("--collider", [each.path for each in found[:MOST_NAMED]]))
     one = len(found) == 1
-    meshes, why = ("a closed mesh", "it is no collider") if one else ("closed meshes", "they are no colliders")
+    meshes, why = ("a mesh", "it is no collider") if one else ("meshes", "they are no colliders")
     figures = {"named": ", ".join(named), "options": options, "near": 1e3 * NEAR, "auto": AUTO}
     return [WARNINGS["unfelt"](meshes=meshes, why=why, **figures)]
 

@@ -1,5 +1,7 @@
 """The time at which a frame's solve ends wherever it is: the loops of the solve ask, and stop where they stand.
 
+A signal that asks the run to end is over time too; the caller then drops the frame.
+
 Cloth that walks is where a safe move ended, at any time, so what is written then is valid though it is not at rest.
 """
 
@@ -10,6 +12,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+
+from ..interrupts import is_asked
 
 _ENDS: ContextVar[float] = ContextVar("ends", default=math.inf)
 
@@ -25,5 +29,5 @@ def ends_after(seconds: float) -> Iterator[None]:
 
 
 def is_over() -> bool:
-    """Whether the time is over; never outside of `ends_after`."""
-    return time.perf_counter() >= _ENDS.get()
+    """Whether the time is over, which outside of `ends_after` it never is, or a signal asks the run to end."""
+    return is_asked() or time.perf_counter() >= _ENDS.get()

@@ -72,14 +72,17 @@ class LevelChoice:
         return 0.0 < self.compression <= LEAST_STRAIN
 
 
-def sample_frames(times: Sequence[float], frame_at: Callable[[float | None], Frame]) -> list[Frame]:
+def sample_frames(
+    times: Sequence[float], frame_at: Callable[[float | None], Frame], *, most: int = SAMPLED_FRAMES
+) -> list[Frame]:
     """Read a few frames spread over the shot, the first and the last among them; unreadable ones are left out.
 
     Args:
         times: Its time codes; of none, the default values are read.
         frame_at: Reads a frame.
+        most: Most frames to read.
     """
-    picks = np.linspace(0, len(times) - 1, min(SAMPLED_FRAMES, len(times))).round().astype(int)
+    picks = np.linspace(0, len(times) - 1, min(most, len(times))).round().astype(int)
     picked: list[float | None] = [times[i] for i in picks] or [None]
     return [frame for time in picked if (frame := _readable(frame_at, time)) is not None]
 

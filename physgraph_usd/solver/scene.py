@@ -237,23 +237,29 @@ def _unsolvable(garment: Garment, points: np.ndarray) -> str:
 
 
 def refuse_falling(scene: Scene, frame: Frame) -> None:
-    """Refuse a frame in which a garment would fall out of its shot: nothing holds it but too weak a guide.
+    """Refuse a frame in which a garment would fall out of its shot: too weak a guide, and nothing else that holds it.
 
-    Without pins, bodies and other garments it sinks by its weight over the guide's stiffness.
+    By its weight over the guide's stiffness it sinks without pins, bodies and other garments. Held by these at one end
+    it stretches: a strip of length L and modulus Y that hangs is longer by w L^2 / 2 Y, with w its weight by area.
 
     Raises:
-        GarmentError: It would sink by `FALLS` times its own size.
+        GarmentError: It would sink, and held cloth stretch, by `FALLS` times its own size.
     """
-    if len(scene.garments) > 1:
-        return
     for garment, garment_frame in zip(scene.garments, frame.garments, strict=True):
         weight = garment_frame.fabric.density * float(np.linalg.norm(scene.gravity))
-        held = garment.colliders or (garment.pin > 0).any() or not len(garment_frame.points)
+        held = garment.colliders or (garment.pin > 0).any() or len(scene.garments) > 1
         size = max(SPECK, *(float(np.ptp(x, axis=0).max(initial=0.0)) for x in (garment_frame.points, garment.rest)))
-        stiffness = garment_frame.guide * float(garment.guide_scale.mean())
-        if not held and weight > FALLS * size * stiffness:
-            sinks = "without end" if stiffness == 0 else f"by {weight / stiffness:.3g} m"
+        guide, stretch = garment_frame.guide * float(garment.guide_scale.mean()), garment_frame.fabric.stretch
+        if not len(garment_frame.points) or weight <= FALLS * size * guide:
+            continue
+        if not held:
+            sinks = "without end" if guide == 0 else f"by {weight / guide:.3g} m"
             problem = f"nothing holds it up but a guide of {garment_frame.guide:g} N/m^3: it would sink {sinks}"
-            raise GarmentError(
-                garment.path, problem, time=frame.time, remedy="raise physgraph:guide:stiffness, or pin it"
-            )
+            remedy = "raise physgraph:guide:stiffness, or pin it"
+        elif weight * size > 2.0 * FALLS * stretch:
+            longer = f"where it hangs it would be {weight * size**2 / (2.0 * stretch):.3g} m longer"
+            problem = f"{stretch:g} N/m cannot carry its weight of {weight:.3g} N/m^2: {longer}"
+            remedy = "raise physgraph:material:stretchStiffness or physgraph:guide:stiffness, or lower the density"
+        else:
+            continue
+        raise GarmentError(garment.path, problem, time=frame.time, remedy=remedy)

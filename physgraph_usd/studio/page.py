@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import html
-import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 from ..errors import PhysGraphError
+from ..interrupts import leave_if_asked
 from ..solver.fabric import PRESETS
 from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
 from .guard import guarded_server
@@ -24,6 +25,8 @@ WORKING, MOVING, SETTLED, WRONG = "#b45f06", "#5b6470", "#1a7f37", "#c0392b"
 """Colours of the page's state."""
 FINEST = 0.002
 """Step of a slider, in its length."""
+POLL_SECONDS = 0.1
+"""How often the main thread asks whether a signal came."""
 STYLE = """<style>
 div:has(> .value) + div .mantine-NumberInput-root, div:has(> .value) + div .mantine-Slider-markLabel,
 div:has(> .value) + div > .mantine-Flex-root > div:first-child {display: none}
@@ -181,7 +184,9 @@ def serve(session: TuneSession, *, port: int = 8080, say: Callable[[str], None])
     page = TunePage(session, port=port)
     say(page.url)
     try:
-        threading.Event().wait()
+        while True:
+            leave_if_asked()
+            sleep(POLL_SECONDS)
     finally:
         page.close()
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..shot.solve import prepare_device
-from ..shot.untagged import AUTO, bodies_beside, open_with_colliders
+from ..shot.untagged import AUTO, find_candidates, open_with_colliders
 from ..shot.warnings import of_unfelt
 from ..solver.fabric import PRESETS
 from ..solver.mesh.subdivide import Refinement
@@ -104,7 +104,7 @@ class TuneSession:
         self.times: tuple[float | None, ...] = scene.times or (None,)
         self.time, self.contact = self.times[0], True
         frames = sample_frames(self.shot.every_time, self.shot.frame)
-        self.warning = "".join(of_unfelt(bodies_beside(self.shot, frames)))
+        self.warning = "".join(of_unfelt([each for each in find_candidates(self.shot) if each.is_taken]))
         self.levels = [choice.level for choice in choose_levels(scene, frames)]
         # A level that is chosen from the fabric would be chosen anew from what is tried.
         chosen = zip(scene.garments, self.levels, strict=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pxr import Ar, Sdf, Usd, UsdUtils
 
-from ..errors import UsageError
+from ..errors import StageError, UsageError
 from .provenance import is_only_ours, read_record
 from .stage import USD_ERRORS, is_sound, quiet
 
@@ -28,6 +28,9 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
     Sublayers, references, payloads, value clips and assets such as textures, through all layers. A refined layer in it
     is left out with what it needs: it is a result, which is not read and may be written again. A file that USD cannot
     open is its only one.
+
+    Raises:
+        StageError: One is a pipe, at which USD would wait for ever.
     """
     found: set[Path] = set()
     if isinstance(shot, Usd.Stage):
@@ -37,6 +40,8 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
     with quiet():
         while waiting:
             file = Path(Ar.SplitPackageRelativePathOuter(waiting.pop())[0])
+            if file.is_fifo():
+                raise StageError(f"{file} is no file: it is a pipe, which has no end")
             if file not in found and not (found and _is_result(file)):
                 found.add(file)
                 waiting += _named_in(file)

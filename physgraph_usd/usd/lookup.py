@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
-from .schema import AUTO_LEVEL, GARMENT, MATERIAL, Property, find_property
+from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, find_property
 from .stage import at_time, in_brief, timecode
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
@@ -29,14 +29,14 @@ class Override:
     """One ``--set``.
 
     Attributes:
-        prim: Prim path at or above the garments it is for; "/" means every garment.
+        prim: Prim path at or above the garments or colliders it is for; "/" means every one.
         row: The attribute.
         value: Its value.
     """
 
     prim: Sdf.Path
     row: Property
-    value: float
+    value: float | str
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +85,11 @@ def _parse_override(text: str) -> Override:
     if match is None:
         raise UsageError(f"cannot read {text!r}; write </prim>.attribute=value or attribute=value")
     row, word = find_property(match["name"]), match["value"].strip().lower()
-    if row.type in ("rel", "token") or row.interpolation:
+    if row.type == "rel" or row.interpolation or (row.type == "token" and row is not COLLIDER["collider:side"]):
         raise UsageError(f"{row.name} is not a single number; author it on the prim")
     try:
+        if row.type == "token":
+            return Override(Sdf.Path(match["prim"] or "/"), row, check_token(row, word, text))
         words = _WORDS | ({"auto": AUTO_LEVEL} if row is GARMENT["refine:level"] else {})
         value = words[word] if word in words else float(word)
         return Override(Sdf.Path(match["prim"] or "/"), row, check_limits(row, value, text))
@@ -95,12 +97,15 @@ def _parse_override(text: str) -> Override:
         raise UsageError(f"cannot use {text!r}: {error}") from error
 
 
-def check_overrides(overrides: Sequence[Override], garments: Sequence[Sdf.Path]) -> None:
-    """Refuse an override that is for no garment; UsageError names it and the garments."""
+def check_overrides(
+    overrides: Sequence[Override], garments: Sequence[Sdf.Path], colliders: Sequence[Sdf.Path] = ()
+) -> None:
+    """Refuse an override that is for no garment, or no collider; UsageError names it and those there are."""
     for override in overrides:
-        if not any(path.HasPrefix(override.prim) for path in garments):
-            paths = ", ".join(str(path) for path in garments)
-            raise UsageError(f"--set {override.prim}.{override.row.name}: no such garment; garments: {paths}")
+        kind, paths = ("collider", colliders) if override.row.short in COLLIDER else ("garment", garments)
+        if not any(path.HasPrefix(override.prim) for path in paths):
+            there = ", ".join(map(str, paths)) or "none"
+            raise UsageError(f"--set {override.prim}.{override.row.name}: no such {kind}; {kind}s: {there}")
 
 
 def with_ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:
@@ -151,10 +156,9 @@ def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
 
     The bound material counts for ``physgraph:material:`` values only.
     """
-    matching = [item for item in overrides if item.row.name == row.name and prim.GetPath().HasPrefix(item.prim)]
-    if matching:
-        winner = max(enumerate(matching), key=lambda pair: (pair[1].prim.pathElementCount, pair[0]))[1]
-        return Found(row, "--set", None, winner.value)
+    override = _override(prim, row, overrides)
+    if override is not None:
+        return Found(row, "--set", None, float(override.value))
     attribute = nearest(prim, row.name)
     if attribute is None and row.name.startswith(MATERIAL):
         materials = bound_materials(prim)
@@ -164,19 +168,32 @@ def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
     return Found(row, "fallback", None, None if row.fallback is None else float(row.fallback))
 
 
-def find_token(prim: Usd.Prim, row: Property) -> tuple[str, str]:
-    """Token of the prim, its nearest ancestor, or the fallback, and its source in words.
+def _override(prim: Usd.Prim, row: Property, overrides: Sequence[Override]) -> Override | None:
+    """The ``--set`` of an attribute that is nearest to a prim, the last of those on one prim; None without any."""
+    matching = [each for each in overrides if each.row.name == row.name and prim.GetPath().HasPrefix(each.prim)]
+    return max(reversed(matching), key=lambda each: each.prim.pathElementCount, default=None)
+
+
+def find_token(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> tuple[str, str]:
+    """Token by ``--set``, of the prim, its nearest ancestor, or the fallback, and its source in words.
 
     Raises:
         SchemaError: The value is none of the row's tokens.
     """
+    override = _override(prim, row, overrides)
+    if override is not None:
+        return str(override.value), "--set"
     attribute = nearest(prim, row.name)
     if attribute is None:
         return str(row.fallback or ""), "fallback"
-    value = attribute.Get()
+    return check_token(row, attribute.Get(), source_name(attribute)), source_name(attribute)
+
+
+def check_token(row: Property, value: object, source: str) -> str:
+    """Return a token when it is one of its row's; SchemaError gives value, source and choices."""
     if value not in row.tokens:
-        raise SchemaError(f"{source_name(attribute)} is {value!r}; it must be one of {', '.join(row.tokens)}")
-    return str(value), source_name(attribute)
+        raise SchemaError(f"{source} is {value!r}; it must be one of {', '.join(row.tokens)}")
+    return str(value)
 
 
 def source_name(attribute: Usd.Attribute) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 from pxr import Sdf, Usd, Vt
 
 from ..errors import LayerError, StageError
+from ..interrupts import leave_if_asked
 from .lookup import bound_materials, with_ancestors
 from .stage import TRAVERSAL, USD_ERRORS, paths_in, reason_of
 from .view import root_over
@@ -191,6 +192,7 @@ def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False
     paths = sorted(path for path in files if path.is_file())
     hashes = {}
     for path in paths:
+        leave_if_asked()
         with path.open("rb") as stream:
             hashes[asset_path(path, folder, absolute=absolute)] = hashlib.file_digest(stream, "sha256").hexdigest()
     return hashes

@@ -31,8 +31,11 @@ CONTACT, PAINTED, COLLISION = "Contact", "Painted Maps", "Collider"
 SIDES = ("auto", "winding", "start", "front", "back")
 """Rules for the side of a mesh on which cloth belongs.
 
-"auto": outside of pieces that are closed, and of the others the side on which the coarse cloth around a vertex is.
-"winding": outside of every piece, closed or not, by the generalised winding number.
+"auto": outside of pieces that are closed. An open mesh is on "winding" where it has pieces with an inside and most of
+the cloth is outside of them, on "front" or "back" where it is a floor or a wall with the cloth on that side; else cloth
+belongs where the coarse cloth around a vertex is.
+"winding": outside of pieces that are closed or have openings of at most half their own area, by the generalised
+winding number; of the others the side on which the coarse cloth is.
 "start": the side on which the coarse cloth is, of every piece, closed or not.
 "front", "back": that side of the authored faces of open pieces; outside of closed ones.
 """
@@ -254,7 +257,8 @@ PROPERTIES: tuple[Property, ...] = (
     _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 where the fine cloth follows the coarse cloth exactly."),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
-        "Whether garments collide with this prim.", "Collide", COLLISION, uniform=True,
+        "Whether garments collide with this prim; where nothing says so, they do where it is visible.",
+        "Collide", COLLISION, uniform=True,
     ),
     Property(
         COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, 10.0,
@@ -262,8 +266,9 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         COLLIDER_API, "physgraph:collider:side", "token", "auto", "", None, None,
-        "Where cloth belongs: auto, outside closed parts and where the coarse cloth is at open ones; winding, outside "
-        "by the winding number; start, where the coarse cloth is; front or back, that side of the faces of open parts.",
+        "Where cloth belongs: auto, outside closed parts, and at open ones as their shape and the coarse cloth tell; "
+        "winding, outside by the winding number; start, where the coarse cloth is; front or back, that side of the "
+        "faces of open parts.",
         "Side", COLLISION, uniform=True, tokens=SIDES,
     ),
     *_material(MATERIAL_API, fallbacks=False),
@@ -278,7 +283,12 @@ COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.sch
 
 def fabric_values(fabric: Fabric) -> dict[str, float]:
     """Values of a fabric by the schema's short names, without those that it has not."""
-    values = {
+    return {name: value for name, value in every_fabric_value(fabric).items() if value is not None}
+
+
+def every_fabric_value(fabric: Fabric) -> dict[str, float | None]:
+    """Values of a fabric by the schema's short names, None for those that it has not."""
+    return {
         "stretchStiffness": fabric.stretch,
         "weftStretchStiffness": fabric.weft_stretch,
         "shearStiffness": fabric.shear,
@@ -291,27 +301,27 @@ def fabric_values(fabric: Fabric) -> dict[str, float]:
         "rest:weftEase": 100.0 * fabric.weft_ease or None,
         "rest:creaseTime": fabric.crease_time or None,
     }
-    return {name: value for name, value in values.items() if value is not None}
 
 
 def find_property(text: str) -> Property:
-    """Find a garment property by full name, by name without ``physgraph:`` and ``material:``, or by its last word.
+    """Find a garment's or collider's property by full name, without ``physgraph:`` and ``material:``, or by last word.
 
     Raises:
         UsageError: When there is none, or a word may mean several; the message lists the names.
     """
-    rows = [row for row in GARMENT.values() if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}]
-    if rows:
-        return rows[0]
+    rows = GARMENT | COLLIDER
+    for row in rows.values():
+        if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}:
+            return row
     # "stiffness" is the last word of the guide's alone, but a fabric has three of them.
-    meant = [row for row in (*GARMENT.values(), *COLLIDER.values()) if row.short.lower().endswith(text.lower())]
-    if len(meant) == 1 and meant[0].short in GARMENT and meant[0].name.rsplit(":", 1)[-1] == text:
+    meant = [row for row in rows.values() if row.short.lower().endswith(text.lower())]
+    if len(meant) == 1 and meant[0].name.rsplit(":", 1)[-1] == text:
         return meant[0]
     if len(meant) > 1:
         raise UsageError(f"attribute {text!r} may mean {', '.join(row.short for row in meant)}; write one of them out")
-    near = nearest_property(text, GARMENT.values())
+    near = nearest_property(text, rows.values())
     hint = f"did you mean {near.short}? " if near else ""
-    raise UsageError(f"unknown attribute {text!r}; {hint}known attributes: {', '.join(sorted(GARMENT))}")
+    raise UsageError(f"unknown attribute {text!r}; {hint}known attributes: {', '.join(sorted(rows))}")
 
 
 def nearest_property(text: str, rows: Iterable[Property]) -> Property | None:

@@ -88,7 +88,7 @@ def hung(points: np.ndarray) -> np.ndarray:
     return np.stack([1.03 * points[:, 0] + 0.05 * points[:, 1], 1.01 * points[:, 1], bow], axis=1)
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("level", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", FAULTS)
 def test_s2_a_fault_leaves_the_rest_of_the_sheet_alone(kind: str, level: int):
     clean, rest = sheet(8, 6)

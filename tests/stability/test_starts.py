@@ -112,6 +112,6 @@ def test_s15_a_crumpled_cage_is_solved():
     """The cage itself is noise of three edges: the coarse animation is absurd, the answer finite and no worse."""
     mesh, rest = sheet(6, 6, EDGE)
     points = rest + 3.0 * EDGE * np.random.default_rng(5).normal(size=rest.shape)
-    state = solved(mesh, rest, points, level=2, dtype=torch.float32)
+    state = solved(mesh, rest, points, level=1, dtype=torch.float32)
     assert np.isfinite(state.points[0]).all()
     assert total(state.telemetry[0], "output") <= total(state.telemetry[0], "input")

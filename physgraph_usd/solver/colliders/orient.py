@@ -15,7 +15,10 @@ from scipy.sparse import csgraph
 WELD = 1e-6
 """Vertices closer than this are one, relative to the mesh's size."""
 HOLES = 0.03
-"""Part of a piece's area that its holes may have for it to count as closed: the winding number closes them."""
+"""Fraction of a piece's area that its openings may have for it to count as closed: the winding number closes them."""
+OPENINGS = 0.5
+"""The same for a piece that has an inside by its winding number alone: half a sphere is the limit, where the number is
+1/2 in the middle of the opening. A plane has an opening as large as itself, and no inside."""
 
 
 FIXED = {"front": 1.0, "back": -1.0}
@@ -45,8 +48,8 @@ def pieces_of(points: np.ndarray, triangles: np.ndarray, *, side: str = "auto") 
     Args:
         points: Positions [m], shape (V, 3); those that are not finite take their faces with them.
         triangles: Corners, shape (T, 3).
-        side: One of `sides.SIDES`: "winding" counts every piece as closed, "start" none; open pieces are left as they
-            are wound for "front" and "back".
+        side: One of `schema.SIDES`: "winding" counts pieces with openings up to `OPENINGS` as closed, "start" none;
+            open pieces are left as they are wound for "front" and "back".
 
     Returns:
         The pieces. Corners are welded: they use the first vertex at each place.
@@ -62,9 +65,9 @@ def pieces_of(points: np.ndarray, triangles: np.ndarray, *, side: str = "auto") 
     piece, turned, sound = _orientation(edge, forward, count, faces=len(faces))
     faces[turned] = faces[turned][:, ::-1]
     edge = np.where(turned[:, None], edge[:, [1, 0, 2]], edge)  # reversed corners: sides 2-1, 1-0, 0-2
-    closed = sound & _is_closed(points, faces, edge, count=count, piece=piece)
+    most = {"winding": OPENINGS, "start": -1.0}.get(side, HOLES)
+    closed = sound & (_openings(points, faces, edge, count=count, piece=piece) <= most)
     volume = np.bincount(piece, _volumes(points, faces, piece), piece.max() + 1)
-    closed = {"winding": np.ones_like(closed), "start": np.zeros_like(closed)}.get(side, closed)
     inward = closed[piece] & (volume[piece] < 0)
     outer = ~closed[piece]
     inward |= outer & turned & (side in FIXED)  # turned back
@@ -124,15 +127,27 @@ def _orientation(
     return piece.reshape(-1), as_is > reverse, ~one_sided
 
 
-def _is_closed(
+def _openings(
     points: np.ndarray, faces: np.ndarray, edge: np.ndarray, *, count: np.ndarray, piece: np.ndarray
 ) -> np.ndarray:
-    """Per piece, whether what its rims could span is small beside its own area."""
+    """Per piece, the area that its openings have at most, as a fraction of its own.
+
+    No flat opening has more area than the circle of its rim's length.
+    """
     corners = points[faces]
-    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    rim = np.bincount(piece, (sides * (count[edge] != 2)).sum(axis=1), piece.max() + 1)
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return rim**2 / (4.0 * np.pi) <= HOLES * np.bincount(piece, area, piece.max() + 1)
+    total = np.bincount(piece, area, piece.max() + 1)
+    face, side = np.nonzero(count[edge] != 2)
+    here, there = faces[face, side], faces[face, (side + 1) % 3]
+    # Rims of two pieces that meet in a vertex are two.
+    places, ends = np.unique(np.stack([here, there]) + piece[face] * len(points), return_inverse=True)
+    ends = ends.reshape(2, -1)
+    rims = sparse.coo_matrix((np.ones(len(face), bool), (ends[0], ends[1])), shape=(len(places), len(places)))
+    rim_count, rim = csgraph.connected_components(rims, directed=False)
+    length = np.bincount(rim[ends[0]], np.linalg.norm(points[there] - points[here], axis=1), rim_count)
+    owner = np.zeros(rim_count, np.int64)
+    owner[rim] = places // len(points)
+    return np.bincount(owner, length**2 / (4.0 * np.pi), len(total)) / np.maximum(total, np.finfo(float).tiny)
 
 
 def _volumes(points: np.ndarray, faces: np.ndarray, piece: np.ndarray) -> np.ndarray:

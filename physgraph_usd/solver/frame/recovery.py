@@ -16,8 +16,6 @@ from .values import FrameInput, Solved, State
 
 ROUNDING = 1e-3
 """Fraction of the energies' size by which two energies count as equal: sums are in single precision."""
-CONTACT = frozenset({"contact", "self_contact"})
-"""Names of the terms by which a cage that crosses or lies in a body has any energy."""
 MOST_WAIT = 64
 """Most frames between two starts from the cage. The wait doubles with each start that does not help, so such starts
 cost little in a shot whose cloth cannot be drawn apart."""
@@ -30,8 +28,9 @@ class RunawayError(SolveError):
 def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved:
     """Solve a frame, and once more from the cage where the result is unsound.
 
-    A result is unsound if cloth crosses, or if its energy is above the upsampled cage's without contact. The second
-    result stands if less crosses in it, or as much and its energy is lower than one above the cage's.
+    A result is unsound if cloth crosses, or if its energy is above the upsampled cage's without self contact, which is
+    as large as the cage crosses itself deeply. The second result stands if less crosses in it, or as much and its
+    energy is lower than one above the cage's.
 
     Args:
         group: Garments that are solved together.
@@ -40,7 +39,7 @@ def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved
 
     Raises:
         SolveError: As `solve_frame`.
-        RunawayError: Both results have more energy than the upsampled cage with contact.
+        RunawayError: Both results have more energy than the upsampled cage, self contact included.
     """
     solved = solve_frame(group, frame, last)
     why = _unsound(solved.telemetry)
@@ -51,7 +50,7 @@ def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved
     fresh = solve_frame(group, replace(frame, moved=np.inf, walked=None, elapsed=()), None)
     if _is_better(fresh.telemetry, solved.telemetry):
         return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {why}"})
-    if all(_excess(each.telemetry, contact=True) > 0.0 for each in (solved, fresh)):
+    if all(_excess(each.telemetry, whole=True) > 0.0 for each in (solved, fresh)):
         raise RunawayError(f"{why}, and a start from the cage ends no better")
     failures = 1 if last is None else last.failures + 1
     return _waiting(solved, failures, min(2**failures - 1, MOST_WAIT))
@@ -83,10 +82,10 @@ def _crossings(telemetry: Mapping[str, Any]) -> int:
     return int(telemetry.get("contact", {}).get("cloth", {}).get("after", {}).get("crossings", 0))
 
 
-def _excess(telemetry: Mapping[str, Any], *, contact: bool = False) -> float:
-    """Energy of the result above its upsampled cage's, with or without the cage's contact [J]; 0 if below or equal."""
+def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:
+    """Energy of the result above its upsampled cage's, with or without self contact [J]; 0 if below or equal."""
     sides = telemetry["energy_joules"]
-    before = {name: value for name, value in sides["input"].items() if contact or name not in CONTACT}
+    before = {name: value for name, value in sides["input"].items() if whole or name != "self_contact"}
     size = sum(abs(each) for each in (*before.values(), *sides["output"].values()))
     return max(_energy(telemetry) - sum(before.values()) - ROUNDING * size, 0.0)
 

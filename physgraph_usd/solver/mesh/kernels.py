@@ -11,9 +11,11 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from ...errors import PhysGraphError
+
 _STDERR = 2
 _OURS = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") else "-march=native"
-"""The same instructions on every x86-64 processor that has AVX2, so that kernels round alike on all of them."""
+"""Instructions of every x86-64 processor that has AVX2, so that kernels round alike on all of them."""
 _FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=native", _OURS)
 KERNELS = {"enable_backward": False, "cpu_compiler_flags": _FLAGS}
 """Options of modules: no derivatives, and on the CPU Warp's own flags for our instructions."""
@@ -23,10 +25,29 @@ FUSED = KERNELS | {"cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast"}
 
 @functools.cache
 def start_warp() -> None:
-    """Start Warp, without what its library prints itself where no CUDA driver is found: most machines have none."""
+    """Start Warp, without what its library prints itself where no CUDA driver is found: most machines have none.
+
+    Raises:
+        PhysGraphError: Kernels have to be compiled, and there is no folder to keep them in.
+    """
     wp.config.log_level = wp.LOG_WARNING
-    with nullcontext() if torch.cuda.is_available() else _stderr_to_nowhere():
-        wp.init()
+    try:
+        with nullcontext() if torch.cuda.is_available() else _stderr_to_nowhere():
+            wp.init()
+    except OSError as error:
+        raise _no_cache(f"{error.filename}: {error.strerror}") from error
+    if not _compiled() and not os.access(wp.config.kernel_cache_dir or "", os.W_OK):
+        raise _no_cache(f"{wp.config.kernel_cache_dir} may not be written")
+
+
+def _no_cache(why: str) -> PhysGraphError:
+    return PhysGraphError(f"cannot keep compiled kernels, {why}; WARP_CACHE_PATH names another folder for them")
+
+
+def _compiled() -> list[Path]:
+    """Kernels of ours that were compiled for this user and version of Warp before."""
+    package = __name__.split(".", maxsplit=1)[0]
+    return [*Path(wp.config.kernel_cache_dir or "").glob(f"wp_{package}*")]
 
 
 def compile_kernels(device: str) -> None:
@@ -38,8 +59,7 @@ def compile_kernels(device: str) -> None:
 def kernels_are_compiled() -> bool:
     """Whether some of our kernels were compiled for this user and version of Warp before."""
     start_warp()
-    package = __name__.split(".", maxsplit=1)[0]
-    return any(Path(wp.config.kernel_cache_dir or "").glob(f"wp_{package}*"))
+    return bool(_compiled())
 
 
 @contextmanager

@@ -57,7 +57,7 @@ def subdivide(mesh: PolygonMesh) -> Refinement:
     """
     mesh.check_range()
     half = mesh.half_edges
-    polygon = mesh.counts >= 4
+    polygon = mesh.is_polygon
     child_count = np.where(polygon, mesh.counts, np.where(mesh.counts == 3, 4, 0))
     child_size = np.where(polygon, 4, 3)
     starts = np.concatenate([[0], np.cumsum(child_count * child_size, dtype=np.int64)])
@@ -79,8 +79,9 @@ def fine_count(mesh: PolygonMesh, levels: int) -> int:
         levels: Number of subdivisions.
     """
     vertices, edges = mesh.vertex_count, len(mesh.half_edges.edges)
-    larger = mesh.counts >= 4
-    triangles, polygons, corners = int((mesh.counts == 3).sum()), int(larger.sum()), int(mesh.counts[larger].sum())
+    larger = mesh.is_polygon
+    triangles = int(((mesh.counts == 3) & ~larger).sum())
+    polygons, corners = int(larger.sum()), int(mesh.counts[larger].sum())
     for _ in range(levels):
         vertices += edges + polygons
         edges = 2 * edges + 3 * triangles + corners
@@ -90,7 +91,7 @@ def fine_count(mesh: PolygonMesh, levels: int) -> int:
 
 def _place_triangles(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> None:
     """Write the children of triangles into ``indices``."""
-    faces = np.flatnonzero(mesh.counts == 3)
+    faces = np.flatnonzero((mesh.counts == 3) & ~mesh.is_polygon)
     corners = mesh.starts[faces, None] + np.arange(3)
     a, b, c = mesh.indices[corners].T
     ab, bc, ca = midpoint[corners].T
@@ -100,7 +101,7 @@ def _place_triangles(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray
 
 def _place_quads(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> None:
     """Write the children of polygons into ``indices``."""
-    corners = np.flatnonzero((mesh.counts >= 4)[mesh.corner_face])
+    corners = np.flatnonzero(mesh.is_polygon[mesh.corner_face])
     face = mesh.corner_face[corners]
     quads = np.stack(
         [
@@ -116,8 +117,8 @@ def _place_quads(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, in
 
 
 def face_points(mesh: PolygonMesh) -> np.ndarray:
-    """Child vertex at the centre of each parent face, shape (F,), int32; -1 for faces under four corners."""
-    polygon = mesh.counts >= 4
+    """Child vertex at the centre of each parent face, shape (F,), int32; -1 for faces that get none."""
+    polygon = mesh.is_polygon
     first = mesh.vertex_count + len(mesh.half_edges.edges)
     return np.where(polygon, first + np.cumsum(polygon) - 1, -1).astype(np.int32)
 
@@ -125,9 +126,9 @@ def face_points(mesh: PolygonMesh) -> np.ndarray:
 def _linear(mesh: PolygonMesh) -> sparse.csr_matrix:
     """Stencil of vertices, midpoints and centroids."""
     edges = mesh.half_edges.edges
-    sizes = mesh.counts[mesh.counts >= 4]
+    sizes = mesh.counts[mesh.is_polygon]
     columns = np.concatenate(
-        [np.arange(mesh.vertex_count), edges.reshape(-1), mesh.indices[(mesh.counts >= 4)[mesh.corner_face]]]
+        [np.arange(mesh.vertex_count), edges.reshape(-1), mesh.indices[mesh.is_polygon[mesh.corner_face]]]
     )
     lengths = np.concatenate([np.ones(mesh.vertex_count, np.int64), np.full(len(edges), 2), sizes])
     offsets = np.concatenate([[0], np.cumsum(lengths)])
@@ -201,12 +202,14 @@ class _Rules:
     """Which smooth rule holds where."""
 
     smooth_edge: np.ndarray  # (E,) the two faces decide
-    boundary: np.ndarray  # (E,) one face only
+    boundary: np.ndarray  # (E,) one face only, or a crease
     smooth_vertex: np.ndarray  # (V,) all faces decide
     rim_vertex: np.ndarray  # (V,) cubic B-spline along two boundary edges
 
 
-def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
+def smooth(
+    mesh: PolygonMesh, refinement: Refinement, *, creased: np.ndarray | None = None, corners: np.ndarray | None = None
+) -> sparse.csr_matrix:
     """Build the smooth placement of the same child vertices.
 
     Among triangles these are Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and among polygons
@@ -215,17 +218,19 @@ def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
     or a fourth: with s the sum of them the rules are evaluated at valence 6 s and 4 s, and each corner adds its part.
     That is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) where s = 1, and the pure rule among one kind.
 
-    Boundaries are cubic B-splines. Fixed are: vertices with one face, with three or more boundary edges, on
-    non-manifold edges or between several fans, and isolated ones.
+    Boundaries and creases are cubic B-splines. Fixed are: vertices with one face, with three or more edges on
+    boundaries and creases, on non-manifold edges or between several fans, isolated ones, and corners.
 
     Args:
         mesh: The parent.
         refinement: Its subdivision, from :func:`subdivide`.
+        creased: Whether each edge is a sharp crease, shape (E,), bool; None without.
+        corners: Whether each vertex is a sharp corner, shape (V,), bool; None without.
 
     Returns:
         Stencil, shape (V_child, V_parent), float64; rows sum to 1.
     """
-    rules = _rules(mesh)
+    rules = _rules(mesh, creased, corners)
     parts = [_fixed_part(mesh, rules), _edge_part(mesh, rules), _rim_part(mesh, rules), _vertex_part(mesh, rules)]
     rows, columns, weights = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     size = refinement.mesh.vertex_count
@@ -233,15 +238,17 @@ def smooth(mesh: PolygonMesh, refinement: Refinement) -> sparse.csr_matrix:
     return average @ refinement.linear
 
 
-def _rules(mesh: PolygonMesh) -> _Rules:
+def _rules(mesh: PolygonMesh, creased: np.ndarray | None, corners: np.ndarray | None) -> _Rules:
     """Classify edges and vertices."""
     half, size = mesh.half_edges, mesh.vertex_count
     proper = half.edges[:, 0] != half.edges[:, 1]
     manifold = half.count <= 2
     boundary = (half.count == 1) & proper
+    boundary = boundary if creased is None else boundary | (creased & proper & manifold)
     faces = np.bincount(mesh.indices, minlength=size)
     at_rim = np.bincount(half.edges[boundary].reshape(-1), minlength=size)
     fixed = (faces < 2) | (at_rim > 2) | (mesh.fan_counts > 1)
+    fixed = fixed if corners is None else fixed | corners
     fixed[half.edges[~manifold].reshape(-1)] = True
     rim_vertex = (at_rim == 2) & ~fixed
     return _Rules(proper & manifold & ~boundary, boundary, ~fixed & ~rim_vertex, rim_vertex)
@@ -268,7 +275,7 @@ def _fixed_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
 def _edge_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Each face's half of the rule of a smooth edge."""
     corners = np.flatnonzero(rules.smooth_edge[mesh.half_edges.edge])
-    polygon = (mesh.counts >= 4)[mesh.corner_face[corners]]
+    polygon = mesh.is_polygon[mesh.corner_face[corners]]
     here, there = mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]
     opposite = mesh.indices[mesh.previous_corner[corners]]
     far = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], opposite)
@@ -287,7 +294,7 @@ def _rim_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
 def _vertex_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Each corner's part of the rule of a smooth vertex."""
     corners = np.flatnonzero(rules.smooth_vertex[mesh.indices])
-    polygon = (mesh.counts >= 4)[mesh.corner_face[corners]]
+    polygon = mesh.is_polygon[mesh.corner_face[corners]]
     here, before = mesh.indices[corners], mesh.previous_corner[corners]
     turn = np.bincount(here, weights=np.where(polygon, 1 / 4, 1 / 6), minlength=mesh.vertex_count)[here]
     valence = np.where(polygon, 4, 6) * turn

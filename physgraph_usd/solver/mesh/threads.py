@@ -17,8 +17,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ...interrupts import undisturbed
-
 LEAST_PER_THREAD = 4000
 """Items below which another thread costs more than it saves."""
 LEAST_QUERIES = 250
@@ -87,13 +85,12 @@ class Launch:
             return
         left = iter(self._commands)  # A list's iterator hands each command to one thread only.
         others: list[Future[None]] = []
-        with undisturbed:  # The caller's arrays may go only when nobody works on them any more.
-            try:
-                for _ in range(self._threads - 1):
-                    others.append(_pool(self._threads).submit(_run, left))
-                _run(left)
-            finally:
-                wait(others)
+        try:
+            for _ in range(self._threads - 1):
+                others.append(_pool(self._threads).submit(_run, left))
+            _run(left)
+        finally:
+            wait(others)  # The caller's arrays may go only when nobody works on them any more.
         for other in others:
             other.result()
 

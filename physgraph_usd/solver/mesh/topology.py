@@ -69,6 +69,8 @@ class PolygonMesh:
         counts: Vertices per face, shape (F,), int32.
         indices: Vertex of each corner, faces one after another, shape (C,), int32.
         vertex_count: Number of vertices V, those that no face uses included.
+        least_polygon: Fewest corners of a face that subdivision splits into quads round its centre: 3 for Catmull and
+            Clark's scheme, 4 where triangles are split into four.
 
     Raises:
         ValueError: The counts are negative or do not sum to the number of indices.
@@ -77,6 +79,7 @@ class PolygonMesh:
     counts: np.ndarray
     indices: np.ndarray
     vertex_count: int
+    least_polygon: int = 4
 
     def __post_init__(self) -> None:
         """Bring arrays to int32 and check that they fit together."""
@@ -96,6 +99,11 @@ class PolygonMesh:
     def starts(self) -> np.ndarray:
         """First corner of each face and, last, the number of corners: shape (F + 1,), int64."""
         return np.concatenate([[0], np.cumsum(self.counts, dtype=np.int64)])
+
+    @cached_property
+    def is_polygon(self) -> np.ndarray:
+        """Whether subdivision splits each face into quads, shape (F,), bool."""
+        return self.counts >= self.least_polygon
 
     @cached_property
     def is_triangles(self) -> bool:

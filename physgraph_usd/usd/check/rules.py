@@ -411,22 +411,27 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
         value = layer.QueryTimeSample(name, time) if time is not None else (spec.default if spec else None)
         below = UsdGeom.Mesh(coarse).GetPointsAttr().Get(timecode(time))
         if value is not None and below is not None and len(value) and len(below):
-            clouds.append((np.asarray(value), np.asarray(below), time))
+            to_world = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(coarse))
+            with np.errstate(invalid="ignore", over="ignore"):
+                fine, cage = (np.asarray(each, np.float64) @ to_world[:3, :3] for each in (value, below))
+            clouds.append((fine, cage, time))
     yield from _compare(clouds, name)
 
 
 def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name: str) -> Iterator[Problem]:
-    """Compare fine and coarse clouds in the same local space by size and place, at some times.
+    """Compare fine and coarse clouds, placed in the world but for translation, by size and place, at some times.
+
+    A local length is none where the transform shears: cloth sags along the world's axis.
 
     A sample may be broken, such as one whose points are all at one place: it is enough to be as large as the coarse
     mesh is at any of the times.
     """
-    whole = [(fine.astype(np.float64), below[np.isfinite(below).all(axis=1)], time) for fine, below, time in clouds]
+    whole = [(fine, below[np.isfinite(below).all(axis=1)], time) for fine, below, time in clouds]
     whole = [each for each in whole if len(each[1]) and np.isfinite(each[0]).all()]
     sizes = [_size(below) for _, below, _ in whole]
     for fine, below, time in whole if max(sizes, default=0.0) > 0 else ():
         least, most = min(sizes), max(sizes)
-        away = float(np.linalg.norm(fine.mean(axis=0) - below.mean(axis=0, dtype=np.float64)))
+        away = float(np.linalg.norm(fine.mean(axis=0) - below.mean(axis=0)))
         if not least / 4 <= _size(fine) <= 4 * most:
             message = f"is {_size(fine):g} units large; the coarse mesh is {_size(below):g}"
             yield _error(f"{message}: units or transforms are wrong", name, time)
@@ -436,7 +441,7 @@ def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name
 
 def _size(cloud: np.ndarray) -> float:
     """Diagonal of a cloud's box."""
-    return float(np.linalg.norm(np.ptp(cloud.astype(np.float64), axis=0)))
+    return float(np.linalg.norm(np.ptp(cloud, axis=0)))
 
 
 def same_variants(layer: Sdf.Layer, shot: StageView, garments: Sequence[str]) -> Iterator[Problem]:

@@ -1,28 +1,35 @@
 """Colliders, read from meshes and primitives and posed in world metres.
 
-A pose that cannot be used at some time is left out there, with a notice. A primitive that its transform makes into a
-shape without a name, such as an ellipsoid, becomes a mesh.
+A mesh is read as a renderer draws it: without holes, and subdivided by its scheme. A pose that cannot be used at some
+time is left out there, with a notice. A primitive that its transform makes into a shape without a name, such as an
+ellipsoid, becomes a mesh.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
+from ...solver.mesh.drawn import MOST_VERTICES, Cage, DrawnMesh, drawn_mesh
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
-from ..lookup import find_token, find_value
-from ..schema import COLLIDER
+from ..lookup import Override, find_token, find_value
+from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
 from .absence import missing_value
 from .placement import is_flipped, place
 
+DRAWN_NEAR = 0.1
+"""Fraction of the contact offset within which a body is as it is drawn: cloth then stands no farther off by eye."""
 _EVEN = 1e-4
 """Relative difference under which two scales count as the same."""
+_LEAST_OFFSET = 1e-3
+"""Offset below which bodies are subdivided no finer [m]: an offset of 0 would ask for all that there are."""
 _PLANE_START = ("plane", "start")
 _KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
 _TURNS, _RISES = 64, 24
@@ -37,16 +44,15 @@ UPRIGHT = {
 
 
 @dataclass(frozen=True, eq=False)
-class _Topology:
-    """Faces as authored, whether their front is clockwise in the world, and triangles turned to it."""
+class _Faces:
+    """Authored arrays of a mesh's topology, the faces drawn from them, and their triangles, as authored and turned."""
 
-    counts: np.ndarray
-    indices: np.ndarray
-    flip: bool
-    triangles: np.ndarray
+    authored: tuple[np.ndarray, ...]
+    drawn: DrawnMesh
+    wound: tuple[np.ndarray, np.ndarray]
 
-    def equals(self, counts: np.ndarray, indices: np.ndarray, flip: bool) -> bool:
-        return self.flip == flip and np.array_equal(self.counts, counts) and np.array_equal(self.indices, indices)
+    def are_of(self, authored: tuple[np.ndarray, ...]) -> bool:
+        return all(map(np.array_equal, self.authored, authored))
 
 
 @dataclass(eq=False)
@@ -57,52 +63,103 @@ class ColliderReader:
         prim: Its prim.
         collider: Its constant data.
         metres: Length of one stage unit [m].
+        within: Distance from the surface that is drawn within which a mesh is near enough to it [m].
+        always: Whether it counts where it is invisible, too.
     """
 
     prim: Usd.Prim
     collider: Collider
     metres: float
-    _topology: _Topology | None = None
+    within: float = DRAWN_NEAR * float(GARMENT["contact:offset"].fallback or 0.0)
+    always: bool = False
+    _faces: _Faces | None = None
 
-    def pose(self, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
-        """Pose at a time code, interpolated as USD does; None, with a notice why, where there is none."""
-        matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(self.prim), dtype=np.float64).T
-        matrix[:3] *= self.metres
+    def on_side(self, side: str) -> ColliderReader:
+        """Return a reader of the collider on another side, one of `schema.SIDES`."""
+        return replace(self, collider=replace(self.collider, side=side))
+
+    def pose(self, time: float | None, skinned: np.ndarray | None = None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        """Pose at a time code, interpolated as USD does; None, with a notice why, where there is none.
+
+        Args:
+            time: The time code, or None for the default.
+            skinned: World positions of a mesh's points [m], in place of the authored ones; or None.
+        """
+        if not self.always and _is_invisible(self.prim, time):
+            message = f"no collider where it is invisible, unless {COLLIDER['collider:enabled'].name} is set to true"
+            return None, (Notice(self.collider.path, None, message),)
+        matrix = self._matrix(timecode(time))
         if time is not None and (why := missing_value(self.prim, time)):
             return None, (self._out(time, why),)
         if not matrix[:3, :3].any():
             return None, (self._out(time, "its transform to the world scales it to nothing"),)
         if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
             return None, (self._out(time, "its transform to the world is not an affine one"),)
-        pose, odd = (self._mesh if self.collider.kind == "mesh" else self._shape)(matrix, time)
-        return (None, odd) if pose is None else self._bounded(pose, time)
+        if self.collider.kind == "mesh":
+            pose, odd = self._mesh(matrix, time, skinned)
+        else:
+            pose, odd = self._shape(matrix, time)
+        if pose is None:
+            return None, odd
+        pose, beyond = self._bounded(pose, time)
+        return pose, (*odd, *beyond)
 
-    def _mesh(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+    def _matrix(self, code: Usd.TimeCode) -> np.ndarray:
+        matrix = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(self.prim), dtype=np.float64).T
+        matrix[:3] *= self.metres
+        return matrix
+
+    def _mesh(
+        self, matrix: np.ndarray, time: float | None, skinned: np.ndarray | None
+    ) -> tuple[Pose | None, tuple[Notice, ...]]:
         mesh = UsdGeom.Mesh(self.prim)
-        points, counts, indices = (
+        points, counts, indices, holes = (
             _array(attribute, time)
-            for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+            for attribute in (
+                *(mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr()),
+                mesh.GetHoleIndicesAttr(),
+            )
         )
         usable = points.ndim == 2 and points.shape[1] == 3 and len(indices) and counts.sum() == len(indices)
         if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
             return None, (self._out(time, "its points and faces do not fit together"),)
-        flip = self.collider.side in FIXED and is_flipped(self.prim, matrix)
-        first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
-        split_at = first if first.shape == points.shape else points
-        triangles = self._triangles(split_at, counts, indices, flip=flip)
-        return MeshPose(place(np.where(np.isfinite(points), points, np.nan).astype(np.float64), matrix), triangles), ()
+        faces = self._faces_of(points, (counts, indices, holes))
+        triangles = faces.wound[self.collider.side in FIXED and is_flipped(self.prim, matrix)]
+        placed = place(np.where(np.isfinite(points), points, np.nan).astype(np.float64), matrix)
+        if skinned is not None and skinned.shape == placed.shape:
+            placed = skinned
+        return MeshPose(faces.drawn.place(placed), triangles), self._coarse(faces.drawn)
 
-    def _triangles(self, points: np.ndarray, counts: np.ndarray, indices: np.ndarray, *, flip: bool) -> np.ndarray:
-        """Triangles of the faces; the same array as last time while the topology is the same.
+    def _faces_of(self, points: np.ndarray, authored: tuple[np.ndarray, ...]) -> _Faces:
+        """The faces that are drawn; the same as last time while the topology is the same.
 
-        Quads are split as they lie in the collider's first sample, whichever frame is read first.
+        They are subdivided, and quads are split, as they lie in the collider's first sample, whichever frame is read
+        first.
         """
-        cached = self._topology
-        if cached is None or not cached.equals(counts, indices, flip):
-            triangles = PolygonMesh(counts, indices, len(points)).triangulate(np.nan_to_num(points)).triangles
-            cached = _Topology(counts, indices, flip, np.ascontiguousarray(triangles[:, ::-1]) if flip else triangles)
-            self._topology = cached
-        return cached.triangles
+        if self._faces is None or not self._faces.are_of(authored):
+            counts, indices, holes = authored
+            mesh = UsdGeom.Mesh(self.prim)
+            first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
+            first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
+            scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
+            cage = _cage_of(mesh, PolygonMesh(counts, indices, len(points)))
+            drawn = drawn_mesh(cage, first, holes=holes, scheme=scheme, within=self.within / self._scale())
+            triangles = drawn.mesh.triangulate(drawn.place(first)).triangles
+            self._faces = _Faces(authored, drawn, (triangles, np.ascontiguousarray(triangles[:, ::-1])))
+        return self._faces
+
+    def _scale(self) -> float:
+        """Length in metres of the longest unit of the prim's space, in its first sample."""
+        linear = self._matrix(Usd.TimeCode.EarliestTime())[:3, :3]
+        return float(np.linalg.norm(linear, 2)) if np.isfinite(linear).all() and linear.any() else self.metres
+
+    def _coarse(self, drawn: DrawnMesh) -> tuple[Notice, ...]:
+        """A notice where a mesh could not be subdivided enough."""
+        error = drawn.error * self._scale()
+        if error <= self.within:
+            return ()
+        message = f"its faces lie up to {1e3 * error:.2g} mm off the smooth surface that is drawn: more subdivisions"
+        return (Notice(self.collider.path, None, f"{message} would give it over {MOST_VERTICES:,} vertices"),)
 
     def _shape(self, matrix: np.ndarray, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         kind, size, axes = _measures(self.prim, time)
@@ -141,12 +198,16 @@ class ColliderReader:
         return Notice(self.collider.path, time, f"this collider is left out here: {why}")
 
 
-def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None, tuple[Notice, ...]]:
+def read_collider(
+    prim: Usd.Prim, metres: float, *, overrides: Sequence[Override], offset: float
+) -> tuple[ColliderReader | None, tuple[Notice, ...]]:
     """Reader of a gprim as a collider, or None for a kind of prim that cloth cannot touch, and notices.
 
     Args:
         prim: A gprim.
         metres: Length of one stage unit [m].
+        overrides: Values of ``--set``.
+        offset: Least distance that a garment keeps from colliders [m].
 
     Raises:
         SchemaError: When its offset or its side cannot be used.
@@ -155,10 +216,35 @@ def read_collider(prim: Usd.Prim, metres: float) -> tuple[ColliderReader | None,
     if not UsdGeom.Mesh(prim) and kind not in _KINDS:
         return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
     kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
-    offset = find_value(prim, COLLIDER["collider:offset"]).at(None) or 0.0
-    side, _ = find_token(prim, COLLIDER["collider:side"])
+    own = find_value(prim, COLLIDER["collider:offset"], overrides).at(None) or 0.0
+    side, _ = find_token(prim, COLLIDER["collider:side"], overrides)
     odd = (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
-    return ColliderReader(prim, Collider(path, kind, offset, side), metres), odd
+    within = DRAWN_NEAR * max(offset + own, _LEAST_OFFSET)
+    always = find_value(prim, COLLIDER["collider:enabled"], overrides).source != "fallback"
+    return ColliderReader(prim, Collider(path, kind, own, side), metres, within, always), odd
+
+
+def _is_invisible(prim: Usd.Prim, time: float | None) -> bool:
+    return UsdGeom.Imageable(prim).ComputeVisibility(timecode(time)) == UsdGeom.Tokens.invisible
+
+
+def _cage_of(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> Cage:
+    """The faces with their creases and corners, without those whose arrays do not fit together."""
+    ends, sharpness = np.zeros((0, 2), np.int32), np.zeros(0)
+    attributes = (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr(), mesh.GetCreaseSharpnessesAttr())
+    indices, lengths, given = (_array(attribute, None) for attribute in attributes)
+    if len(lengths) and lengths.min() >= 2 and lengths.sum() == len(indices):
+        chain = np.repeat(np.arange(len(lengths)), lengths)
+        along = np.flatnonzero(chain[1:] == chain[:-1])
+        given = given[chain[along]] if len(given) == len(lengths) else given  # One a crease, or one an edge.
+        if len(given) == len(along):
+            ends, sharpness = np.stack([indices[along], indices[along + 1]], axis=1), given
+    corners = np.zeros(polygons.vertex_count)
+    places, given = (_array(each, None) for each in (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()))
+    if len(places) == len(given):
+        inside = (places >= 0) & (places < len(corners))
+        corners[places[inside]] = given[inside]
+    return Cage.of(polygons, edges=ends, creases=sharpness, corners=corners)
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:

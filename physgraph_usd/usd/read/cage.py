@@ -17,6 +17,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ...errors import GarmentError, counted
+from ...interrupts import leave_if_asked
 from ...solver.mesh.topology import PolygonMesh
 from ..stage import Notice, value_at
 from .absence import missing_value
@@ -226,6 +227,7 @@ class PointReader:
         return repaired, (Notice(self.path, time, message),)
 
     def _raw(self, time: float | None) -> np.ndarray:
+        leave_if_asked()
         return as_points(value_at(self._attribute, time), self.path, "points", time=time)
 
     def _good_sample(self, time: float | None) -> np.ndarray | None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from ...errors import AbsentError, GarmentError, SchemaError, StageError
-from ..lookup import find_token, is_on, with_ancestors
+from ..lookup import Override, find_token, find_value, is_on, with_ancestors
 from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API
 from ..stage import TRAVERSAL, Notice, Units, list_meshes
 
@@ -17,6 +17,8 @@ GRAVITY_OPTION = "--gravity"
 _COLLECTION = ".collection:"
 _COLLIDERS_RELATIONSHIP = "physgraph:colliders"
 _SHOWN = 20
+MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")
+"""Schemas by which a prim, or one above it, decides whether cloth touches it."""
 EXCLUDE = "physgraph:contact:exclude"
 
 
@@ -30,8 +32,8 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
 
     Args:
         stage: The stage.
-        wanted: Prim paths (a transform stands for the meshes below it), prim names, globs over paths, or collections
-            (``/Prim.collection:name``); empty: every mesh with PhysGraphGarmentAPI.
+        wanted: Prim paths (a transform stands for the meshes drawn below it), prim names, globs over paths, or
+            collections (``/Prim.collection:name``); empty: every mesh with PhysGraphGarmentAPI.
 
     Raises:
         AbsentError: When an item is not found; the message lists the meshes that there are.
@@ -53,27 +55,39 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
     return found
 
 
-def find_colliders(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str] = ()) -> list[Usd.Prim]:
+def find_colliders(
+    stage: Usd.Stage,
+    garments: Sequence[Usd.Prim],
+    wanted: Sequence[str] = (),
+    *,
+    overrides: Sequence[Override] = (),
+) -> list[Usd.Prim]:
     """Find the gprims that garments may collide with, in stage order.
 
-    Invisible prims and those of purpose guide or proxy count; inactive ones do not exist.
+    Invisible prims count, for they may be visible at other times; inactive and disabled ones do not.
 
     Args:
         stage: The stage.
         garments: The garments; they are no colliders.
         wanted: As for ``find_garments``; empty: what the garments' ``physgraph:colliders`` name, and for garments
             without targets every prim with PhysGraphColliderAPI or UsdPhysics' CollisionAPI.
+        overrides: Values of ``--set``.
 
     Raises:
         AbsentError: When a named one is not there.
     """
-    chosen = {path for item in wanted for path in find_paths(stage, item, UsdGeom.Gprim)}
-    chosen = chosen.union(*(() if wanted else felt_by(stage, garments)))
-    chosen -= {prim.GetPath() for prim in garments}
+    felt = [_colliders_named(stage, wanted, overrides)] if wanted else felt_by(stage, garments, overrides=overrides)
+    chosen = {path for paths in felt for path in paths} - {prim.GetPath() for prim in garments}
     return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
 
 
-def felt_by(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str] = ()) -> list[frozenset[Sdf.Path]]:
+def felt_by(
+    stage: Usd.Stage,
+    garments: Sequence[Usd.Prim],
+    wanted: Sequence[str] = (),
+    *,
+    overrides: Sequence[Override] = (),
+) -> list[frozenset[Sdf.Path]]:
     """For each garment, paths of the gprims that it may collide with; arguments as for ``find_colliders``.
 
     Raises:
@@ -86,7 +100,7 @@ def felt_by(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str
         named = tuple(wanted or map(str, targets_of(garment, _COLLIDERS_RELATIONSHIP)))
         if named not in found:
             try:
-                found[named] = _colliders_named(stage, named)
+                found[named] = _colliders_named(stage, named, overrides)
             except AbsentError as error:
                 if wanted:
                     raise
@@ -95,11 +109,58 @@ def felt_by(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str
     return each
 
 
-def _colliders_named(stage: Usd.Stage, named: Sequence[str]) -> frozenset[Sdf.Path]:
+def _colliders_named(stage: Usd.Stage, named: Sequence[str], overrides: Sequence[Override]) -> frozenset[Sdf.Path]:
+    """Gprims that are named, or else those of every collider of the stage, without the disabled ones."""
+    enabled = COLLIDER["collider:enabled"]
+    found = _named_or_marked(stage, named)
+    return frozenset(path for path in found if is_on(stage.GetPrimAtPath(path), enabled, overrides))
+
+
+def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
     """Gprims that are named, or else those of every collider of the stage."""
     if named:
-        return frozenset(path for item in named for path in find_paths(stage, item, UsdGeom.Gprim))
-    return frozenset(path for prim in traverse(stage) if _collides(prim) for path in _gprims_below(prim, UsdGeom.Gprim))
+        return list(dict.fromkeys(path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)))
+    marked = (prim for prim in traverse(stage) if _collides(prim))
+    return [each.GetPath() for prim in marked for each in _drawn(_below(prim, UsdGeom.Gprim))]
+
+
+def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Notice]:
+    """Notices of garments and colliders that no final render shows, but for those marked or named themselves."""
+    notices = []
+    for prim in prims:
+        by_itself = {str(prim.GetPath()), prim.GetName()} & {*named}
+        marked = any(has_schema(prim, mark) for mark in MARKS)
+        if not (is_drawn(prim) or by_itself or marked):
+            purpose = UsdGeom.Imageable(prim).ComputePurpose()
+            message = f"no final render shows it, a {purpose}; it is taken, for what was named holds nothing else"
+            notices.append(Notice(str(prim.GetPath()), None, message))
+    return notices
+
+
+def disabled_colliders(
+    stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str], *, overrides: Sequence[Override]
+) -> dict[Usd.Prim, Notice]:
+    """Gprims that are named or marked as colliders and are disabled, each with a notice of the attribute that does so.
+
+    Arguments are those of `find_colliders`.
+    """
+    row, found = COLLIDER["collider:enabled"], {}
+    for path in _named_or_marked(stage, [*wanted] or colliders_of(garments)):
+        prim = stage.GetPrimAtPath(path)
+        enabled = find_value(prim, row, overrides)
+        if not enabled.at(None):
+            found[prim] = Notice(str(path), None, f"no collider, for {row.name} is off, by {enabled.source}")
+    return found
+
+
+def colliders_of(garments: Sequence[Usd.Prim]) -> list[str]:
+    """Paths that the garments' ``physgraph:colliders`` name."""
+    return [str(path) for prim in garments for path in targets_of(prim, _COLLIDERS_RELATIONSHIP)]
+
+
+def is_drawn(prim: Usd.Prim) -> bool:
+    """Whether a final render shows prims of a prim's purpose: default and render, not proxy or guide."""
+    return UsdGeom.Imageable(prim).ComputePurpose() in {UsdGeom.Tokens.default_, UsdGeom.Tokens.render}
 
 
 def instance_roots(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
@@ -141,33 +202,49 @@ def with_gravity(units: Units, garments: Sequence[Usd.Prim], asked: str | None) 
 def _collides(prim: Usd.Prim) -> bool:
     """Whether a prim is a collider by our schema, or else by UsdPhysics."""
     if has_schema(prim, COLLIDER_API):
-        return is_on(prim, COLLIDER["collider:enabled"])
+        return True
     collision = UsdPhysics.CollisionAPI(prim)
     return bool(collision) and bool(UsdGeom.Imageable(prim)) and collision.GetCollisionEnabledAttr().Get() is not False
 
 
-def find_paths(stage: Usd.Stage, item: str, kind: type) -> list[Sdf.Path]:
-    """Paths of the prims of a class of UsdGeom that an item, as in `find_garments`, names; AbsentError when none is."""
-    roots: Iterable[Usd.Prim]
+def find_paths(stage: Usd.Stage, item: str, kind: type, *, drawn: bool = True) -> list[Sdf.Path]:
+    """Paths of the prims of a class of UsdGeom that an item, as in `find_garments`, names.
+
+    Args:
+        stage: The stage.
+        item: The item.
+        kind: The class.
+        drawn: Whether proxies and guides count only where the item is their own path or name, or names nothing else.
+
+    Raises:
+        AbsentError: There is none.
+    """
+    pick = _drawn if drawn else list
     if _COLLECTION in item:  # Each member by itself, so that excluded prims stay out.
-        roots = [prim for prim in _collection(stage, item) if kind(prim)]
+        found = pick([prim for prim in _collection(stage, item) if kind(prim)])
     elif any(letter in item for letter in "*?["):
-        roots = [prim for prim in traverse(stage) if fnmatch.fnmatchcase(str(prim.GetPath()), item)]
-    elif item.startswith("/"):
-        roots = [_at_path(stage, item)]
+        matching = (prim for prim in traverse(stage) if fnmatch.fnmatchcase(str(prim.GetPath()), item))
+        found = pick([prim for root in matching for prim in _below(root, kind)])
     else:
-        roots = [prim for prim in traverse(stage) if prim.GetName() == item]
-    found = [path for root in roots for path in _gprims_below(root, kind)]
+        named = [_at_path(stage, item)] if item.startswith("/") else _named(stage, item)
+        found = [prim for root in named for prim in pick(_below(root, kind))]
     if not found:
         raise AbsentError(f"{item!r} names no {kind.__name__}; {_mesh_list(stage)}")
-    return found
+    return [prim.GetPath() for prim in found]
 
 
-def _gprims_below(root: Usd.Prim, kind: type) -> list[Sdf.Path]:
+def _named(stage: Usd.Stage, name: str) -> list[Usd.Prim]:
+    return [prim for prim in traverse(stage) if prim.GetName() == name]
+
+
+def _below(root: Usd.Prim, kind: type) -> list[Usd.Prim]:
     """The prim itself when it is of the kind, else those of the kind below it."""
-    if kind(root):
-        return [root.GetPath()]
-    return [prim.GetPath() for prim in Usd.PrimRange(root, TRAVERSAL) if kind(prim)]
+    return [root] if kind(root) else [prim for prim in Usd.PrimRange(root, TRAVERSAL) if kind(prim)]
+
+
+def _drawn(prims: list[Usd.Prim]) -> list[Usd.Prim]:
+    """The prims that a final render shows, or all where it shows none."""
+    return [prim for prim in prims if is_drawn(prim)] or prims
 
 
 def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
@@ -236,7 +313,7 @@ def _excluded_by(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str],
     message = f"<{prim.GetPath()}>.{EXCLUDE}"
     for target in targets_of(prim, EXCLUDE):
         try:
-            paths = find_paths(stage, str(target), UsdGeom.Gprim)
+            paths = find_paths(stage, str(target), UsdGeom.Gprim, drawn=False)
         except StageError as error:
             notices.append(Notice(str(prim.GetPath()), None, f"{EXCLUDE} excludes nothing by <{target}>: {error}"))
             continue

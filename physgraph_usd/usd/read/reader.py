@@ -20,6 +20,9 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
+from ...interrupts import leave_if_asked
+from ...solver.colliders.choose_side import choose_side
+from ...solver.colliders.pose import MeshPose
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
 from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
@@ -41,7 +44,17 @@ from ..times import merge, snap, within
 from ..view import StageView
 from .authored import authored_faults
 from .bodies import ColliderReader, read_collider
-from .find import felt_by, find_colliders, find_garments, instance_roots, read_apart, with_gravity
+from .find import (
+    colliders_of,
+    disabled_colliders,
+    felt_by,
+    find_colliders,
+    find_garments,
+    instance_roots,
+    purpose_notices,
+    read_apart,
+    with_gravity,
+)
 from .garment import GarmentReader, Request, is_visible, read_garment, samples_of
 from .materials import find_values
 from .placement import to_metres
@@ -130,6 +143,7 @@ class Shot:
             SchemaError: When an animated value cannot be used.
             StageError: When USD cannot read the files any more.
         """
+        leave_if_asked()
         garments, notices = [], []
         with pxr_errors(f"cannot read {self.path}" + at_time(time)):
             for index, reader in enumerate(self._readers):
@@ -156,7 +170,7 @@ class Shot:
             UsageError: When one cannot be read, or is for no garment.
         """
         asked = parse_overrides(overrides)
-        check_overrides(asked, [source.path for source in self.sources])
+        check_overrides(asked, [source.path for source in self.sources], [Sdf.Path(path) for path in self.colliders])
         other = copy(self)
         found = [
             find_values(self.stage.GetPrimAtPath(source.path), self._request.units, asked) for source in self.sources
@@ -226,10 +240,14 @@ def open_shot(
         check_metadata(stage)
         prims = _find(stage, garments, notices)
         refuse_refined(stage, [prim.GetPath() for prim in prims])
-        check_overrides(asked, [prim.GetPath() for prim in prims])
-        found = find_colliders(stage, prims, colliders)
+        found = find_colliders(stage, prims, colliders, overrides=asked)
+        disabled = disabled_colliders(stage, prims, colliders, overrides=asked)
+        check_overrides(asked, *([prim.GetPath() for prim in each] for each in (prims, [*found, *disabled])))
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
+        named = [*colliders] or colliders_of(prims)
+        notices += disabled.values() if named else ()
+        notices += purpose_notices([*prims, *found], [*garments, *named])
         notices += authored_faults(prims, found)
         units, odd = read_units(stage)
         units = with_gravity(units, prims, gravity)
@@ -238,7 +256,8 @@ def open_shot(
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
-        readers, solids = _link(stage, readers, bodies, wanted=colliders, metres=units.metres, notices=notices)
+        readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
+        solids = _with_sides(stage, readers, solids)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
         notices += _timing(stage, readers, solids, bake=bake)
         read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
@@ -280,20 +299,23 @@ def _link(
     paths: Sequence[Sdf.Path],
     *,
     wanted: Sequence[str],
-    metres: float,
+    request: Request,
     notices: list[Notice],
 ) -> tuple[list[GarmentReader], list[ColliderReader]]:
     """Garments with the numbers of the colliders that they feel, and these colliders."""
     prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
     cloth = {prim.GetPath() for prim in prims}
-    reachable = felt_by(stage, prims, wanted)
+    reachable = felt_by(stage, prims, wanted, overrides=request.overrides)
     excluded, odd = read_apart(stage, prims)
     notices += odd
     felt = [near - targets.keys() for near, targets in zip(reachable, excluded, strict=True)]
+    times = [reader.source.times[0] if reader.source.times else None for reader in readers]
+    offset = min(reader.values.number("contact:offset", time) for reader, time in zip(readers, times, strict=True))
+    given = {"overrides": request.overrides, "offset": offset}
     bodies = []
     for path in paths:
         if any(path in near for near in felt):
-            body, odd = read_collider(stage.GetPrimAtPath(path), metres)
+            body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, **given)
             notices += odd
             bodies += [body] if body is not None else []
     numbers = {body.prim.GetPath(): number for number, body in enumerate(bodies)}
@@ -305,6 +327,38 @@ def _link(
         garment = replace(reader.garment, colliders=colliders, apart_from=others)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
     return linked, bodies
+
+
+def _with_sides(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader]
+) -> list[ColliderReader]:
+    """Colliders, with sides chosen for open meshes on "auto" by where the cloth is in the first frame of the shot."""
+    asked = [body for body in bodies if (body.collider.kind, body.collider.side) == ("mesh", "auto")]
+    time, cages = _first_cages(stage, readers, asked[0].metres) if asked else (None, [])
+    found = [*bodies]
+    for number, body in enumerate(bodies):
+        if body in asked:
+            front = body.on_side("front")  # Its faces are wound as they look in the world.
+            pose, _ = front.pose(time)
+            felt = [cage for reader, cage in zip(readers, cages, strict=True) if number in reader.garment.colliders]
+            side = choose_side(pose.points, pose.triangles, felt) if isinstance(pose, MeshPose) else "auto"
+            found[number] = front.on_side(side)
+    return found
+
+
+def _first_cages(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float
+) -> tuple[float | None, list[np.ndarray]]:
+    """The first time code of the shot at which all cages can be read, and these [m]; none where there is none."""
+    every = merge(time for reader in readers for time in (*reader.source.times, *reader.source.left_out))
+    for time in every or (None,):
+        try:
+            prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
+            pairs = zip(readers, prims, strict=True)
+            return time, [reader.frame(prim, metres, time)[0].points for reader, prim in pairs]
+        except StageError:
+            continue
+    return None, [np.zeros((0, 3))] * len(readers)
 
 
 def _timing(
@@ -349,7 +403,7 @@ def _read(
             readers.append(read_garment(prim, instances, samples, request))
     if request.frames and every and not within(every, request.frames):
         message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
-        raise StageError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
+        raise AbsentError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,36 +11,30 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel
 from ...errors import GarmentError
 from ...solver.colliders.pose import Collider, MeshPose, Pose
 from ..lookup import with_ancestors
-from ..schema import COLLIDER_API, GARMENT_API
 from ..stage import TRAVERSAL, pxr_errors, quiet, timecode
 from .bodies import ColliderReader
-from .find import has_schema, traverse
+from .find import MARKS, has_schema, is_drawn, traverse
 from .garment import is_visible
 from .placement import place, to_metres
 from .reader import Shot
 
-_MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")
-"""Schemas by which a prim, or one above it, decides whether cloth touches it."""
 Box = np.ndarray
 """Least and greatest corner [m], world space, shape (2, 3)."""
 
 
-def meshes_beside(
-    shot: Shot, times: Sequence[float | None], boxes: Sequence[Box], *, least: float
-) -> Iterator[tuple[str, Iterator[tuple[int, Pose]]]]:
-    """Meshes that nothing marks as garment or collider and whose bounds meet a garment's in one of some frames.
-
-    Invisible ones, and copies of colliders or of one another, are left out.
+def unnamed_meshes(
+    shot: Shot, times: Sequence[float | None], boxes: Sequence[Box]
+) -> Iterator[tuple[str, str, Iterator[tuple[int, Pose]]]]:
+    """Meshes that are neither garments nor colliders of a shot, and where they are in some frames.
 
     Args:
         shot: An open shot.
         times: Time codes of the frames.
         boxes: Bounds of garments and their neighbourhood in each.
-        least: Longest side of the smallest mesh that counts [m].
 
     Yields:
-        The path of each, in stage order, and the frames in which they meet, by number, with its pose there: to be taken
-        before the next path.
+        The path of each, in stage order; why cloth does not touch it, or ""; and the frames in which its bounds meet a
+        garment's, by number, with its pose there: to be taken before the next path.
 
     Raises:
         StageError: USD cannot read the files any more.
@@ -49,36 +42,41 @@ def meshes_beside(
     in_shot = {*shot.colliders, *(garment.path for garment in shot.scene.garments)}
     in_shot |= {path for source in shot.sources for path in source.apart_from}
     with pxr_errors(f"cannot read {shot.path}"), quiet():
-        prims = [prim for prim in traverse(shot.stage) if UsdGeom.Mesh(prim) and str(prim.GetPath()) not in in_shot]
-        prims = [prim for prim in prims if _is_plain(prim, times)]
+        meshes = [prim for prim in traverse(shot.stage) if UsdGeom.Mesh(prim) and str(prim.GetPath()) not in in_shot]
+        unfit = {prim: _why_left(prim, times) for prim in meshes}
+        prims = [prim for prim, why in unfit.items() if not why]
         skinned = _Skinning(shot, [prim.GetPath() for prim in prims if _is_skinned(prim)])
-        seen = [pose for time in times[:1] for pose in shot.frame(time).colliders] if prims else []
-        for prim in prims:
-            if not _is_skinned(prim) and not _may_meet(prim, shot.metres_per_unit, times, boxes, least=least):
+        posed = zip(shot.scene.colliders, shot.frame(times[0]).colliders, strict=True) if prims else ()
+        seen = [(collider.path, pose) for collider, pose in posed]
+        for prim, why in unfit.items():
+            path = str(prim.GetPath())
+            if why or not (_is_skinned(prim) or _may_meet(prim, shot.metres_per_unit, times, boxes)):
+                yield path, why, iter(())
                 continue
-            reader = ColliderReader(prim, Collider(str(prim.GetPath()), "mesh"), shot.metres_per_unit)
+            reader = ColliderReader(prim, Collider(path, "mesh"), shot.metres_per_unit)
             first = skinned.pose(reader, times[0])
-            if not any(_same_place(first, other) for other in seen):
-                seen.append(first)
-                poses = (first if index == 0 else skinned.pose(reader, time) for index, time in enumerate(times))
-                yield reader.collider.path, _meeting(poses, boxes, least=least)
+            copied = next((other for other, pose in seen if _same_place(first, pose)), "")
+            seen.append((path, first))
+            poses = (first if index == 0 else skinned.pose(reader, time) for index, time in enumerate(times))
+            yield path, f"a copy of <{copied}>" if copied else "", iter(()) if copied else _meeting(poses, boxes)
 
 
-def _is_plain(prim: Usd.Prim, times: Sequence[float | None]) -> bool:
-    """Whether a mesh is visible, and no schema decides whether cloth touches it."""
-    if any(has_schema(each, mark) for each in with_ancestors(prim) for mark in _MARKS):
-        return False
-    guide = UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
-    return not guide and is_visible(prim, [time for time in times if time is not None])
+def _why_left(prim: Usd.Prim, times: Sequence[float | None]) -> str:
+    """The reason for which no cloth touches a mesh: a schema that decides, its purpose or its visibility; or ""."""
+    for each in with_ancestors(prim):
+        if mark := next((mark for mark in MARKS if has_schema(each, mark)), None):
+            return f"{mark} on <{each.GetPath()}> marks it, and this run does not have it"
+    if not is_drawn(prim):
+        return f"a {UsdGeom.Imageable(prim).ComputePurpose()}, which no final render shows"
+    visible = is_visible(prim, [time for time in times if time is not None])
+    return "" if visible else "invisible"
 
 
 def _is_skinned(prim: Usd.Prim) -> bool:
     return bool(UsdSkel.BindingAPI(prim).GetJointIndicesAttr().HasAuthoredValue())
 
 
-def _may_meet(
-    prim: Usd.Prim, metres: float, times: Sequence[float | None], boxes: Sequence[Box], *, least: float
-) -> bool:
+def _may_meet(prim: Usd.Prim, metres: float, times: Sequence[float | None], boxes: Sequence[Box]) -> bool:
     """Whether the bounds that USD gives a mesh meet the boxes; True where its points move and its extent does not."""
     extent, points = UsdGeom.Mesh(prim).GetExtentAttr(), UsdGeom.Mesh(prim).GetPointsAttr()
     if extent.HasAuthoredValue() and points.ValueMightBeTimeVarying() and not extent.ValueMightBeTimeVarying():
@@ -87,26 +85,25 @@ def _may_meet(
     for time, box in zip(times, boxes, strict=True):
         bound = UsdGeom.BBoxCache(timecode(time), every).ComputeWorldBound(prim).ComputeAlignedRange()
         bounds = metres * np.array([bound.GetMin(), bound.GetMax()], dtype=np.float64)
-        if not bound.IsEmpty() and _meets(bounds, box, least):
+        if not bound.IsEmpty() and _meets(bounds, box):
             return True
     return False
 
 
-def _meeting(poses: Iterable[Pose | None], boxes: Sequence[Box], *, least: float) -> Iterator[tuple[int, Pose]]:
-    """Numbers and poses of the frames in which posed points meet the boxes, and are large enough."""
+def _meeting(poses: Iterable[Pose | None], boxes: Sequence[Box]) -> Iterator[tuple[int, Pose]]:
+    """Numbers and poses of the frames in which posed points meet the boxes."""
     for index, (pose, box) in enumerate(zip(poses, boxes, strict=True)):
         points = np.zeros((0, 3)) if pose is None else pose.corners()
         points = points[np.isfinite(points).all(axis=1)]
         if pose is None or not len(points):
             continue
-        if _meets(np.stack([points.min(axis=0), points.max(axis=0)]), box, least):
+        if _meets(np.stack([points.min(axis=0), points.max(axis=0)]), box):
             yield index, pose
 
 
-def _meets(bounds: Box, box: Box, least: float) -> bool:
-    """Whether bounds overlap a box and are large enough."""
-    overlap = (bounds[0] <= box[1]).all() and (box[0] <= bounds[1]).all()
-    return bool(overlap and np.ptp(bounds, axis=0).max() >= least)
+def _meets(bounds: Box, box: Box) -> bool:
+    """Whether bounds overlap a box."""
+    return bool((bounds[0] <= box[1]).all() and (box[0] <= bounds[1]).all())
 
 
 def _same_place(a: Pose | None, b: Pose | None) -> bool:
@@ -144,11 +141,7 @@ class _Skinning:
 
     def pose(self, reader: ColliderReader, time: float | None) -> Pose | None:
         """A mesh at a time code, skinned where joints bend it."""
-        pose, _ = reader.pose(time)
-        points = self._points(reader.prim.GetPath(), time)
-        if not isinstance(pose, MeshPose) or points is None or points.shape != pose.points.shape:
-            return pose
-        return replace(pose, points=points)
+        return reader.pose(time, self._points(reader.prim.GetPath(), time))[0]
 
     def _points(self, path: Sdf.Path, time: float | None) -> np.ndarray | None:
         """World positions of a skinned mesh [m], shape (V, 3), float64; None for one that no joints bend."""

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from pxr import Sdf
 
-from ...errors import LayerError, StageError
+from ...errors import AbsentError, LayerError
 from ..provenance import FAILED, read_record
 from ..stage import check_there
 from ..times import within
-from .track import HEAT, PREFIX
+from .track import HEAT, PREFIX, refuse_not_finite
 
 CHUNK = "chunk"
 """The chunk's entry of a layer's record."""
@@ -126,9 +126,24 @@ class ChunkLayer:
                 continue
             found = points_at(self.layer, path, time)
             if found is not None:
+                self._check(path, time, found)
                 maps = ((name, _latest(self.layer, f"{path}.{PREFIX}{name}", time)) for name in HEAT)
                 points[path], heat[path] = found, {name: values for name, values in maps if values is not None}
         return Frame(time, points, heat, frozenset(path for path, cuts in self.chunk.cuts.items() if time in cuts))
+
+    def check_preroll(self) -> None:
+        """Refuse (LayerError) a pre-roll that does not fit its meshes, or is not finite."""
+        for time, found in self.chunk.preroll.items():
+            for path in found.keys() & set(self.garments):
+                self._check(path, time, found[path])
+
+    def _check(self, path: str, time: float, points: np.ndarray) -> None:
+        """Refuse (LayerError) points that do not fit the mesh, or are not finite, before a kernel sees them."""
+        place = f"{self.file}: <{path}> at time code {time:g}: points"
+        count = vertex_count(self.layer, path)
+        if points.shape != (count, 3):
+            raise LayerError(f"{place} have shape {points.shape}; the mesh has {count} vertices")
+        refuse_not_finite(points, place)
 
     @cached_property
     def _sampled(self) -> dict[str, frozenset[float]]:
@@ -160,13 +175,13 @@ def chunk_of(every: Sequence[float], frames: tuple[float, float] | None) -> Chun
         frames: First and last time code; None for all.
 
     Raises:
-        StageError: None lies there.
+        AbsentError: None lies there.
     """
     times = within(every, frames)
     if not times and frames is not None:
         message = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
         ends = f"; its {len(every)} samples run from {every[0]:g} to {every[-1]:g}" if every else ""
-        raise StageError(message + ends)
+        raise AbsentError(message + ends)
     return Chunk(times, tuple(every))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdUtils, Vt
 
 from ...errors import LayerError
+from ...interrupts import leave_if_asked
 from ...solver.mesh.topology import PolygonMesh
 from ..check.validate import check_layer
 from ..files import LAYER_SUFFIXES, check_suffix
@@ -137,6 +138,7 @@ def _still(parts: Sequence[ChunkLayer], out: Path) -> Sdf.Layer:
     for part in parts:
         moving = {f"{path}.{name}" for path in part.garments for name in _MOVING}
         for path in paths_in(part.layer):
+            leave_if_asked()
             if path.IsPropertyPath() and str(path) not in moving:
                 _add_samples(still, part.layer, path)
     return still
@@ -171,6 +173,7 @@ def _write_frames(stream: LayerStream, parts: Sequence[ChunkLayer], frames: Iter
     """Write samples by the tracks of `LayerWriter`; a garment without samples has its default alone."""
     tracks: dict[str, tuple[PointTrack, HeatTrack]] = {}
     for frame in frames:
+        leave_if_asked()
         for path, points in frame.points.items():
             if path not in tracks:
                 tracks[path] = _tracks(stream, parts, path)

@@ -108,7 +108,7 @@ class LayerStream:
 
         Raises:
             LayerError: The disk is full or gone.
-            KeyboardInterrupt, SystemExit: A signal came, and its exception was lost.
+            KeyboardInterrupt, SystemExit: A signal asks the run to end.
         """
         leave_if_asked()
         if self.target is not None:

@@ -10,10 +10,10 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import SchemaError, StageError, UsageError
 from ...solver.fabric import PRESETS
 from ..files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
-from ..lookup import check_limits
+from ..lookup import USER_PROPERTIES, check_limits
 from ..provenance import asset_path, export_layer
 from ..read.find import find_colliders, find_garments
-from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, SIDES, Property, fabric_values
+from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, SIDES, Property, every_fabric_value
 from ..stage import open_stage
 from ..view import root_over
 from .atomic import ASSET_PATHS, prepare_target
@@ -37,7 +37,7 @@ def tag(
     Args:
         shot: The shot file; never edited.
         out: Layer to write; it sublayers the shot.
-        garments: Prim paths, names, globs or collections of meshes.
+        garments: Prim paths, names, globs or collections of meshes; with a preset and without these, the tagged ones.
         colliders: The same, of anything with a surface.
         preset: Name of a fabric whose values are authored on the garments, or None.
         layer: Place of the garments in the order of garments, lower is nearer to the body, or None.
@@ -55,7 +55,7 @@ def tag(
         StageError: A named prim is not there, lies in an instance, or is no surface.
         LayerError: The layer cannot be written.
     """
-    if not garments and not colliders:
+    if not garments and not colliders and preset is None:
         raise UsageError("nothing to tag; name a garment or a collider")
     _check_word("preset", preset, sorted(PRESETS))
     _check_word("side", side, SIDES)
@@ -68,19 +68,17 @@ def tag(
     check_targets([("the layer", target)], files_of(shot))
     prepare_target(target, overwrite=overwrite)
     stage, _ = open_stage(str(shot))
-    cloth = find_garments(stage, garments) if garments else []
+    cloth = find_garments(stage, garments) if garments or preset is not None else []
     solid = find_colliders(stage, cloth, colliders) if colliders else []
     root = root_over(stage.GetRootLayer(), [asset_path(shot, target.parent, absolute=asset_paths == "absolute")])
     for prim in (*cloth, *solid):
         _check_editable(prim)
     for prim in cloth:
         spec = _applied(root, prim, GARMENT_API)
-        authored = {} if preset is None else fabric_values(PRESETS[preset])
+        authored = {} if preset is None else every_fabric_value(PRESETS[preset])
         authored |= {} if layer is None else {"contact:layer": layer}
         for name, value in (authored | dict((values or {}).get(str(prim.GetPath()), {}))).items():
-            _author(spec, GARMENT[name], round(value) if GARMENT[name].type == "int" else value)
-            if prim.GetAttribute(GARMENT[name].name).HasAuthoredConnections():  # They would go before the value.
-                spec.attributes[GARMENT[name].name].connectionPathList.ClearEditsAndMakeExplicit()
+            _author_over(spec, prim, GARMENT[name], value)
     for prim in solid:
         spec = _applied(root, prim, COLLIDER_API)
         if side is not None:
@@ -121,6 +119,20 @@ def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
     schemas.prependedItems = [schema]
     spec.SetInfo("apiSchemas", schemas)
     return spec
+
+
+def _author_over(spec: Sdf.PrimSpec, prim: Usd.Prim, row: Property, value: float | None) -> None:
+    """Author one attribute's default over what a prim has; None hides that, as a value that another preset left."""
+    if value is not None:
+        _author(spec, row, round(value) if row.type == "int" else value)
+        if prim.GetAttribute(row.name).HasAuthoredConnections():  # They would go before the value.
+            spec.attributes[row.name].connectionPathList.ClearEditsAndMakeExplicit()
+        return
+    for attribute in map(prim.GetAttribute, (row.name, USER_PROPERTIES + row.name)):
+        if attribute and (attribute.HasAuthoredValue() or attribute.HasAuthoredConnections()):
+            hidden = Sdf.AttributeSpec(spec, attribute.GetName(), attribute.GetTypeName(), attribute.GetVariability())
+            hidden.default = Sdf.ValueBlock()
+            hidden.connectionPathList.ClearEditsAndMakeExplicit()
 
 
 def _author(spec: Sdf.PrimSpec, row: Property, value: float | str) -> None:

@@ -42,6 +42,20 @@ class _Sample:
     points: np.ndarray
 
 
+def refuse_not_finite(values: np.ndarray, place: str) -> None:
+    """Refuse (LayerError) values that are NaN or infinite, and name the first; ``place`` begins the message."""
+    if not np.isfinite(values).all():
+        first = int(np.argwhere(~np.isfinite(values))[0][0])
+        raise LayerError(f"{place}: value {first} is {values[first].tolist()}, not finite")
+
+
+def _set_sample(stream: LayerStream, path: Sdf.Path, values: np.ndarray, time: float | None) -> None:
+    """Author values that are solved: all of them go into a layer here, finite."""
+    refuse_not_finite(values, f"<{path}>" + at_time(time))
+    kind = Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray
+    stream.set(path, kind.FromNumpy(values), time=time)
+
+
 class PointTrack:
     """Writes one garment's samples as they come, holding at most three in memory.
 
@@ -214,7 +228,7 @@ class PointTrack:
         self.box = extent_of(points)
         values = {"points": points, "normals": self._normals(points), "extent": self.box}
         for name, value in values.items():
-            self._stream.set(self._paths[name], Vt.Vec3fArray.FromNumpy(value), time=time)
+            _set_sample(self._stream, self._paths[name], value, time)
 
     def _author_velocity(self, at: _Sample, before: _Sample, after: _Sample) -> None:
         """Author the velocity of a sample by finite differences [units/s], or the shot's own where it is alone."""
@@ -228,8 +242,7 @@ class PointTrack:
 
     def _set_velocity(self, time: float | None, velocity: np.ndarray) -> None:
         self._stream.attribute(self._paths["velocities"], TYPES["velocities"])
-        values = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(velocity, np.float32))
-        self._stream.set(self._paths["velocities"], values, time=time)
+        _set_sample(self._stream, self._paths["velocities"], np.ascontiguousarray(velocity, np.float32), time)
 
 
 def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:
@@ -253,11 +266,9 @@ def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | 
     x, y, z = (np.asarray(world[:, axis], np.float64) - to_metres[axis, 3] for axis in range(3))
     with np.errstate(invalid="ignore", over="ignore"):
         local = np.stack([(a * x + b * y + c * z).astype(np.float32) for a, b, c in inverse])
-    # NaN and infinity both show in the least or the greatest value.
-    if local.size and not (np.isfinite(local.min(axis=1)).all() and np.isfinite(local.max(axis=1)).all()):
-        vertex = int(np.flatnonzero(~np.isfinite(local).all(axis=0))[0])
-        raise LayerError(f"<{path}>{when}: point {vertex} is {world[vertex].tolist()}, not a finite position")
-    return np.ascontiguousarray(local.T)
+    points = np.ascontiguousarray(local.T)
+    refuse_not_finite(points, f"<{path}>{when}: points")
+    return points
 
 
 def extent_of(points: np.ndarray) -> np.ndarray:
@@ -287,13 +298,13 @@ class HeatTrack:
         self._runs: dict[str, tuple[np.ndarray, float | None]] = {}
 
     def check(self, heat: Mapping[str, np.ndarray], time: float | None) -> None:
-        """Refuse values that are not one finite number a vertex."""
+        """Refuse values that are not one number a vertex."""
         for name, values in heat.items():
             place = f"<{self._path(name)}>" + at_time(time)
             if name not in HEAT:
                 raise LayerError(f"{place}: no such heat map; known: {', '.join(HEAT)}")
-            if values.shape != (self._count,) or not np.isfinite(values).all():
-                raise LayerError(f"{place}: needs {self._count} finite values, got shape {values.shape}")
+            if values.shape != (self._count,):
+                raise LayerError(f"{place}: needs {self._count} values, got shape {values.shape}")
 
     def write(self, time: float | None, heat: Mapping[str, np.ndarray]) -> None:
         """Write the maps of a time code by name, each of shape (V,); one that is left out has no sample here."""
@@ -324,7 +335,7 @@ class HeatTrack:
         return self._target.AppendProperty(PREFIX + name)
 
     def _set(self, name: str, time: float | None, values: np.ndarray) -> None:
-        self._stream.set(self._path(name), Vt.FloatArray.FromNumpy(values), time=time)
+        _set_sample(self._stream, self._path(name), values, time)
 
 
 class ModelHints:

@@ -1,0 +1,151 @@
+"""The surface that a renderer draws from a polygon mesh: without holes, and subdivided where its scheme says so.
+
+A mesh of scheme Catmull-Clark or Loop is a cage of a smooth limit surface. Its vertices are moved to the limit surface,
+after as many subdivisions as bring the flat faces between them near enough to it. The distance left falls to a quarter
+with each subdivision, as the square of the edge length.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import numpy as np
+from scipy import sparse
+
+from .subdivide import Refinement, fine_count, smooth, subdivide
+from .topology import PolygonMesh, find_edges
+
+MOST_VERTICES = 25_000
+"""Most vertices that a mesh is subdivided to, about as many as the cloth over it has. Frames of a shirt of 22,000
+vertices over a body of 53,000 take half as long again as over one of 13,000: its hierarchy is refitted in each."""
+NEAR_PART = 0.95
+"""Fraction of the surface that has to be near enough: nostrils and fingertips would ask for more everywhere."""
+_SHARP = 0.5
+"""Sharpness from which an edge or a vertex counts as sharp in a subdivision: USD's fractions are rounded."""
+TO_LIMIT = 4.0 / 3.0
+"""A vertex's distance to the limit surface over its move in one subdivision: 1 + 1/4 + 1/16 + ..."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMesh:
+    """Faces as they are drawn.
+
+    Attributes:
+        mesh: The faces without holes.
+        stencil: Matrix from the authored points to those of the faces, shape (V, V_authored); None where they are the
+            authored ones.
+        error: Distance from the limit surface that is left over `NEAR_PART` of the surface, in the points' unit.
+    """
+
+    mesh: PolygonMesh
+    stencil: sparse.csr_matrix | None = None
+    error: float = 0.0
+
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Points of the faces, shape (V, 3), from the authored ones; a point that is not finite spoils its neighbours'.
+
+        Args:
+            points: Authored points, shape (V_authored, 3).
+        """
+        return points if self.stencil is None else np.asarray(self.stencil @ points)
+
+
+@dataclass(frozen=True, eq=False)
+class Cage:
+    """A mesh that is subdivided, and what is sharp on it.
+
+    Attributes:
+        mesh: The faces.
+        creases: Sharpness of each edge, the number of subdivisions in which it stays a crease, shape (E,).
+        corners: The same of each vertex, shape (V,).
+    """
+
+    mesh: PolygonMesh
+    creases: np.ndarray
+    corners: np.ndarray
+
+    @staticmethod
+    def of(mesh: PolygonMesh, *, edges: np.ndarray, creases: np.ndarray, corners: np.ndarray) -> Cage:
+        """A cage.
+
+        Args:
+            mesh: The faces.
+            edges: Ends of the edges that are creases, shape (C, 2).
+            creases: Their sharpness, shape (C,).
+            corners: Sharpness of each vertex, shape (V,).
+        """
+        row = find_edges(mesh.half_edges.edges, edges)
+        sharpness = np.zeros(len(mesh.half_edges.edges))
+        sharpness[row[row >= 0]] = creases[row >= 0]
+        return Cage(mesh, sharpness, corners)
+
+    def subdivided(self) -> tuple[Refinement, sparse.csr_matrix, Cage]:
+        """The refinement, the matrix of its smooth placement, and the finer cage."""
+        step = subdivide(self.mesh)
+        stencil = smooth(self.mesh, step, creased=self.creases >= _SHARP, corners=self.corners >= _SHARP)
+        sharp = np.flatnonzero(self.creases >= _SHARP)
+        ends, middles = step.edges[sharp], self.mesh.vertex_count + sharp
+        halves = np.concatenate([np.stack([ends[:, end], middles], axis=1) for end in (0, 1)])
+        corners = np.zeros(step.mesh.vertex_count)
+        corners[: self.mesh.vertex_count] = self.corners - 1.0
+        creases = np.tile(self.creases[sharp] - 1.0, 2)
+        return step, stencil, Cage.of(step.mesh, edges=halves, creases=creases, corners=corners)
+
+
+def drawn_mesh(cage: Cage, points: np.ndarray, *, holes: np.ndarray, scheme: str, within: float) -> DrawnMesh:
+    """The faces that a renderer draws.
+
+    Args:
+        cage: The authored faces.
+        points: Authored points of any one pose, shape (V, 3): they decide the number of subdivisions.
+        holes: Numbers of the authored faces that are holes.
+        scheme: "catmullClark", "loop", or another for faces that are drawn flat.
+        within: Distance from the limit surface that is near enough, in the points' unit.
+    """
+    kept = ~np.isin(np.arange(cage.mesh.face_count), holes)
+    if scheme not in ("catmullClark", "loop") or not cage.mesh.face_count:
+        return DrawnMesh(_some_faces(cage.mesh, kept))
+    cage = replace(cage, mesh=replace(cage.mesh, least_polygon=3 if scheme == "catmullClark" else 4))
+    error = flatness(cage, points)
+    wanted = 0 if error <= within else math.ceil(math.log(error / within, 4.0))
+    levels = next(n for n in range(wanted, -1, -1) if n == 0 or fine_count(cage.mesh, n) <= MOST_VERTICES)
+    stencils = []
+    for _ in range(levels):
+        step, stencil, cage = cage.subdivided()
+        stencils.append(stencil)
+        kept = kept[step.parent_face]
+    stencil = reduce(lambda product, each: each @ product, [*stencils, _to_limit(cage)])
+    return DrawnMesh(_some_faces(cage.mesh, kept), sparse.csr_matrix(stencil), error / 4.0**levels)
+
+
+def flatness(cage: Cage, points: np.ndarray) -> float:
+    """Distance from the limit surface of the faces between vertices on it, over `NEAR_PART` of the surface.
+
+    A vertex that subdivision makes is as far from the face of the old vertices, all moved by one subdivision.
+
+    Args:
+        cage: The cage.
+        points: Its points, shape (V, 3).
+    """
+    step, stencil, _ = cage.subdivided()
+    count = cage.mesh.vertex_count
+    moved = stencil @ np.nan_to_num(points)
+    away = np.linalg.norm(moved - step.linear @ moved[:count], axis=1)[count:]
+    return float(np.quantile(away, NEAR_PART)) if len(away) else 0.0
+
+
+def _to_limit(cage: Cage) -> sparse.csr_matrix:
+    """The matrix that moves vertices to the limit surface, shape (V, V)."""
+    count = cage.mesh.vertex_count
+    moved = cage.subdivided()[1][:count, :]
+    same = sparse.identity(count, format="csr")
+    return sparse.csr_matrix(same + TO_LIMIT * (moved - same))
+
+
+def _some_faces(mesh: PolygonMesh, kept: np.ndarray) -> PolygonMesh:
+    """The mesh with some of its faces."""
+    if kept.all():
+        return mesh
+    return PolygonMesh(mesh.counts[kept], mesh.indices[kept[mesh.corner_face]], mesh.vertex_count)

@@ -1,0 +1,322 @@
+"""Cloth rests on the bodies that a renderer shows: each kind by its right value on a small stage of its own."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pxr import Usd, UsdGeom, Vt
+from shots import fine, refine
+from stages import COLLIDER_API, author, new_stage, save, vec3
+
+from physgraph_usd.errors import UsageError
+from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.solver.colliders.mesh import MeshBody
+from physgraph_usd.solver.colliders.pose import MeshPose, Pose
+from physgraph_usd.usd.read.reader import open_shot
+
+Faces = list[list[int]]
+SKIRT, BODY = "/World/skirt", "/World/body"
+RADIUS = 0.1
+
+
+def tube(radius: float, low: float, high: float, *, around: int = 16, rows: int = 5) -> tuple[np.ndarray, Faces]:
+    """An open tube of quads about y."""
+    angle, heights = 2.0 * np.pi * np.arange(around) / around, np.linspace(low, high, rows)
+    points = np.array([[radius * np.cos(a), y, radius * np.sin(a)] for y in heights for a in angle])
+    ids = np.arange(len(points)).reshape(rows, around)
+    faces = np.stack([ids[:-1], ids[1:], np.roll(ids[1:], -1, axis=1), np.roll(ids[:-1], -1, axis=1)], axis=-1)
+    return points, faces.reshape(-1, 4).tolist()
+
+
+def capped(radius: float, low: float, high: float) -> tuple[np.ndarray, Faces]:
+    """A closed tube."""
+    points, faces = tube(radius, low, high)
+    return points, [*faces, [*range(16)], [*range(len(points) - 1, len(points) - 17, -1)]]
+
+
+def floor(height: float, size: float = 1.0, cells: int = 4) -> tuple[np.ndarray, Faces]:
+    """A level grid whose front is up."""
+    ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
+    points = np.array([[x, height, z] for z in ticks for x in ticks])
+    ids = np.arange(len(points)).reshape(cells + 1, cells + 1)
+    faces = np.stack([ids[:-1, :-1], ids[1:, :-1], ids[1:, 1:], ids[:-1, 1:]], axis=-1)
+    return points, faces.reshape(-1, 4).tolist()
+
+
+def spline(count: int, *, parts: int) -> np.ndarray:
+    """Weights of a closed cubic B-spline's control points at places between them, shape (count * parts, count)."""
+    t = np.arange(parts) / parts
+    weights = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1) / 6.0
+    rows = np.zeros((count, parts, count))
+    for start in range(count):
+        rows[start][:, (start + np.arange(-1, 3)) % count] = weights
+    return rows.reshape(-1, count)
+
+
+def add(stage: Usd.Stage, path: str, shape: tuple[np.ndarray, Faces], *, scheme: str = "none") -> UsdGeom.Mesh:
+    """A mesh that stands still."""
+    points, faces = shape
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateSubdivisionSchemeAttr(scheme)
+    mesh.CreateFaceVertexCountsAttr([len(face) for face in faces])
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray([corner for face in faces for corner in face]))
+    mesh.CreatePointsAttr(vec3(points))
+    return mesh
+
+
+def add_moving(stage: Usd.Stage, path: str, shape: tuple[np.ndarray, Faces], *samples: np.ndarray) -> UsdGeom.Mesh:
+    """A mesh with samples at time codes 1, 2, ..."""
+    mesh = add(stage, path, shape)
+    for time, points in enumerate(samples, 1):
+        mesh.GetPointsAttr().Set(vec3(points), time)
+    return mesh
+
+
+def pressed(points: np.ndarray, by: float) -> np.ndarray:
+    """A tube pressed in along x and out along z by a fraction."""
+    return points * np.array([1.0 - by, 1.0, 1.0 + by])
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Usd.Stage:
+    """A skirt that is 4 mm off a body of `RADIUS` in its first sample and 4 mm inside it in its second."""
+    made = new_stage(tmp_path / "shot.usda")
+    points, faces = tube(1.04 * RADIUS, 0.0, 0.2, around=24, rows=6)
+    add_moving(made, SKIRT, (points, faces), points, pressed(points, 0.08))
+    return made
+
+
+def felt(stage: Usd.Stage, *colliders: str, time: float = 1.0, **options) -> tuple[list[str], list[Pose | None], str]:
+    """Colliders of a shot, their poses, and its warnings."""
+    with closing(open_shot(save(stage), garments=[SKIRT], colliders=colliders, **options)) as shot:
+        poses = shot.frame(time).colliders
+        return [each.path for each in shot.scene.colliders], list(poses), "\n".join(map(str, shot.warnings))
+
+
+def refined(stage: Usd.Stage, folder: Path, *, level: int, time: float) -> np.ndarray:
+    """Points of the skirt over `BODY` at a time code [m]."""
+    shot, out = Path(save(stage)), folder / "fine.usdc"
+    refine(shot, out, garments=[SKIRT], colliders=[BODY], level=level, frames=(time, time))
+    return fine(shot, out, time, prim=SKIRT)
+
+
+class TestPurpose:
+    @pytest.fixture(autouse=True)
+    def character(self, stage: Usd.Stage) -> None:
+        for purpose, radius in (("render", 0.1), ("proxy", 0.13), ("guide", 0.16)):
+            add(stage, f"/World/char/{purpose}", capped(radius, -0.1, 0.3)).CreatePurposeAttr(purpose)
+
+    @pytest.mark.parametrize("named", ["/World/char", "/World/cha*", "auto"])
+    def test_below_a_prim_what_a_final_render_shows_is_felt(self, stage: Usd.Stage, tmp_path: Path, named: str):
+        report = refine(Path(save(stage)), tmp_path / "a.usdc", garments=[SKIRT], colliders=[named], dry_run=True)
+        assert report.garments[0]["colliders"] == ["/World/char/render"]
+
+    def test_a_guide_is_felt_where_it_is_named_itself(self, stage: Usd.Stage):
+        assert felt(stage, "/World/char/guide")[::2] == (["/World/char/guide"], "")
+
+    def test_a_proxy_is_felt_and_said_where_nothing_else_is_there(self, stage: Usd.Stage):
+        stage.RemovePrim("/World/char/render")
+        stage.RemovePrim("/World/char/guide")
+        paths, _, warnings = felt(stage, "/World/char")
+        assert paths == ["/World/char/proxy"]
+        assert "</World/char/proxy>: no final render shows it, a proxy" in warnings
+
+
+class TestSmoothBodies:
+    """A torus of quads, each corner of which has four: its limit surface is a bicubic B-spline."""
+
+    COUNT, SHAPE = (6, 5), (0.3, 0.1)
+
+    def torus(self) -> tuple[np.ndarray, Faces]:
+        u, v = np.meshgrid(*(2.0 * np.pi * np.arange(count) / count for count in self.COUNT), indexing="ij")
+        ring = self.SHAPE[0] + self.SHAPE[1] * np.cos(v)
+        points = np.stack([ring * np.cos(u), self.SHAPE[1] * np.sin(v), ring * np.sin(u)], axis=-1)
+        ids = np.arange(u.size).reshape(self.COUNT)
+        turns = [np.roll(ids, shift, axis=(0, 1)) for shift in ((0, 0), (-1, 0), (-1, -1), (0, -1))]
+        return points.reshape(-1, 3), np.stack(turns, axis=-1).reshape(-1, 4).tolist()
+
+    def test_a_body_is_felt_where_catmull_clark_draws_it(self, stage: Usd.Stage):
+        cage, faces = self.torus()
+        add(stage, BODY, (cage, faces), scheme="catmullClark")
+        _, (pose,), warnings = felt(stage, BODY)
+        assert isinstance(pose, MeshPose)
+        assert warnings == ""
+        around, along = (spline(count, parts=8) for count in self.COUNT)
+        drawn = np.einsum("ua,vb,abd->uvd", around, along, cage.reshape(*self.COUNT, 3)).reshape(-1, 3)
+        (surface,) = MeshBody(device="cpu", threads=1).pose(pose)
+        x = torch.as_tensor(drawn - surface.origin)
+        away = surface.closest(x, torch.full_like(x[:, 0], np.inf)).distance.numpy()
+        assert np.quantile(away, 0.95) < 2e-4  # A tenth of the contact offset.
+        assert away.max() < 5e-4
+
+    def test_creases_and_corners_stay(self, stage: Usd.Stage):
+        """A tube with caps whose rims are creases for ever, and one of whose rims' points is a corner."""
+        points, faces = capped(RADIUS, -0.1, 0.3)
+        mesh = add(stage, BODY, (points, faces), scheme="catmullClark")
+        rims = [[*range(16), 0], [*range(len(points) - 16, len(points)), len(points) - 16]]
+        mesh.CreateCreaseIndicesAttr([*rims[0], *rims[1]])
+        mesh.CreateCreaseLengthsAttr([17, 17])
+        mesh.CreateCreaseSharpnessesAttr([10.0, 10.0])
+        mesh.CreateCornerIndicesAttr([0])
+        mesh.CreateCornerSharpnessesAttr([10.0])
+        _, (pose,), _ = felt(stage, BODY)
+        assert isinstance(pose, MeshPose)
+        used = pose.points[np.unique(pose.triangles)]
+        assert (used[:, 1].min(), used[:, 1].max()) == pytest.approx((-0.1, 0.3), abs=1e-6)
+        assert np.linalg.norm(used - points[0], axis=1).min() < 1e-6
+
+    @pytest.mark.parametrize(("scheme", "triangles"), [("none", 60), ("bilinear", 60)])
+    def test_flat_faces_stay(self, stage: Usd.Stage, scheme: str, triangles: int):
+        add(stage, BODY, self.torus(), scheme=scheme)
+        _, (pose,), _ = felt(stage, BODY)
+        assert isinstance(pose, MeshPose)
+        assert (len(pose.points), len(pose.triangles)) == (30, triangles)
+
+    def test_a_dense_body_is_moved_to_its_limit_and_keeps_its_faces(self, stage: Usd.Stage):
+        add(stage, BODY, tube(RADIUS, 0.0, 0.2, around=200, rows=40), scheme="catmullClark")
+        _, (pose,), _ = felt(stage, BODY)
+        assert isinstance(pose, MeshPose)
+        assert len(pose.points) == 8000
+        inner = np.hypot(pose.points[200:-200, 0], pose.points[200:-200, 2])
+        angle = 2.0 * np.pi / 200
+        np.testing.assert_allclose(inner, RADIUS * (4.0 + 2.0 * np.cos(angle)) / 6.0, rtol=1e-6)
+
+
+def test_faces_in_holes_are_not_there(stage: Usd.Stage):
+    """A body in a wider shell, all of which is a hole."""
+    inner, outer = capped(RADIUS, -0.1, 0.3), capped(1.3 * RADIUS, -0.1, 0.3)
+    faces = inner[1] + [[corner + len(inner[0]) for corner in face] for face in outer[1]]
+    mesh = add(stage, BODY, (np.concatenate([inner[0], outer[0]]), faces))
+    mesh.CreateHoleIndicesAttr([*range(len(inner[1]), len(faces))])
+    for scheme in ("none", "catmullClark"):
+        mesh.CreateSubdivisionSchemeAttr().Set(scheme)
+        _, (pose,), _ = felt(stage, BODY)
+        assert isinstance(pose, MeshPose)
+        assert np.hypot(*pose.points[np.unique(pose.triangles)][:, [0, 2]].T).max() < 1.01 * RADIUS
+
+
+class TestVisibility:
+    @pytest.fixture(autouse=True)
+    def body(self, stage: Usd.Stage) -> None:
+        """A body that is hidden in the second sample."""
+        visible = add(stage, BODY, capped(RADIUS, -0.1, 0.3)).CreateVisibilityAttr()
+        visible.Set("inherited", 1.0)
+        visible.Set("invisible", 2.0)
+
+    def test_a_body_counts_where_it_is_visible(self, stage: Usd.Stage):
+        assert felt(stage, BODY)[1] != [None]
+        _, poses, warnings = felt(stage, BODY, time=2.0)
+        assert poses == [None]
+        assert f"<{BODY}>: no collider where it is invisible, unless physgraph:collider:enabled is set" in warnings
+
+    @pytest.mark.parametrize("how", ["authored", "--set"])
+    def test_enabled_goes_before_visibility(self, stage: Usd.Stage, how: str):
+        if how == "authored":
+            author(stage.GetPrimAtPath(BODY), "physgraph:collider:enabled", True, kind="bool")
+        overrides = [] if how == "authored" else [f"<{BODY}>.collider:enabled=on"]
+        assert felt(stage, BODY, time=2.0, overrides=overrides)[1] != [None]
+
+    def test_a_disabled_body_that_is_named_is_left_out_and_said(self, stage: Usd.Stage):
+        author(stage.GetPrimAtPath("/World"), "physgraph:collider:enabled", False, kind="bool")
+        paths, _, warnings = felt(stage, BODY)
+        assert paths == []
+        assert f"<{BODY}>: no collider, for physgraph:collider:enabled is off, by </World>." in warnings
+
+
+class TestOpenBodies:
+    def test_without_its_hidden_faces_a_body_is_solid(self, stage: Usd.Stage, tmp_path: Path):
+        add(stage, BODY, tube(RADIUS, -0.1, 0.3, around=32, rows=9))
+        found = refined(stage, tmp_path, level=1, time=2.0)
+        assert np.hypot(found[:, 0], found[:, 2]).min() > 0.995 * RADIUS  # Between corners 32 sides are a 200th inside.
+
+    @pytest.mark.parametrize("front", ["up", "down"])
+    def test_a_floor_has_one_side_whichever_way_its_faces_look(self, stage: Usd.Stage, tmp_path: Path, front: str):
+        points, faces = floor(0.01)
+        add(stage, BODY, (points, faces if front == "up" else [face[::-1] for face in faces]))
+        assert refined(stage, tmp_path, level=0, time=1.0)[:, 1].min() > 0.01
+
+    def side(self, stage: Usd.Stage) -> str:
+        with closing(open_shot(save(stage), garments=[SKIRT], colliders=[BODY])) as shot:
+            return shot.scene.colliders[0].side
+
+    def test_cloth_inside_a_wider_tube_stays_inside(self, stage: Usd.Stage):
+        add(stage, BODY, tube(1.2 * RADIUS, -0.1, 0.3))
+        assert self.side(stage) == "auto"
+
+    def test_cloth_over_both_sides_of_a_wall_stays_on_both(self, stage: Usd.Stage):
+        add(stage, BODY, floor(0.1))
+        assert self.side(stage) == "auto"
+
+    def test_a_mirrored_floor_is_turned(self, stage: Usd.Stage):
+        mesh = add(stage, BODY, floor(-0.01))
+        assert self.side(stage) == "front"
+        mesh.AddScaleOp().Set((-1.0, 1.0, 1.0))
+        assert self.side(stage) == "front"  # USD turns the faces of a mirrored mesh, too.
+        mesh.CreateOrientationAttr("leftHanded")
+        assert self.side(stage) == "back"
+
+
+class TestAuto:
+    """Beside the skirt: its body, its own render mesh, a button on it, a copy of the body, a crate far away."""
+
+    @pytest.fixture(autouse=True)
+    def meshes(self, stage: Usd.Stage) -> None:
+        add(stage, BODY, tube(RADIUS, -0.1, 0.3, around=32, rows=9))
+        points, faces = tube(1.04 * RADIUS, 0.0, 0.2, around=24, rows=6)
+        shell = np.concatenate([points * [r, 1.0, r] for r in (0.985, 1.015)])
+        both = [*faces, *([corner + len(points) for corner in face[::-1]] for face in faces)]
+        add_moving(stage, "/World/render", (shell, both), shell, pressed(shell, 0.08))
+        button, sides = capped(0.006, 0.0015, 0.0045)
+        button = button[:, [1, 0, 2]] + [1.04 * RADIUS, 0.1, 0.0]
+        add_moving(stage, "/World/button", (button, sides), button, button - [0.08 * 1.04 * RADIUS, 0.0, 0.0])
+        add(stage, "/World/guide", capped(1.2 * RADIUS, -0.1, 0.3)).CreatePurposeAttr("guide")
+        add(stage, "/World/hidden", capped(RADIUS, -0.2, 0.3)).CreateVisibilityAttr("invisible")
+        crate, sides = capped(0.5, 0.0, 1.0)
+        add(stage, "/World/crate", (crate + np.array([9.0, 0.0, 0.0]), sides))
+
+    def test_inspect_says_why_each_is_taken_or_left(self, stage: Usd.Stage):
+        found = inspect_shot(save(stage), garments=(SKIRT,))
+        assert found["candidates"] == {
+            BODY: f"taken: 100% of <{SKIRT}> is inside or within 25 mm at time code 1",
+            "/World/render": f"left: it lies on <{SKIRT}> and moves with it: a trim, or the garment's own skin",
+            "/World/button": f"left: it lies on <{SKIRT}> and moves with it: a trim, or the garment's own skin",
+            "/World/guide": "left: a guide, which no final render shows",
+            "/World/hidden": "left: invisible",
+        }
+        assert found["command"].endswith(f"--collider {BODY}")
+
+    def test_auto_takes_the_body_alone(self, stage: Usd.Stage, tmp_path: Path):
+        report = refine(Path(save(stage)), tmp_path / "a.usdc", garments=[SKIRT], colliders=["auto"], dry_run=True)
+        assert report.garments[0]["colliders"] == [BODY]
+
+
+def test_a_body_touched_in_one_frame_of_ten_is_taken(tmp_path: Path):
+    stage = new_stage(tmp_path / "shot.usda")
+    points, faces = tube(RADIUS, 0.0, 0.2)
+    add_moving(stage, SKIRT, (points, faces), *(points + np.array([0.5 * (time == 3), 0.0, 0.0]) for time in range(10)))
+    shelf, sides = capped(RADIUS, 0.05, 0.3)
+    add(stage, BODY, (shelf + np.array([0.65, 0.0, 0.0]), sides))
+    found = inspect_shot(save(stage), garments=(SKIRT,))["candidates"]
+    assert list(found) == [BODY]
+    assert found[BODY].endswith("at time code 4")
+
+
+class TestSet:
+    @pytest.fixture(autouse=True)
+    def body(self, stage: Usd.Stage) -> None:
+        add(stage, BODY, capped(RADIUS, -0.1, 0.3)).GetPrim().AddAppliedSchema(COLLIDER_API)
+
+    def test_it_takes_a_colliders_attributes(self, stage: Usd.Stage):
+        overrides = [f"<{BODY}>.collider:offset=0.003", "physgraph:collider:side=start"]
+        with closing(open_shot(save(stage), garments=[SKIRT], overrides=overrides)) as shot:
+            (collider,) = shot.scene.colliders
+        assert (collider.offset, collider.side) == (0.003, "start")
+        assert felt(stage, overrides=["collider:enabled=off"])[0] == []
+
+    def test_one_for_no_collider_is_refused_by_name(self, stage: Usd.Stage):
+        with pytest.raises(UsageError, match=f"no such collider; colliders: {BODY}"):
+            felt(stage, overrides=["</World/other>.collider:offset=0.003"])
