@@ -15,7 +15,7 @@ from ...errors import PhysGraphError
 
 _STDERR = 2
 _OURS = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") else "-march=native"
-"""The same instructions on every x86-64 processor that has AVX2, so that kernels round alike on all of them."""
+"""Instructions of every x86-64 processor that has AVX2, so that kernels round alike on all of them."""
 _FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=native", _OURS)
 KERNELS = {"enable_backward": False, "cpu_compiler_flags": _FLAGS}
 """Options of modules: no derivatives, and on the CPU Warp's own flags for our instructions."""
