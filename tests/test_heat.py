@@ -178,8 +178,8 @@ class TestLayers:
     @pytest.mark.parametrize(
         ("heat", "message"),
         [
-            ({"penetration": np.zeros(3)}, r"penetration> at time code 1: needs 63 finite values, got shape \(3,\)"),
-            ({"crossing": np.full(63, np.nan)}, "crossing> at time code 1: needs 63 finite"),
+            ({"penetration": np.zeros(3)}, r"penetration> at time code 1: needs 63 values, got shape \(3,\)"),
+            ({"crossing": np.full(63, np.nan)}, "crossing> at time code 1: value 0 is nan, not finite"),
             ({"fever": np.zeros(63)}, "no such heat map; known: penetration, crossing"),
         ],
     )

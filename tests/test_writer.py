@@ -115,7 +115,7 @@ def test_wrong_calls_leave_nothing(dressed: Path, tmp_path: Path) -> None:
     broken = [points[0].copy()]
     broken[0][5] = np.nan
     cases = [
-        (rf"<{COAT}> at time code 2\.5: point 5 is \[nan", [(1.0, points), (2.5, broken)]),
+        (rf"<{COAT}> at time code 2\.5: points: value 5 is \[nan", [(1.0, points), (2.5, broken)]),
         (r"points have shape \(3, 3\); the fine mesh has 63", [(1.0, [np.zeros((3, 3))])]),
         (r"time code 1\.0 does not come after 1", [(1.0, points), (1.0, points)]),
         (r"0 arrays of points for 1 garments", [(1.0, [])]),

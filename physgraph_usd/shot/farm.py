@@ -71,7 +71,7 @@ class FarmCall:
         self._future.cancel()
 
     def end(self) -> None:
-        """The same: nothing here waits for a worker."""
+        """Cancel it, as `ask_to_end` does: nothing here waits for a worker."""
         self.ask_to_end()
 
 
