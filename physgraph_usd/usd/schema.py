@@ -257,7 +257,7 @@ PROPERTIES: tuple[Property, ...] = (
     _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 where the fine cloth follows the coarse cloth exactly."),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
-        "Whether garments collide with this prim; where nothing says so, they do where it is visible.",
+        "Whether garments collide with this prim; unless authored, while it is visible.",
         "Collide", COLLISION, uniform=True,
     ),
     Property(
