@@ -21,12 +21,12 @@ from physgraph_usd.usd.schema import (
     MATERIAL_API,
     PROPERTIES,
     Property,
+    fabric_values,
     find_property,
     register,
     schema_path,
 )
 from physgraph_usd.usd.schema_files import attribute_table, schema_files
-from physgraph_usd.usd.write.tag import fabric_values
 
 TYPES = {GARMENT_API: UsdGeom.Mesh, COLLIDER_API: UsdGeom.Sphere, MATERIAL_API: UsdShade.Material}
 

@@ -203,6 +203,7 @@ def test_one_garment_that_cannot_be_solved_follows_its_cage(tmp_path: Path, belo
     body = UsdGeom.Mesh.Define(stage, "/World/body")
     body.CreateFaceVertexCountsAttr([3] * len(faces))
     body.CreateFaceVertexIndicesAttr(np.asarray(faces).ravel().tolist())
+    body.CreateSubdivisionSchemeAttr("none")
     body.CreatePointsAttr().Set(vec3(points - [0.0, below, 0.0]))
     body.GetPrim().AddAppliedSchema(COLLIDER_API)
     shot, out = Path(save(stage)), tmp_path / "fine.usdc"

@@ -292,7 +292,7 @@ def odd_shot(tmp_path: Path) -> Path:
     for time in times[1:-1]:
         still.Set(still.Get(2.0), time)
     moves = UsdGeom.Mesh(stage.GetPrimAtPath("/World/moves")).GetPointsAttr()
-    for time in times[5:]:
+    for time in times[6:]:
         moves.Set(vec3(np.asarray(moves.Get(time)) + np.array([0.0, 100.0, 0.0])), time)
     for attribute, time in ((moves, 4.0), (still, 5.0)):
         stage.GetRootLayer().SetTimeSample(attribute.GetPath(), time, Sdf.ValueBlock())

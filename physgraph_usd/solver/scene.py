@@ -250,7 +250,7 @@ def refuse_falling(scene: Scene, frame: Frame) -> None:
         held = garment.colliders or (garment.pin > 0).any() or len(scene.garments) > 1
         size = max(SPECK, *(float(np.ptp(x, axis=0).max(initial=0.0)) for x in (garment_frame.points, garment.rest)))
         guide, stretch = garment_frame.guide * float(garment.guide_scale.mean()), garment_frame.fabric.stretch
-        if not len(garment_frame.points) or weight <= FALLS * size * guide:
+        if (garment.pin >= 1.0).all() or weight <= FALLS * size * guide:
             continue
         if not held:
             sinks = "without end" if guide == 0 else f"by {weight / guide:.3g} m"

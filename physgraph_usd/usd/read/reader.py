@@ -257,8 +257,7 @@ def open_shot(
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
-        solids = _with_sides(stage, readers, solids)
-        opened = Shot(path, stage, view, request=request, readers=readers, bodies=solids)
+        opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
         notices += _timing(stage, readers, solids, bake=bake)
         read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
