@@ -273,6 +273,7 @@ class TestLayers:
         assert layers[0].read_bytes() == layers[1].read_bytes()
         assert faults(layers[0], shot) == []
 
+    @pytest.mark.slow
     def test_s35_equal_frames_give_the_same_bytes_across_a_seam(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc", frozen=True)
         layers = [layer_with(shot, tmp_path / str(n), workers=n, temporal="off") for n in (1, 2)]

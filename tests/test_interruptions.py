@@ -315,7 +315,7 @@ def _alive(group: int) -> bool:
 
 @pytest.mark.parametrize(
     ("megabytes", "workers"),
-    [(0.005, "2"), (0.3, "1"), *(pytest.param(each, "1", marks=pytest.mark.slow) for each in (0.005, 0.6))],
+    [(0.005, "1"), (0.3, "1"), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0.005, "2"), (0.6, "1")))],
 )
 def test_a_full_disk_is_a_clear_error_and_costs_no_finished_frame(
     shot: Path, whole: bytes, tmp_path: Path, megabytes: float, workers: str

@@ -174,7 +174,7 @@ def judged(shape: Shape, moves: int, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_what_a_patch_leaves_out_never_touches(shape: Shape):
-    patches, left, wrong, crossed = judged(shape, 12, seed=1)
+    patches, left, wrong, crossed = judged(shape, 8, seed=4)
     assert patches > 20
     assert left > 1000
     assert crossed > 1

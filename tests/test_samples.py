@@ -250,7 +250,9 @@ def test_stage_is_complete_and_valid(sample: Callable[[str], Path], name: str) -
             np.testing.assert_allclose(mesh.GetExtentAttr().Get(code), [np.min(place, 0), np.max(place, 0)])
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "dancer" else name for name in SAMPLES]
+)
 def test_same_bytes_every_time_and_soon(sample: Callable[[str], Path], name: str, tmp_path: Path) -> None:
     start = time.process_time()
     again = write_sample(name, tmp_path / "new" / "folder")
