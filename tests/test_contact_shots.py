@@ -19,7 +19,7 @@ SHOTS: dict[str, tuple[list[str], list[str], tuple[float, float]]] = {
     "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], ["Cesium_Man_2"], (36, 37)),
     "12_variants/b_winding_flipped_unflagged.usdc": (["/shot/shirt"], ["/shot/body"], (6, 7)),
 }
-FAST = ("01_newton_shirt_dab_cm.usdc", "08_sphere_spin_xformcollider.usdc")
+FAST = ("08_sphere_spin_xformcollider.usdc",)
 SLOW = {name: [pytest.mark.slow] for name in SHOTS if name not in FAST}
 
 
