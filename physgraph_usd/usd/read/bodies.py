@@ -154,9 +154,9 @@ class ColliderReader:
         return float(np.linalg.norm(linear, 2)) if np.isfinite(linear).all() and linear.any() else self.metres
 
     def _coarse(self, drawn: DrawnMesh) -> tuple[Notice, ...]:
-        """A notice where a mesh could not be subdivided enough."""
+        """A notice where a mesh is so coarse that what is drawn comes through cloth that keeps its offset."""
         error = drawn.error * self._scale()
-        if error <= self.within:
+        if error <= self.within / DRAWN_NEAR:
             return ()
         message = f"its faces lie up to {1e3 * error:.2g} mm off the smooth surface that is drawn: more subdivisions"
         return (Notice(self.collider.path, None, f"{message} would give it over {MOST_VERTICES:,} vertices"),)
