@@ -77,7 +77,7 @@ def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -
 
 
 def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
-    """Each shot with its layer and its options, those of its show's file among them."""
+    """Shots with layers and options, from the command line and the show's file."""
     from ..shot.options import OPTIONS, RefineOptions
 
     layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)

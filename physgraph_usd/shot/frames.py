@@ -90,7 +90,7 @@ class Kept:
     of: int
 
     def __str__(self) -> str:
-        """How many, where, and what to do with them."""
+        """Number of kept frames, folder, and the option that resumes the run."""
         are, them = ("is", "it") if self.frames == 1 else ("are", "them")
         frames = f"{self.frames} of {counted(self.of, 'frame')}"
         return f"{frames} {are} kept in {self.folder}; --resume goes on from {them}"

@@ -256,7 +256,7 @@ def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _also(times: Sequence[float | None]) -> str:
-    """At what other time codes it is so, or ""."""
+    """Words for the other time codes of a warning; "" without any."""
     if len(times) > MOST_NAMED:
         return f"also in {counted(len(times), 'other frame')}"
     names = ["default" if time is None else f"{time:g}" for time in times]

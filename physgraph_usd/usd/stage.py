@@ -23,7 +23,7 @@ USD_ERRORS: tuple[type[Exception], ...] = (Tf.ErrorException, *filter(None, [get
 MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 UP_AXIS = "upAxis of the stage"
-"""Source of gravity's direction where nothing else gives one."""
+"""Default source of gravity's direction."""
 STANDARD_GRAVITY = 9.81
 """Magnitude of gravity when no physics scene gives one [m/s^2]."""
 MOST_GRAVITY = 1e5
@@ -307,7 +307,7 @@ def check_there(path: str | Path) -> None:
 
 
 def is_sound(layer: Sdf.Layer) -> bool:
-    """Whether a layer holds every prim that it lists: USD ends the process where it follows one that is not there."""
+    """Whether a layer holds every prim that it lists. USD ends the process at a listed prim without a spec."""
     paths = paths_in(layer)
     return all(not path.isEmpty and (not path.IsPrimPath() or layer.GetPrimAtPath(path)) for path in paths)
 

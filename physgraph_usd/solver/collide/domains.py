@@ -485,7 +485,7 @@ def _touching(parts: Topology, count: int, vertices: int) -> sp.csr_matrix:
 
 
 def _grouped(touching: sp.csr_matrix) -> sp.csr_matrix:
-    """Groups of one and those that touch it, shape (groups, items)."""
+    """Groups of a cluster and its neighbours, shape (groups, clusters)."""
     count = touching.shape[0]
     off = sp.csr_matrix(touching - sp.diags(touching.diagonal()))
     off.eliminate_zeros()

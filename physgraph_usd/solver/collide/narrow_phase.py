@@ -134,7 +134,7 @@ def box_gap(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 @wp.func
 def nearness(face: wp.bool, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32, parts: Topology, motion: Motion):
-    """Distance of a pair over that within which it is near, which is less where it is near at rest; 1 beyond it."""
+    """Distance of a pair of parts over its contact range, which is smaller for pairs near at rest; at most 1."""
     one = wp.float64(1.0)
     r, p, m = motion.radius, motion.play, motion.slack
     within, may = sum_of(face, r[a], r[b], r[c], r[d]), sum_of(face, m[a], m[b], m[c], m[d])
@@ -327,7 +327,7 @@ def pack(
     face: wp.array(dtype=wp.bool),
     owner: wp.array(dtype=wp.int64),
 ):
-    """Write what pairs of clusters have found one after the other, of those that had room, and whose it is."""
+    """Copy the pairs of parts of cluster pairs with enough room into one list, with the number of the cluster pair."""
     n = first + wp.tid()
     count = found.count[n]
     if count > room:

@@ -112,7 +112,7 @@ def body_crossings(
 
 
 def _marked(mesh: wp.Mesh, start: np.ndarray, end: np.ndarray, *, device: str) -> tuple[np.ndarray, np.ndarray]:
-    """Which segments meet a mesh, and which of its faces they meet."""
+    """Masks of the segments that meet a mesh, shape (S,), and of the faces met, shape (F,)."""
     segments = [
         wp.array(np.ascontiguousarray(each, np.float32), dtype=wp.vec3f, device=device) for each in (start, end)
     ]

@@ -56,8 +56,8 @@ def lead_in(
         times: The shot's time codes up to the run's first, in order.
 
     Returns:
-        The refiner there, and the time code that it walked from; None where the first frame needs nothing of the kind,
-        or nothing comes before it.
+        The refiner there, and the time code that it walked from; None where the first frame's cage does not
+        cross, or is the shot's first.
     """
     last = len(times) - 1
     try:

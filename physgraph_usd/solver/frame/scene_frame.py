@@ -257,7 +257,7 @@ class SceneFrame:
         return float(self.cloth.group(part, self.settings).levels[0].spacing.mean())
 
     def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
-        """Telemetry of what garments were solved with: bodies, where they feel any, and one another."""
+        """Telemetry: paths of the bodies near garments, and of garments solved together."""
         found: dict[str, object] = {}
         if any(self.cloth.scene.garments[index].colliders for index in part):
             found["near"] = [self.cloth.scene.colliders[each].path for each in near]

@@ -14,11 +14,11 @@ import warp as wp
 from ...errors import PhysGraphError
 
 _STDERR = 2
-_OURS = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") else "-march=native"
+_TARGET = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") else "-march=native"
 """Instructions of every x86-64 processor that has AVX2, so that kernels round alike on all of them."""
-_FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=native", _OURS)
+_FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=native", _TARGET)
 KERNELS = {"enable_backward": False, "cpu_compiler_flags": _FLAGS}
-"""Options of modules: no derivatives, and on the CPU Warp's own flags for our instructions."""
+"""Options of Warp modules: no derivatives; on the CPU Warp's default flags, for the target instructions."""
 FUSED = KERNELS | {"cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast"}
 """Options of modules whose kernels compute most: on the CPU a product and a sum are one instruction."""
 

@@ -51,7 +51,7 @@ class _Clip:
 
 
 def targets_of(out: Path, *, clips: bool) -> dict[str, Path]:
-    """Files that are written, by what they are."""
+    """Output files by role: layer, topology, manifest."""
     beside = {"topology": out.with_suffix(".topology.usdc"), "manifest": out.with_suffix(".manifest.usda")}
     return {"layer": out} | (beside if clips else {})
 
@@ -159,7 +159,7 @@ def _add_samples(still: Sdf.Layer, layer: Sdf.Layer, path: Sdf.Path) -> None:
 
 
 def _union(ours: Any, value: Any) -> Any:
-    """Boxes, one corner after the other, that hold two sets of them; the second where they are not of one shape."""
+    """Union of extents, box by box, shape (2 B, 3), lowest and highest corners in turn; the second if shapes differ."""
     one, other = np.asarray(ours), np.asarray(value)
     if ours is None or one.shape != other.shape or one.ndim != 2:
         return value
