@@ -29,7 +29,7 @@ TO_LIMIT = 4.0 / 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnMesh:
+class DrawnSurface:
     """Faces as they are drawn.
 
     Attributes:
@@ -53,7 +53,7 @@ class DrawnMesh:
 
 
 @dataclass(frozen=True, eq=False)
-class Cage:
+class ControlMesh:
     """A mesh that is subdivided, and what is sharp on it.
 
     Attributes:
@@ -67,7 +67,7 @@ class Cage:
     corners: np.ndarray
 
     @staticmethod
-    def of(mesh: PolygonMesh, *, edges: np.ndarray, creases: np.ndarray, corners: np.ndarray) -> Cage:
+    def of(mesh: PolygonMesh, *, edges: np.ndarray, creases: np.ndarray, corners: np.ndarray) -> ControlMesh:
         """A cage.
 
         Args:
@@ -79,9 +79,9 @@ class Cage:
         row = find_edges(mesh.half_edges.edges, edges)
         sharpness = np.zeros(len(mesh.half_edges.edges))
         sharpness[row[row >= 0]] = creases[row >= 0]
-        return Cage(mesh, sharpness, corners)
+        return ControlMesh(mesh, sharpness, corners)
 
-    def subdivided(self) -> tuple[Refinement, sparse.csr_matrix, Cage]:
+    def subdivided(self) -> tuple[Refinement, sparse.csr_matrix, ControlMesh]:
         """The refinement, the matrix of its smooth placement, and the finer cage."""
         step = subdivide(self.mesh)
         stencil = smooth(self.mesh, step, creased=self.creases >= _SHARP, corners=self.corners >= _SHARP)
@@ -91,10 +91,12 @@ class Cage:
         corners = np.zeros(step.mesh.vertex_count)
         corners[: self.mesh.vertex_count] = self.corners - 1.0
         creases = np.tile(self.creases[sharp] - 1.0, 2)
-        return step, stencil, Cage.of(step.mesh, edges=halves, creases=creases, corners=corners)
+        return step, stencil, ControlMesh.of(step.mesh, edges=halves, creases=creases, corners=corners)
 
 
-def drawn_mesh(cage: Cage, points: np.ndarray, *, holes: np.ndarray, scheme: str, within: float) -> DrawnMesh:
+def drawn_surface(
+    cage: ControlMesh, points: np.ndarray, *, holes: np.ndarray, scheme: str, within: float
+) -> DrawnSurface:
     """The faces that a renderer draws.
 
     Args:
@@ -106,7 +108,7 @@ def drawn_mesh(cage: Cage, points: np.ndarray, *, holes: np.ndarray, scheme: str
     """
     kept = ~np.isin(np.arange(cage.mesh.face_count), holes)
     if scheme not in ("catmullClark", "loop") or not cage.mesh.face_count:
-        return DrawnMesh(_some_faces(cage.mesh, kept))
+        return DrawnSurface(_some_faces(cage.mesh, kept))
     cage = replace(cage, mesh=replace(cage.mesh, least_polygon=3 if scheme == "catmullClark" else 4))
     error = flatness(cage, points)
     wanted = 0 if error <= within else math.ceil(math.log(error / within, 4.0))
@@ -117,10 +119,10 @@ def drawn_mesh(cage: Cage, points: np.ndarray, *, holes: np.ndarray, scheme: str
         stencils.append(stencil)
         kept = kept[step.parent_face]
     stencil = reduce(lambda product, each: each @ product, [*stencils, _to_limit(cage)])
-    return DrawnMesh(_some_faces(cage.mesh, kept), sparse.csr_matrix(stencil), error / 4.0**levels)
+    return DrawnSurface(_some_faces(cage.mesh, kept), sparse.csr_matrix(stencil), error / 4.0**levels)
 
 
-def flatness(cage: Cage, points: np.ndarray) -> float:
+def flatness(cage: ControlMesh, points: np.ndarray) -> float:
     """Distance from the limit surface of the faces between vertices on it, over `NEAR_PART` of the surface.
 
     A vertex that subdivision makes is as far from the face of the old vertices, all moved by one subdivision.
@@ -136,7 +138,7 @@ def flatness(cage: Cage, points: np.ndarray) -> float:
     return float(np.quantile(away, NEAR_PART)) if len(away) else 0.0
 
 
-def _to_limit(cage: Cage) -> sparse.csr_matrix:
+def _to_limit(cage: ControlMesh) -> sparse.csr_matrix:
     """The matrix that moves vertices to the limit surface, shape (V, V)."""
     count = cage.mesh.vertex_count
     moved = cage.subdivided()[1][:count, :]

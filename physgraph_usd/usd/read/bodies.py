@@ -15,7 +15,7 @@ from pxr import Usd, UsdGeom
 
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
-from ...solver.mesh.drawn import MOST_VERTICES, Cage, DrawnMesh, drawn_mesh
+from ...solver.mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import Override, find_token, find_value
@@ -48,7 +48,7 @@ class _Faces:
     """Authored arrays of a mesh's topology, the faces drawn from them, and their triangles, as authored and turned."""
 
     authored: tuple[np.ndarray, ...]
-    drawn: DrawnMesh
+    drawn: DrawnSurface
     wound: tuple[np.ndarray, np.ndarray]
 
     def are_of(self, authored: tuple[np.ndarray, ...]) -> bool:
@@ -142,8 +142,8 @@ class ColliderReader:
             first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
             first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
             scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
-            cage = _cage_of(mesh, PolygonMesh(counts, indices, len(points)))
-            drawn = drawn_mesh(cage, first, holes=holes, scheme=scheme, within=self.within / self._scale())
+            cage = _control_mesh(mesh, PolygonMesh(counts, indices, len(points)))
+            drawn = drawn_surface(cage, first, holes=holes, scheme=scheme, within=self.within / self._scale())
             triangles = drawn.mesh.triangulate(drawn.place(first)).triangles
             self._faces = _Faces(authored, drawn, (triangles, np.ascontiguousarray(triangles[:, ::-1])))
         return self._faces
@@ -153,7 +153,7 @@ class ColliderReader:
         linear = self._matrix(Usd.TimeCode.EarliestTime())[:3, :3]
         return float(np.linalg.norm(linear, 2)) if np.isfinite(linear).all() and linear.any() else self.metres
 
-    def _coarse(self, drawn: DrawnMesh) -> tuple[Notice, ...]:
+    def _coarse(self, drawn: DrawnSurface) -> tuple[Notice, ...]:
         """A notice where a mesh is so coarse that what is drawn comes through cloth that keeps its offset."""
         error = drawn.error * self._scale()
         if error <= self.within / DRAWN_NEAR:
@@ -228,7 +228,7 @@ def _is_invisible(prim: Usd.Prim, time: float | None) -> bool:
     return UsdGeom.Imageable(prim).ComputeVisibility(timecode(time)) == UsdGeom.Tokens.invisible
 
 
-def _cage_of(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> Cage:
+def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
     """The faces with their creases and corners, without those whose arrays do not fit together."""
     ends, sharpness = np.zeros((0, 2), np.int32), np.zeros(0)
     attributes = (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr(), mesh.GetCreaseSharpnessesAttr())
@@ -244,7 +244,7 @@ def _cage_of(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> Cage:
     if len(places) == len(given):
         inside = (places >= 0) & (places < len(corners))
         corners[places[inside]] = given[inside]
-    return Cage.of(polygons, edges=ends, creases=sharpness, corners=corners)
+    return ControlMesh.of(polygons, edges=ends, creases=sharpness, corners=corners)
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
