@@ -16,7 +16,6 @@ from physgraph_usd.solver.colliders.pose import Collider, MeshPose, Pose
 from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
 from physgraph_usd.solver.contact.frame import FrameContact
 from physgraph_usd.solver.contact.promise import Promise
-from physgraph_usd.solver.contact.seams import Seams
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces.seam import Seam
@@ -24,6 +23,8 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
+from physgraph_usd.solver.seams import level_seams
+from physgraph_usd.usd.read.seams import sewn_garments
 
 EDGE = 0.05
 LEVEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -147,8 +148,13 @@ def contact_of(
         cloth=ClothContact(levels, garments),
         thickness=[0.001] * len(garments),
         settings=ContactSettings(**settings),
-        seams=Seams.find(levels[0], cage),
+        seams=level_seams(levels, sewn(garments, cage.double().numpy())),
     )
+
+
+def sewn(garments: Sequence[Garment], *cages: np.ndarray) -> list[Garment]:
+    """Garments whose vertices at one place in these cages are sewn."""
+    return sewn_garments(garments, [1e-3 * EDGE] * len(garments), lambda _: iter([cages]))[0]
 
 
 def refiner_with(

@@ -126,7 +126,7 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
         0.05 * np.concatenate([corner[list(side)] for side in sides]),
         PolygonMesh(np.full(6, 4), np.arange(24), 24),
     )
-    garments, frames = [garment_of(mesh, points)], frame_of(points * [0.95, 0.9, 1.0]).garments
+    garments, frames = sewn([garment_of(mesh, points)], points), frame_of(points * [0.95, 0.9, 1.0]).garments
     chains, down, answers = refine_garments(garments, [4]), np.array([0.0, -9.81, 0.0]), []
     for device in ("cpu", "cuda", "cuda"):
         settings = settings_of(steps=60, tolerance=1e-6)

@@ -133,7 +133,7 @@ def garment_with(values: np.ndarray | None, *, name: str = "st", turn: float = 0
     mesh, one = triangle_mesh(triangles, len(points)), np.ones(len(points))
     painted = {"easeScale": one, "gather": 0 * one, "grain": turn * one}
     kept, up = np.arange(len(triangles)), np.array([0.0, 0.0, 1.0])
-    return read_grain(usd.GetPrim(), mesh, points, kept=kept, up=up, painted=painted)
+    return read_grain(usd.GetPrim(), unwelded(mesh), points, kept=kept, up=up, painted=painted)
 
 
 def flat_points() -> np.ndarray:

@@ -20,7 +20,6 @@ MUTATORS = {"append", "extend", "insert", "add", "update", "setdefault", "clear"
 ALLOWED = {
     # Of a frame, each answer found once.
     "contact/frame.py FrameContact.at: _views": "one a level",
-    "contact/seams.py Seams.at: _levels": "one a level",
     "contact/broad_phase.py Bodies._meets: _bounds": "of a pose, until the next one",
     "contact/broad_phase.py Bodies._posed: _surfaces": "of a pose, until the next one",
     "contact/cloth.py ClothView._look: _looked": "of the positions asked for last, and of no others",

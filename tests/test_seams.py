@@ -21,6 +21,7 @@ from folds import (
     named,
     promise_of,
     refiner_with,
+    sewn,
     square,
     strip,
     view_of,
@@ -173,7 +174,7 @@ def test_a_cut_sheet_in_tension_is_the_whole_one(count: int):
         x = cloth[1][:, 0]
         pin = ((x < 0.01) | (x > x.max() - 0.01)) * 1.0
         solver = refiner_with(
-            [named(cloth, pin=pin)], level=1, gravity=np.zeros(3), dtype=torch.float64, steps=400, tolerance=1e-8
+            sewn([named(cloth, pin=pin)], cloth[1]), level=1, gravity=np.zeros(3), dtype=torch.float64, steps=400, tolerance=1e-8
         )
         frame = frame_with([stretched(cloth[1])], fabric=SOFT, guide=0.0)
         answers.append((solver.solve(frame).points[0], base_of(cloth[0], cloth[1], 1)))
@@ -195,7 +196,7 @@ def gap_of(points: np.ndarray, places: np.ndarray) -> float:
 def test_seams_stay_closed_on_a_body(options: dict[str, Any]):
     """A sheet of four panels sinks onto a ball that stands in it: closed, and as far outside as a whole one."""
     cloth, _ = panels(square(8, edge=0.5 * EDGE), 4)
-    solver = refiner_with([named(cloth)], ["mesh"], times=(0.0, 1.0), **options)
+    solver = refiner_with(sewn([named(cloth)], cloth[1]), ["mesh"], times=(0.0, 1.0), **options)
     for time in (0.0, 1.0):
         cage = cloth[1] + [0.0, 0.058 - 0.004 * time, 0.0]
         answer = solver.solve(frame_with([cage], ball(0.06, level=3), time=time))
@@ -223,7 +224,7 @@ def test_a_box_of_sewn_faces_settles():
     points = 0.01 * np.concatenate([corner[list(side)] for side in sides])
     mesh = PolygonMesh(np.full(6, 4), np.arange(24), 24)
     pressed = points * [0.95, 0.9, 1.0] + [0.1, 0.0, 0.0] * points[:, 1:2]
-    solver = refiner_with([named((mesh, points))], level=4, steps=50)
+    solver = refiner_with(sewn([named((mesh, points))], points), level=4, steps=50)
     answer = solver.solve(frame_with([pressed]))
     assert answer.telemetry[0]["contact"]["cloth"]["after"]["crossings"] == 0
     assert answer.telemetry[0]["levels"][-1]["remaining_move"] < 0.02
@@ -276,7 +277,7 @@ class TestCloth:
     def test_a_frame_whose_carried_detail_opens_at_a_seam_is_closed(self):
         """Two frames of a sewn strip that is bent at its seam by ever more."""
         cloth, _ = panels(strip(8, 3))
-        solver = refiner_with([named(cloth)], times=(0.0, 1.0, 2.0))
+        solver = refiner_with(sewn([named(cloth)], cloth[1]), times=(0.0, 1.0, 2.0))
         middle = float(np.median(cloth[1][:, 0]))
         for time in range(3):
             bent = cloth[1].copy()

@@ -385,7 +385,7 @@ def _level_of(opened: Shot, index: int, count: int | None) -> int:
     """How often a garment was subdivided to have a number of vertices; 0 where it is in no chunk."""
     if count is None:
         return 0
-    cage = opened.scene.garments[index].mesh
+    cage = opened.sources[index].weld.apart
     for level in range(_FINEST + 1):
         if [cage, *(step.mesh for step in subdivide_times(cage, level))][-1].vertex_count == count:
             return level

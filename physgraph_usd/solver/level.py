@@ -17,6 +17,7 @@ from torch import Tensor
 from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
 from .mesh.defects import FLAT
+from .mesh.creases import creases_of, halves_of, on_edges
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
 from .mesh.lengths import ANGLES, LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
@@ -248,7 +249,7 @@ class _GarmentLevel:
     triangles: np.ndarray
     edges: np.ndarray
     elements: ElasticElements
-    bent_rest: bool
+    bent: np.ndarray
     vertex_values: dict[str, np.ndarray]
     warp: np.ndarray | None
     linear: sp.csr_matrix
@@ -262,17 +263,19 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     """Carry one garment to a level, or to the end of its chain of refinements, at which it stays."""
     mesh, chain = garment.mesh, whole[:index]
     linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    creases = creases_of(mesh, garment.rest, garment.closed)
     face = np.arange(mesh.face_count)
     for number, refinement in enumerate(chain):
         split = mesh.triangulate(None if number else garment.rest)
         flat_step = on_triangles(mesh, refinement, split)
-        linear_step, smooth_step = refinement.linear, sp.csr_matrix(smooth(mesh, refinement))
+        linear_step, smooth_step = refinement.linear, sp.csr_matrix(smooth(mesh, refinement, creased=on_edges(mesh, creases)))
         smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
+        creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
         mesh, face = refinement.mesh, face[refinement.parent_face]
     if index > len(chain):
         linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
-    split = _sound(mesh.triangulate(rest if not chain else None), rest)
+    split = _sound(mesh.triangulate(rest if not chain else None), rest, rigid=_is_rigid(garment, linear))
     elements = elastic_elements(mesh, split, rest)
     # Along normals only: what smoothing moves within the surface would strain a flat cage.
     normal = vertex_normals(smooth_rest, elements.membrane)
@@ -288,7 +291,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         triangles=split.triangles,
         edges=edges_of(split.triangles, mesh.vertex_count).vertices,
         elements=elements,
-        bent_rest=garment.bent_rest,
+        bent=garment.bent_rest | (find_edges(creases, elements.hinges[:, :2]) >= 0),
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
         linear=linear,
@@ -336,14 +339,20 @@ def triangle_areas(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
-def _sound(split: TriangleSplit, rest: np.ndarray) -> TriangleSplit:
-    """Without triangles that have no rest area or repeat an earlier one: they are no cloth."""
+def _is_rigid(garment: Garment, linear: sp.csr_matrix) -> np.ndarray:
+    """Whether each vertex of a level belongs to a rigid part, shape (V,)."""
+    parts = np.full(len(garment.rest), -1) if garment.rigid is None else garment.rigid
+    return np.asarray(linear @ (parts >= 0).astype(np.float64)) > 0.0
+
+
+def _sound(split: TriangleSplit, rest: np.ndarray, *, rigid: np.ndarray) -> TriangleSplit:
+    """Without triangles of rigid parts, without rest area, or that repeat an earlier one: they are no cloth."""
     corners = rest[split.triangles]
     sides = corners - np.roll(corners, 1, axis=1)
     area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     valid = np.zeros(len(area), bool)
     valid[np.unique(np.sort(split.triangles, axis=1), axis=0, return_index=True)[1]] = True
-    valid &= area > FLAT * (sides**2).sum(axis=2).max(axis=1)
+    valid &= (area > FLAT * (sides**2).sum(axis=2).max(axis=1)) & ~rigid[split.triangles[:, 0]]
     return split if valid.all() else TriangleSplit(split.triangles[valid], split.face[valid])
 
 
@@ -418,7 +427,7 @@ def _measured(
     springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
     surface, size = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "size"))
     share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))
-    bent = np.repeat([part.bent_rest for part in parts], [len(part.elements.hinges) for part in parts])
+    bent = np.concatenate([part.bent for part in parts])
     inverse = triangle_inverse(surface, triangles, warp)
     stretch, bend, pin = (
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")

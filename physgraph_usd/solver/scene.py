@@ -69,6 +69,12 @@ class Garment:
         apart_from: Paths of the garments that it never touches; each of them names it too.
         grain: Which way its warp lies, and its painted ease; None is unknown, and none.
         raises_bending: Whether bending is raised on a level whose edges are too long for the fabric's folds.
+        sewn_at: Places of the vertices that are sewn to others, in a pose in which the seams are closed [m], NaN at
+            all other vertices, shape (V, 3). Vertices of any garments at one place are sewn together, and vertices on
+            another border's edge to that edge. None without seams.
+        closed: Whether each vertex belongs to a closed piece, whose sharp edges stay sharp, shape (V,); None without
+            such pieces.
+        rigid: Number of the rigid part that each vertex belongs to, -1 for cloth, shape (V,); None without parts.
     """
 
     path: str
@@ -88,6 +94,9 @@ class Garment:
     apart_from: tuple[str, ...] = ()
     grain: Grain | None = None
     raises_bending: bool = True
+    sewn_at: np.ndarray | None = None
+    closed: np.ndarray | None = None
+    rigid: np.ndarray | None = None
 
     @staticmethod
     def of(

@@ -223,6 +223,11 @@ PROPERTIES: tuple[Property, ...] = (
         "Colliders and garments that this garment never touches: prims, prims above them, or collections.",
         "Excluded Prims", CONTACT,
     ),
+    Property(
+        GARMENT_API, "physgraph:seam:tolerance", "float", 0.0, "m", 0.0, 1.0,
+        "Distance within which open borders are sewn together; 0 sews borders at one place." + SI,
+        "Seam Tolerance", REST, (0.0, 5e-3), uniform=True,
+    ),
     _scale(
         "stretchScale", "Stretch Stiffness Scale", 1.0, most=1e4, soft=10.0,
         doc="Painted multiplier of the stretch stiffness; vertex or constant.",

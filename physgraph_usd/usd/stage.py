@@ -14,6 +14,7 @@ import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from ..errors import AbsentError, LayerError, PhysGraphError, StageError
+from ..solver.mesh.weld import Weld
 from .view import StageView
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
@@ -110,11 +111,13 @@ class GarmentSource:
         velocities: Whether the shot has velocities for it.
         absent: Its own authored times in range at which it has no shape, ascending; the layer has blocks there.
         subsets: Faces of the cage in each GeomSubset, by its name.
+        weld: The mesh as authored and as the solver has it, without holes.
         words: Words in the names of the prim, the prim above it, its materials, and subsets that cover most of it.
     """
 
     path: Sdf.Path
     kept_faces: np.ndarray
+    weld: Weld
     skinned: bool
     instance_roots: tuple[Sdf.Path, ...]
     times: tuple[float, ...]

@@ -9,7 +9,7 @@ import pytest
 from bodies import ball
 from brute import between
 from cloth import Answer, base_of, refiner_of
-from folds import EDGE, Cloth, frame_with, named, refiner_with, square
+from folds import EDGE, Cloth, frame_with, named, refiner_with, sewn, square
 from scenes import sleeve
 from sheets import garment_of
 from test_tangles import cornered, dented
@@ -170,7 +170,7 @@ def seam_gap(gravity: np.ndarray, squeeze: float, **options: Any) -> float:
     cloths, cages, left, right = halves()
     garments = [named(cloth, name) for cloth, name in zip(cloths, "AB", strict=True)]
     cages = [cage * np.array([1.0 - squeeze, 1.0, 1.0]) for cage in cages]
-    answer = refiner_with(garments, gravity=gravity, **options).solve(frame_with(cages))
+    answer = refiner_with(sewn(garments, *cages), gravity=gravity, **options).solve(frame_with(cages))
     return float(np.linalg.norm(answer.points[0][left] - answer.points[1][right], axis=1).max())
 
 

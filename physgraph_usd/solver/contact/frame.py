@@ -26,7 +26,6 @@ from .metric import HeldMetric
 from .promise import Promise
 from .push_out import moves, projected
 from .repair import repaired_cage
-from .seams import Seams
 from .settings import ContactSettings
 
 FLOOR = 0.06
@@ -169,7 +168,7 @@ class FrameContact:
         cloth: ClothContact | None,
         thickness: Sequence[float],
         settings: ContactSettings,
-        seams: Seams | None = None,
+        seams: Sequence[Seam | None] = (),
         target: Float[Tensor, "vertices 3"] | None = None,
     ) -> None:
         """Take the frame.
@@ -181,7 +180,7 @@ class FrameContact:
             cloth: The group's cloth, or None when cloth is not to touch cloth.
             thickness: Of each garment's cloth [m].
             settings: How contact is solved, with k_c itself as its stiffness.
-            seams: What the input has at one place, or None when nothing is.
+            seams: The seam of each level, None without seams; () for none.
             target: Where the finest level's cloth is to go in a warm frame [m], or None.
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
@@ -203,7 +202,7 @@ class FrameContact:
         cage, out, crosses = self._levels[0], self._coarse, None
         if self._cloth is None:
             return out, crosses
-        seam = self._seam_at(cage, out)
+        seam = self._seam_at(cage)
         mesh = self._cloth.mesh(cage, seam)
         if self._bodies is not None:
             out = repaired_cage(cage, out, bodies=self._bodies.at(cage, self._levels[-1]), mesh=mesh)
@@ -234,7 +233,7 @@ class FrameContact:
             finest = level is self._levels[-1]
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
-            seam = self._seam_at(level, base)
+            seam = self._seam_at(level)
             bodies = None if bodies is None else replace(bodies.losing(base), seam=seam)
             cloth = promise = None
             if self._cloth is not None:
@@ -255,9 +254,9 @@ class FrameContact:
         term = None if view.cloth is None else view.cloth.term(base)
         return 0.0 if term is None else float(term.near(finest).to(base).mean())
 
-    def _seam_at(self, level: Level, base: Float[Tensor, "vertices 3"]) -> Seam | None:
-        """What is sewn together at a level, upsampled to given positions [m]."""
-        return None if self._seams is None else self._seams.at(level, base)
+    def _seam_at(self, level: Level) -> Seam | None:
+        """The seam of a level."""
+        return self._seams[level.index] if self._seams else None
 
     def finish(self, x: Placed) -> tuple[Placed, dict[str, object]]:
         """Move the solved cloth out of bodies.

@@ -4,8 +4,8 @@
 
 | symbol | here | meaning |
 |---|---|---|
-| A | ``Seam.closed`` | sewn points at their mean, or at what may not move; all others where they are |
-| A^T | ``Seam.shared`` | each of n sewn points feels an n-th of what all of them feel |
+| A | ``Seam.closed`` | sewn points at their mean, at a vertex that may not move, or on the edge they follow |
+| A^T | ``Seam.shared`` | each of n points at one place feels an n-th of the forces on all; ends of an edge feel theirs |
 
 So a seam holds exactly, however stiff the cloth, and an integrator need not know of it: steps that would open it change
 neither energy nor force.
@@ -20,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.borders import OnEdge
 from ..mesh.stencil import Stencil
 from ..mesh.topology import joined_by
 from .base import ForceModule
@@ -29,27 +30,33 @@ class Seam:
     """Points of a level that are sewn together.
 
     Attributes:
-        pairs: Vertices that are, each any number of times, shape (N, 2).
-        label: A number for each vertex, the same for what is sewn together, shape (V,).
+        pairs: Vertices taken for one, each any number of times, shape (N, 2): those at one place, and each vertex
+            between two others with the nearer of these.
+        label: A number for each vertex, the same for vertices taken for one, shape (V,).
     """
 
-    def __init__(self, level: Level, pairs: np.ndarray) -> None:
-        """Group pairs of vertices, each vertex any number of times.
+    def __init__(self, level: Level, pairs: np.ndarray, between: OnEdge | None = None) -> None:
+        """Group the vertices.
 
         Args:
             level: The level.
-            pairs: Vertices, shape (N, 2), N > 0.
+            pairs: Vertices at one place, each any number of times, shape (N, 2).
+            between: Vertices that lie on an edge between others. None of its ends lies on an edge.
         """
-        self.pairs = pairs
-        sewn, ends = np.unique(pairs, return_inverse=True)
-        count = len(sewn)
-        group = joined_by(ends.reshape(-1, 2), count)
-        self.label = np.arange(level.vertex_count)
-        self.label[sewn] = sewn[np.unique(group, return_index=True)[1]][group]
+        self._between = None
+        together = pairs
+        if between is not None and len(between.vertex):
+            self._between = _Between(level, between)
+            nearer = np.where(between.part < 0.5, between.edge[:, 0], between.edge[:, 1])
+            together = np.concatenate([pairs, np.stack([between.vertex, nearer], axis=1)])
+        self.pairs = together
+        self.label = _lowest(together, level.vertex_count)
+        sewn = np.unique(pairs)
+        group = np.unique(_lowest(pairs, level.vertex_count)[sewn], return_inverse=True)[1].reshape(-1)
         free = level.free[:, 0].cpu().numpy()[sewn]
-        held = np.bincount(group, ~free)[group] > 0
+        held = np.bincount(group, ~free, minlength=1)[group] > 0
         leads = np.where(held, ~free, True)
-        member = sp.csr_matrix((leads.astype(float), (group, np.arange(count))))
+        member = sp.csr_matrix((leads.astype(float), (group, np.arange(len(sewn)))), shape=(group.max(initial=-1) + 1, len(sewn)))
         mean = sp.csr_matrix(sp.diags(1.0 / np.asarray(member.sum(axis=1)).ravel()) @ member)[group]
         first = np.asarray(member.argmax(axis=1)).ravel()[group]
         device, dtype = level.device, level.dtype
@@ -59,18 +66,53 @@ class Seam:
         self._fraction = Stencil(sp.csr_matrix(sp.diags((~held).astype(float)) @ mean), dtype=dtype, device=device)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Sewn points brought together; to the last bit as they are where they are together."""
+        """Sewn points brought together; points that are together keep their bits."""
         points = x[self._place]
         first = points[self._first]
         out = x.clone()
         out[self._place] = torch.where(self._free, first + self._mean.apply(points - first), points)
-        return out
+        return out if self._between is None else self._between.placed(out)
 
     def shared(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Forces shared by sewn points; none on what is sewn to something that may not move."""
-        out = force.clone()
-        out[self._place] = self._fraction.apply(force[self._place])
+        """Forces on sewn points, A^T F; none on points sewn to a vertex that may not move."""
+        out = force.clone() if self._between is None else self._between.handed_on(force)
+        out[self._place] = self._fraction.apply(out[self._place])
         return out
+
+
+class _Between:
+    """Vertices that follow points of edges."""
+
+    def __init__(self, level: Level, on: OnEdge) -> None:
+        device, dtype = level.device, level.dtype
+        self._vertex, self._start, self._end = (
+            torch.as_tensor(each, device=device) for each in (on.vertex, on.edge[:, 0], on.edge[:, 1])
+        )
+        self._part = torch.as_tensor(on.part, dtype=dtype, device=device).unsqueeze(1)
+        self._free = level.free[self._vertex]
+        weights = np.concatenate([1.0 - on.part, on.part]) * np.tile(self._free[:, 0].cpu().numpy(), 2)
+        columns = np.tile(np.arange(len(on.vertex)), 2)
+        shape = (level.vertex_count, len(on.vertex))
+        ends = sp.csr_matrix((weights, (on.edge.T.ravel(), columns)), shape=shape)
+        self._ends = Stencil(ends, dtype=dtype, device=device)
+
+    def placed(self, x: Tensor) -> Tensor:
+        """Positions with the vertices on their edges; x is written to."""
+        start = x[self._start]
+        x[self._vertex] = torch.where(self._free, start + self._part * (x[self._end] - start), x[self._vertex])
+        return x
+
+    def handed_on(self, force: Tensor) -> Tensor:
+        """Forces with those on the vertices given to the ends of their edges."""
+        out = force + self._ends.apply(force[self._vertex].contiguous())
+        out[self._vertex] = 0.0
+        return out
+
+
+def _lowest(pairs: np.ndarray, count: int) -> np.ndarray:
+    """The lowest of the vertices that pairs join to each, itself where none do, shape (V,)."""
+    label = joined_by(pairs, count) if len(pairs) else np.arange(count)
+    return np.unique(label, return_index=True)[1][label]
 
 
 class SewnForces:

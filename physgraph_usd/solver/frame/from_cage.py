@@ -5,7 +5,8 @@ and of a tangent that is a fixed linear combination of the triangles' edges, so 
 interpolates to the fine vertices is how frames have turned: tangents of neighbours may point anywhere, also against one
 another, and have no mean.
 
-Fixed vertices are placed by the cage, and corners of faces without area follow the cloth beside them.
+Fixed vertices are placed by the cage, corners of faces without area follow the cloth beside them, and rigid parts the
+cloth under them.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from torch import Tensor
 from ..level import PIN_MARGIN, Level, Placed
 from ..mesh.stencil import Stencil, add_at
 from ..mesh.topology import PolygonMesh
+from ..scene import Garment
+from .rigid_parts import RigidParts
 from .values import State
 
 NEAREST = 1e-6
@@ -92,8 +95,9 @@ class MovingFrames:
 class Followers:
     """Fixed vertices, and corners of faces without area, which move with what lies beside them, by nearness."""
 
-    def __init__(self, level: Level, meshes: Sequence[PolygonMesh]) -> None:
+    def __init__(self, level: Level, garments: Sequence[Garment], meshes: Sequence[PolygonMesh]) -> None:
         """Find them at a level; ``meshes`` are its garments' polygons."""
+        self._rigid = RigidParts(level, garments)
         parts = zip(meshes, level.spans, strict=True)
         edges = np.concatenate([mesh.half_edges.edges.astype(np.int64) + span.start for mesh, span in parts])
         ends = np.concatenate([edges, edges[:, ::-1]])
@@ -126,6 +130,7 @@ class Followers:
         if self._inverse is not None:
             base = self._from_coarse @ coarse
             out[self._which] = base[self._which] + self._inverse.solve(self._beside @ (out - base))
+            self._rigid.place(out, base)
         return out
 
 

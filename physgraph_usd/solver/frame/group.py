@@ -14,15 +14,16 @@ from torch import Tensor
 from ..contact.bodies import FrameBodies, Touching
 from ..contact.cloth import ClothContact
 from ..contact.frame import FrameContact
-from ..contact.seams import Seams
 from ..contact.settings import ContactSettings
 from ..forces.base import ForceModule
 from ..forces.guide import GuideMap
+from ..forces.seam import Seam
 from ..integrate.base import Integrator, System
 from ..integrate.quasi_newton import QuasiNewton
 from ..level import Level, Placed, build_levels, unhindered
 from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame, recentred
+from ..seams import level_seams
 from .from_cage import Followers, MovingFrames
 from .level_forces import LevelForces, build_forces
 from .settings import SolveSettings
@@ -42,6 +43,7 @@ class Group:
         moving_frames: Of the cage, which carry the last frame's detail.
         followers: What no solve moves.
         cloth: The cloth's contact with itself.
+        seams: The seam of each level, None without seams.
     """
 
     garments: tuple[Garment, ...]
@@ -52,6 +54,7 @@ class Group:
     moving_frames: MovingFrames
     followers: Followers
     cloth: ClothContact
+    seams: list[Seam | None]
     # The lasting terms by potential and materials, of the last ones alone; and integrators with what they recorded.
     _forces: dict[tuple[object, ...], list[LevelForces]] = field(default_factory=dict)
     _integrators: dict[Callable[[], Integrator], Integrator] = field(default_factory=dict)
@@ -88,8 +91,9 @@ class Group:
             levels,
             guide_maps=[GuideMap(level) for level in levels],
             moving_frames=MovingFrames(levels[0], levels[-1]),
-            followers=Followers(levels[-1], meshes),
+            followers=Followers(levels[-1], garments, meshes),
             cloth=ClothContact(levels, tuple(garments)),
+            seams=level_seams(levels, garments),
         )
 
     @property
@@ -154,15 +158,14 @@ class Group:
         cloth = self.cloth if settings.cloth != "off" and self.cloth.meets.any() else None
         if not len(self.levels[0].triangles):
             return None
-        seams = Seams.find(self.levels[0], cage.points)
-        if cloth is None and not touching and seams is None:
+        if cloth is None and not touching and not any(self.seams):
             return None
         fabrics = [each.fabric for each in frame.garments]
         settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics))
         bodies = None
         if touching:
             bodies = FrameBodies.begin(self.levels, touching, cage.points, origin=cage.origin, settings=settings)
-        cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": seams}
+        cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
         return FrameContact(self.levels, cage.points, bodies=bodies, cloth=cloth, **cloths, target=target)
 
     def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:

@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ...errors import GarmentError, SchemaError
+from ...errors import GarmentError, SchemaError, counted
+from ...solver.mesh.borders import open_edges
+from ...solver.mesh.pieces import pieces_of
 from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.weld import Weld, seam_reach, unwelded, weld
 from ...solver.scene import Garment, GarmentFrame
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..schema import GARMENT
@@ -26,6 +29,8 @@ from .placement import check_matrix, check_placement, is_flipped, place, to_metr
 from .rest import Animation, Rest, read_rest, rests_bent
 from .skinning import Bake
 
+RIGID = "physgraph:rigid"
+"""Attribute of a subset of faces that are to be rigid, bool."""
 _SMALL, _LARGE = 0.01, 100.0
 _WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 """A word of a name such as "LeatherBelt_geo1"."""
@@ -67,7 +72,8 @@ class GarmentReader:
         source: Its place on the stage.
         values: Sources of its animated values.
         points: Its points.
-        edges: Its edges, shape (E, 2).
+        edges: Its edges as authored, shape (E, 2).
+        weld: Its mesh as authored and as solved.
         notices: Warnings about it.
     """
 
@@ -76,6 +82,7 @@ class GarmentReader:
     values: Values
     points: PointReader
     edges: np.ndarray
+    weld: Weld
     notices: list[Notice] = field(default_factory=list)
 
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
@@ -93,7 +100,7 @@ class GarmentReader:
             points = np.broadcast_to(self.garment.rest.mean(axis=0), self.garment.rest.shape)
         else:
             local, notices = self.points.read(time, self.edges)
-            points = place(local, to_metres(prim, metres, time))
+            points = self.weld.joined(place(local, to_metres(prim, metres, time)))
         names = ("guide:stiffness", "refine:detail", "contact:offset")
         guide, detail, offset = (self.values.number(name, time) for name in names)
         fabric, most = self.values.fabric(time), float(np.linalg.norm(np.ptp(self.garment.rest, axis=0))) / _THICK
@@ -132,28 +139,31 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     placement = check_placement(prim, request.units.metres, times)
     matrix = to_metres(prim, request.units.metres, first)
     animation = _animation(prim, points, request, edges=edges, every=every, times=times)
-    rest = _rest(prim, cage.mesh, animation, request, matrix=matrix)
+    rest, weld = _rest_and_weld(prim, cage.mesh, animation, request, matrix=matrix)
     bent, odd = rests_bent(prim)
     absent = within(samples.absent, request.frames)
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     self_contact, layer, raises, level = _constants(prim, request)
-    painted, cut = _painted(prim, points.count, notices, values=values)
-    grain, lies = read_grain(prim, cage.mesh, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
+    painted, cut = _painted(prim, weld, notices, values=values)
+    closed, rigid, odd_pieces = _pieces(prim, weld, rest.points, cage.kept_faces)
+    grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
-        *(str(prim.GetPath()), cage.mesh, rest.points, round(level.at(None) or 0.0), is_flipped(prim, matrix), bent),
+        *(str(prim.GetPath()), weld.mesh, weld.joined(rest.points), round(level.at(None) or 0.0), is_flipped(prim, matrix), bent),
         self_contact=bool(self_contact.at(None)),
         layer=None if (order := layer.at(None)) is None else round(order),
         grain=grain,
         raises_bending=bool(raises.at(None)),
+        closed=closed,
+        rigid=rigid,
         **painted,
     )
     size = _size_notices(garment.path, animation.first, request)
-    notices += [*rest.notices, *size, *_unit_notices(prim, matrix, request)]
+    notices += [*rest.notices, *odd_pieces, *size, *_unit_notices(prim, matrix, request)]
     sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
     sources |= {"grain": lies, "refine:raiseBending": raises.source}
     source = GarmentSource(
-        *(prim.GetPath(), cage.kept_faces, prim.GetPath() in request.bake.skinned, tuple(roots), times),
+        *(prim.GetPath(), cage.kept_faces, weld, prim.GetPath() in request.bake.skinned, tuple(roots), times),
         sources | values.sources | {"refine:level": level.source},
         values.animated,
         left_out=tuple(time for time in every if time not in times),
@@ -162,7 +172,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         subsets=(subsets := _subsets(prim, cage.kept_faces)),
         words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(cage.kept_faces)]),
     )
-    return GarmentReader(garment, source, values, points, edges, [*notices, *values.notices])
+    return GarmentReader(garment, source, values, points, edges, weld, [*notices, *values.notices])
 
 
 def _animation(
@@ -200,6 +210,29 @@ def has_velocities(prim: Usd.Prim, count: int) -> bool:
     return any(len(attribute.Get(code) or ()) == count for code in codes)
 
 
+def _pieces(
+    prim: Usd.Prim, weld: Weld, rest: np.ndarray, kept: np.ndarray
+) -> tuple[np.ndarray | None, np.ndarray | None, list[Notice]]:
+    """Vertices of closed pieces, numbers of rigid parts at the vertices, None without any, and notices of them."""
+    asked = np.zeros(len(kept), bool)
+    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
+        attribute = subset.GetPrim().GetAttribute(RIGID)
+        if attribute and attribute.Get():
+            faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
+            asked |= np.isin(kept, [] if faces is None else np.asarray(faces))
+    found, path, notices = pieces_of(weld.mesh, weld.joined(rest), asked), str(prim.GetPath()), []
+    if count := int(found.rigid.max(initial=-1)) + 1:
+        message = f"{counted(count, 'piece')} of it moved rigidly with the cloth under, as buttons are"
+        notices.append(Notice(path, None, message))
+    if found.closed.any():
+        message = "a closed shell: both skins are refined, and its sharp edges stay sharp; a sheet makes better folds"
+        notices.append(Notice(path, None, message))
+    if found.joined:
+        message = f"{RIGID} is for pieces that share no vertices with cloth; paint bendScale to stiffen the others"
+        notices.append(Notice(path, None, message))
+    return found.closed if found.closed.any() else None, found.rigid if count else None, notices
+
+
 def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
     """Faces of the cage in each of the mesh's subsets of faces, by name."""
     subsets = {}
@@ -218,18 +251,39 @@ def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:
     return tuple(word.lower() for each in prims for word in _WORD.findall(each.GetName()))
 
 
-def _rest(prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray) -> Rest:
+def _rest_and_weld(
+    prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray
+) -> tuple[Rest, Weld]:
+    """Rest shape as authored or fitted, and the weld of the borders that stay together there and over the shot."""
+    found = unwelded(mesh)
+    poses, within = [*animation.poses(1).values()] or [animation.first], 0.0
+    if len(open_edges(mesh)):
+        within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
+        found = weld(mesh, poses, within)
+    if not found.is_none:
+        poses = [*animation.poses().values()]
+        found = weld(mesh, poses, within)
+    rest = _rest(prim, found, animation, request, matrix=matrix)
+    return rest, found if found.is_none else weld(mesh, [*poses, rest.points], within)
+
+
+def seam_tolerance(prim: Usd.Prim, overrides: Sequence[Override]) -> float:
+    """Distance within which a garment's open borders are sewn [m]."""
+    return float(find_value(prim, GARMENT["seam:tolerance"], overrides).at(None) or 0.0)
+
+
+def _rest(prim: Usd.Prim, weld: Weld, animation: Animation, request: Request, *, matrix: np.ndarray) -> Rest:
     """Rest shape; authored points of a skinned mesh are placed by its bind transform in place of the mesh's matrix."""
     bound, first = matrix, animation.times[0] if animation.times else None
     if prim.GetPath() in request.bake.skinned:
         rows = request.bake.rest_transform(prim.GetPath(), first)
         bound = check_matrix(prim, rows, request.units.metres, time=first)
     placed = partial(place, matrix=bound)
-    return read_rest(prim, mesh, request.rest_frame, animation, place=placed, baked=request.bake.layer)
+    return read_rest(prim, weld, request.rest_frame, animation, place=placed, baked=request.bake.layer)
 
 
 def _painted(
-    prim: Usd.Prim, count: int, notices: list[Notice], *, values: Values
+    prim: Usd.Prim, weld: Weld, notices: list[Notice], *, values: Values
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The painted arrays of a garment by field name, times the relative thickness, and the grain's by schema name.
 
@@ -240,11 +294,12 @@ def _painted(
     cut = ("easeScale", "gather", "grain")
     arrays = {}
     for name, short in (names | dict(zip(cut, cut, strict=True))).items():
-        arrays[name], odd = read_painted(prim, short, count)
+        arrays[name], odd = read_painted(prim, short, weld.apart.vertex_count)
         notices.extend(odd)
     arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
     arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
-    return {name: arrays[name] for name in names}, {name: arrays[name] for name in cut}
+    joined = {name: weld.largest(arrays[name]) if name == "pin" else weld.joined(arrays[name]) for name in names}
+    return joined, {name: arrays[name] for name in cut}
 
 
 def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:

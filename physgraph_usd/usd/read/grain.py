@@ -26,7 +26,7 @@ _FLAT = 1e-12
 
 def read_grain(
     prim: Usd.Prim,
-    mesh: PolygonMesh,
+    weld: Weld,
     rest: np.ndarray,
     *,
     kept: np.ndarray,
@@ -37,12 +37,13 @@ def read_grain(
 
     Args:
         prim: Mesh prim.
-        mesh: Its kept faces.
-        rest: Rest positions [m], shape (V, 3).
+        weld: Its kept faces, as authored and welded.
+        rest: Rest positions as authored [m], shape (V, 3).
         kept: Numbers of these among the authored faces, shape (F,).
         up: The stage's upward direction, shape (3,).
         painted: Values of ``easeScale``, ``gather`` [%] and ``grain`` [degrees] at each point, each of shape (V,).
     """
+    mesh = weld.apart
     coordinates = _texture_coordinates(prim, mesh, kept)
     found = None if coordinates is None else _along_v(mesh, rest, coordinates[1])
     source = "the rest shape, downwards"
@@ -54,7 +55,7 @@ def read_grain(
     warp = np.cos(turn)[:, None] * warp + np.sin(turn)[:, None] * np.cross(normal, warp)
     if turn.any():
         source += ", turned by primvars:physgraph:grain"
-    return Grain(warp, painted["easeScale"], painted["gather"] / 100.0), source
+    return Grain(warp, weld.joined(painted["easeScale"]), weld.joined(painted["gather"] / 100.0)), source
 
 
 def face_normals(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 
@@ -23,6 +24,7 @@ from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...interrupts import leave_if_asked
 from ...solver.colliders.choose_side import choose_side
 from ...solver.colliders.pose import MeshPose
+from ...solver.mesh.weld import seam_reach
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
 from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
@@ -55,10 +57,11 @@ from .find import (
     read_apart,
     with_gravity,
 )
-from .garment import GarmentReader, Request, is_visible, read_garment, samples_of
+from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance
 from .materials import find_values
 from .placement import to_metres
 from .rest import AUTO
+from .seams import sewn_garments
 from .skinning import Bake
 from .timing import timing_notices
 
@@ -124,7 +127,8 @@ class Shot:
         Raises:
             GarmentError: They are broken.
         """
-        return self._readers[index].points.read(time, self._readers[index].edges)[0]
+        reader = self._readers[index]
+        return reader.weld.joined(reader.points.read(time, reader.edges)[0])
 
     def times_until(self, last: float) -> list[float]:
         """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
@@ -256,6 +260,7 @@ def open_shot(
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
+        readers = _sewn(stage, readers, request, notices)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
         notices += _timing(stage, readers, solids, bake=bake)
@@ -328,6 +333,39 @@ def _link(
     return linked, bodies
 
 
+def _sewn(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], request: Request, notices: list[Notice]
+) -> list[GarmentReader]:
+    """Garments with their seams; adds notices of borders that run side by side and are not sewn."""
+    prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
+    every = _every_time(readers)
+
+    def poses(most: int) -> Iterator[list[np.ndarray | None]]:
+        picks = np.linspace(0, len(every) - 1, min(most, len(every))).round().astype(int)
+        for time in [every[pick] for pick in picks] or [None]:
+            with suppress(StageError):
+                pairs = zip(readers, prims, strict=True)
+                cages = [reader.frame(prim, request.units.metres, time)[0].points for reader, prim in pairs]
+                yield [points if np.ptp(points, axis=0).any() else None for points in cages]
+
+    tolerances = [seam_tolerance(prim, request.overrides) for prim in prims]
+    first = next(poses(1), [])
+    reaches = [
+        0.0 if points is None else seam_reach(reader.garment.mesh, points, tolerance)
+        for reader, points, tolerance in zip(readers, first, tolerances, strict=False)
+    ]
+    if not first:
+        return [*readers]
+    garments, odd = sewn_garments([reader.garment for reader in readers], reaches, poses)
+    notices += odd
+    return [replace(reader, garment=garment) for reader, garment in zip(readers, garments, strict=True)]
+
+
+def _every_time(readers: Sequence[GarmentReader]) -> tuple[float, ...]:
+    """Time codes at which any garment has a sample, outside the range of frames too."""
+    return merge(time for reader in readers for time in (*reader.source.times, *reader.source.left_out))
+
+
 def _with_sides(
     stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader]
 ) -> list[ColliderReader]:
@@ -349,8 +387,7 @@ def _first_cages(
     stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float
 ) -> tuple[float | None, list[np.ndarray]]:
     """The first time code of the shot at which all cages can be read, and these [m]; none where there is none."""
-    every = merge(time for reader in readers for time in (*reader.source.times, *reader.source.left_out))
-    for time in every or (None,):
+    for time in _every_time(readers) or (None,):
         try:
             prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
             pairs = zip(readers, prims, strict=True)

@@ -19,6 +19,7 @@ from scipy.sparse.linalg import splu
 
 from ...errors import GarmentError
 from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
 from ..lookup import nearest, source_name
@@ -77,10 +78,22 @@ class Animation:
     first: np.ndarray
     read: Callable[[float | None], tuple[np.ndarray, tuple[Notice, ...]]]
 
+    def poses(self, most: int = MOST_FITTED) -> dict[float | None, np.ndarray]:
+        """Positions at time codes spread over the shot, by time code, without frames that cannot be read.
+
+        At most so many; of a shot whose frames are all broken, the first pose that is refined.
+        """
+        poses = dict[float | None, np.ndarray]()
+        picks = np.linspace(0, len(self.times) - 1, min(most, len(self.times))).round().astype(int)
+        for time in [self.times[pick] for pick in picks] or [None]:
+            with contextlib.suppress(GarmentError):  # Refining a broken frame names its fault.
+                poses[time] = self.read(time)[0]
+        return poses
+
 
 def read_rest(
     prim: Usd.Prim,
-    mesh: PolygonMesh,
+    weld: Weld,
     asked: float | str | None,
     animation: Animation,
     *,
@@ -91,7 +104,7 @@ def read_rest(
 
     Args:
         prim: Mesh prim.
-        mesh: Faces of the cage.
+        weld: Faces of the cage, as authored and welded.
         asked: Time code whose points are the rest shape, `AUTO`, or None.
         animation: Points over the shot.
         place: From local rest points to metres, (V, 3) to (V, 3).
@@ -100,18 +113,18 @@ def read_rest(
     Raises:
         GarmentError: When an authored rest shape does not fit the mesh, or the rest shape cannot be used.
     """
-    edges, first, odd = mesh.half_edges.edges, animation.first, list[Notice]()
+    edges, first, odd = weld.apart.half_edges.edges, animation.first, list[Notice]()
     if asked == AUTO:
-        rest = _fitted(mesh, animation, by=" (--rest)")
+        rest = _fitted(weld, animation, by=" (--rest)")
     elif asked is not None:
         points, notices = animation.read(float(asked))
         rest = Rest(points, f"points at time code {float(asked):g} (--rest)", notices)
     elif (authored := _authored(prim, len(first), odd)) is not None:
         rest = Rest(place(authored[0]), authored[1])
     elif (default := _default_points(prim, baked)) is None:
-        rest = _fitted(mesh, animation)
+        rest = _fitted(weld, animation)
     elif len(default) != len(first):
-        rest = _fitted(mesh, animation)
+        rest = _fitted(weld, animation)
         message = f"the default points are {len(default)}, the mesh has {len(first)}; the rest shape is {rest.source}"
         rest = replace(rest, notices=(Notice(str(prim.GetPath()), None, message),))
     else:
@@ -133,19 +146,15 @@ def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, firs
     return Rest(repair(points, edges, first), "default points", (Notice(str(prim.GetPath()), None, message),))
 
 
-def _fitted(mesh: PolygonMesh, animation: Animation, *, by: str = "") -> Rest:
+def _fitted(weld: Weld, animation: Animation, *, by: str = "") -> Rest:
     """Rest shape fitted to the median lengths of the edges over the whole shot; ``by`` ends its source."""
-    every, poses = animation.times, dict[float | None, np.ndarray]()
-    picks = np.linspace(0, len(every) - 1, min(MOST_FITTED, len(every))).round().astype(int)
-    for time in [every[pick] for pick in picks] or [None]:
-        with contextlib.suppress(GarmentError):  # Refining a broken frame names its fault.
-            poses[time] = animation.read(time)[0]
-    found = list(poses.values())
+    poses = animation.poses()
+    found = [weld.joined(pose) for pose in poses.values()]
     if len(found) < 2:
-        return Rest(found[0] if found else animation.first, f"the only sample of points{by}")
-    shape, nearest = median_shape(_braced(mesh), found)
+        return Rest(weld.split(found[0]) if found else animation.first, f"the only sample of points{by}")
+    shape, nearest = median_shape(_braced(weld.mesh), found)
     message = f"median edge lengths of {len(poses)} time codes, from the points at {[*poses][nearest]:g}"
-    return Rest(shape, f"{FITTED}: {message}{by}")
+    return Rest(weld.split(shape), f"{FITTED}: {message}{by}")
 
 
 def _checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray) -> Rest:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Int
 from scipy import sparse
 
 from ...solver.mesh.topology import PolygonMesh
@@ -23,16 +24,25 @@ class VertexNormals:
         vertex_count: V.
     """
 
-    def __init__(self, mesh: PolygonMesh, *, left_handed: bool = False) -> None:
-        """Prepare the stencils; left-handed faces run clockwise seen from outside."""
-        self.vertex_count = mesh.vertex_count
+    def __init__(
+        self, mesh: PolygonMesh, *, left_handed: bool = False, welded: Int[np.ndarray, " vertices"] | None = None
+    ) -> None:
+        """Prepare the stencils.
+
+        Args:
+            mesh: The mesh.
+            left_handed: Whether faces run clockwise seen from outside.
+            welded: A number for each vertex; vertices of one number have one normal. None if no vertices are welded.
+        """
+        self.vertex_count, self._welded = mesh.vertex_count, welded
         counts = np.asarray(mesh.counts, np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
         self._diagonals, self._face = _vector_area_corners(counts, starts, np.asarray(mesh.indices))
         corner_face = np.repeat(np.arange(len(counts)), counts)
+        owner = np.asarray(mesh.indices) if welded is None else welded[mesh.indices]
         shape = (mesh.vertex_count, len(counts))
         ones = np.ones(len(mesh.indices), np.float32)
-        self._faces_of = sparse.csr_matrix((ones, (np.asarray(mesh.indices), corner_face)), shape=shape)
+        self._faces_of = sparse.csr_matrix((ones, (owner, corner_face)), shape=shape)
         self._sign = np.float32(-1.0 if left_handed else 1.0)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
@@ -45,6 +55,7 @@ class VertexNormals:
         if self._face is not None:
             areas = self._face @ areas
         normals = self._faces_of @ areas
+        normals = normals if self._welded is None else normals[self._welded]
         lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))
         # Below this a direction is rounding noise.
         tiny = max(1e-12 * float(lengths.max(initial=0.0)), float(np.finfo(np.float32).tiny))
@@ -57,7 +68,8 @@ class VertexNormals:
     def _from_neighbours(self, normals: np.ndarray, lengths: np.ndarray, bad: np.ndarray) -> np.ndarray:
         """Unit normals for vertices without area, from the good vertices of their faces."""
         unit = np.where(bad[:, None], 0.0, normals / np.where(bad, 1.0, lengths)[:, None])
-        spread = self._faces_of[bad] @ (self._faces_of.T @ unit)
+        owner = np.flatnonzero(bad) if self._welded is None else self._welded[bad]
+        spread = self._faces_of[owner] @ (self._faces_of.T @ unit)
         size = np.linalg.norm(spread, axis=1, keepdims=True)
         return np.where(size > 1e-6, spread / np.maximum(size, 1e-30), self._sign * _FALLBACK)
 

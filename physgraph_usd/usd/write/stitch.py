@@ -15,6 +15,7 @@ from pxr import Sdf, Usd, UsdUtils, Vt
 from ...errors import LayerError
 from ...interrupts import leave_if_asked
 from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.weld import weld
 from ..check.validate import check_layer
 from ..files import LAYER_SUFFIXES, check_suffix
 from ..provenance import (
@@ -212,8 +213,10 @@ def _normals(layer: Sdf.Layer, path: str) -> VertexNormals:
     time = samples_and_blocks(layer, f"{path}.normals")[0][0]
     points, there = (np.asarray(layer.QueryTimeSample(f"{path}.{name}", time)) for name in ("points", "normals"))
     mesh = PolygonMesh(*topology_of(layer, path), len(points))
-    found = VertexNormals(mesh)
-    return found if float((found(points) * there).sum()) >= 0 else VertexNormals(mesh, left_handed=True)
+    welded = weld(mesh, [points], 0.0).number
+    found = VertexNormals(mesh, welded=welded)
+    agrees = float((found(points) * there).sum()) >= 0
+    return found if agrees else VertexNormals(mesh, left_handed=True, welded=welded)
 
 
 def write_clips(

@@ -95,7 +95,7 @@ class PointTrack:
             own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None where it has none.
             absent: Time codes to block, ascending: the garment is not there.
         """
-        self._stream, self._normals, self._count = stream, normals, normals.vertex_count
+        self._stream, self._normals = stream, normals
         self._paths = {name: target.AppendProperty(name) for name in TYPES}
         stream.attribute(self._paths["points"], TYPES["points"])
         stream.attribute(self._paths["normals"], TYPES["normals"], interpolation=UsdGeom.Tokens.vertex)
@@ -110,12 +110,6 @@ class PointTrack:
         self._run_end: float | None = None
         self._queue: list[_Sample] = []
         self.box = np.zeros((2, 3), np.float32)
-
-    def check(self, points: np.ndarray, time: float | None) -> None:
-        """Refuse points that are not of the fine mesh's shape."""
-        if points.shape != (self._count, 3):
-            place = f"<{self._paths['points'].GetPrimPath()}>" + at_time(time)
-            raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {self._count} vertices")
 
     def write(
         self,

@@ -24,7 +24,7 @@ from ..check.validate import check_layer
 from ..files import check_targets, files_of
 from ..read.absence import named_times
 from ..read.reader import Shot
-from ..stage import Notice, first_value, pxr_errors, value_at
+from ..stage import Notice, at_time, first_value, pxr_errors, value_at
 from ..times import within
 from . import overs
 from .chunk import CHUNK, Chunk
@@ -246,7 +246,8 @@ class _RefinedMesh:
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
         counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()))
-        fine = FineMap(shot.scene.garments[index].mesh, steps, counts, source.kept_faces)
+        steps, self._weld = source.weld.subdivided(len(steps))
+        fine = FineMap(source.weld.apart, steps, counts, source.kept_faces)
         self.notices = overs.open_instances(stream, source)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
         overs.author_topology(stream, target, prim, fine)
@@ -256,12 +257,12 @@ class _RefinedMesh:
         self.notices += overs.author_rest_points(stream, target, prim, fine)
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         rest = None if source.skinned or not source.times else _refined_default(prim, fine)
-        normals = VertexNormals(fine.fine, left_handed=left)
+        normals = VertexNormals(fine.fine, left_handed=left, welded=self._weld.number)
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
         moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}
         self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, **moves)
-        self._heat = HeatTrack(stream, target, normals.vertex_count, still=not source.times)
+        self._heat = HeatTrack(stream, target, self._weld.mesh.vertex_count, still=not source.times)
         purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
         self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
         self._shot, self._index = shot, index
@@ -270,20 +271,23 @@ class _RefinedMesh:
         self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool, cut: bool
     ) -> None:
         """Write one time code, as `LayerWriter.write` takes it."""
+        points = self._weld.split(points)
         self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed, cut=cut)
         self._hints.write(time, self._track.box)
-        self._heat.write(time, heat)
+        self._heat.write(time, {name: self._weld.split(values) for name, values in heat.items()})
 
     def before(self, time: float, points: np.ndarray) -> np.ndarray:
         """Local points of a frame of the pre-roll, float32; the hints hold them, since `stitch` shows part of it."""
-        local = to_local(points, self._shot.to_metres(self._index, time), str(self.target), time)
+        local = to_local(self._weld.split(points), self._shot.to_metres(self._index, time), str(self.target), time)
         self._hints.write(time, extent_of(local))
         return local
 
     def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
         """Refuse points and heat maps that do not fit."""
-        if points is not None:
-            self._track.check(points, time)
+        count = self._weld.mesh.vertex_count
+        if points is not None and points.shape != (count, 3):
+            place = f"<{self.target}>" + at_time(time)
+            raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {count} vertices")
         self._heat.check(heat, time)
 
     def finish(self, *, hold: bool) -> None:

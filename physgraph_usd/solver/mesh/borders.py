@@ -1,0 +1,113 @@
+"""Open borders of meshes: their edges, and which border edge is nearest to a border vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from .topology import PolygonMesh
+
+SPACING = 0.25
+"""Distance of the points that stand for an edge in the search, in median border edges."""
+MOST_SAMPLES = 64
+"""Most such points of one edge."""
+NEAREST = 16
+"""Points looked at for each vertex: the edges that meet in it have some, those of another border the rest."""
+
+
+def open_edges(mesh: PolygonMesh) -> Int[np.ndarray, "edges 2"]:
+    """End vertices of the edges with one face."""
+    half = mesh.half_edges
+    return half.edges[(half.count == 1) & (half.edges[:, 0] != half.edges[:, 1])].astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class OnEdge:
+    """Vertices and the point of an edge that is nearest to each.
+
+    Attributes:
+        vertex: Numbers of the vertices, shape (N,).
+        edge: End vertices of the edge of each, shape (N, 2).
+        part: Where on the edge the nearest point lies, from 0 to 1, shape (N,).
+        distance: Distance to that point [m], shape (N,).
+    """
+
+    vertex: Int[np.ndarray, " near"]
+    edge: Int[np.ndarray, "near 2"]
+    part: Float[np.ndarray, " near"]
+    distance: Float[np.ndarray, " near"]
+
+    def where(self, kept: np.ndarray) -> OnEdge:
+        """Some of them."""
+        return OnEdge(self.vertex[kept], self.edge[kept], self.part[kept], self.distance[kept])
+
+    def at(self, points: Float[np.ndarray, "vertices 3"]) -> OnEdge:
+        """The same vertices and edges in another pose."""
+        return _on_edges(points, self.vertex, self.edge)
+
+    def place(self, points: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "near 3"]:
+        """The nearest points, in a pose."""
+        start, end = points[self.edge[:, 0]], points[self.edge[:, 1]]
+        return start + self.part[:, None] * (end - start)
+
+
+def nearest_edges(
+    points: Float[np.ndarray, "vertices 3"],
+    vertices: Int[np.ndarray, " some"],
+    edges: Int[np.ndarray, "edges 2"],
+    within: Float[np.ndarray, " some"],
+) -> OnEdge:
+    """The nearest edge of each vertex that does not end in it and has no neighbour of it at an end.
+
+    Args:
+        points: Positions [m].
+        vertices: Vertices that look for an edge.
+        edges: Open edges of all borders.
+        within: Distance within which each vertex looks [m].
+    """
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) if len(edges) else np.zeros(0)
+    spacing = SPACING * float(np.median(length)) if len(edges) else 0.0
+    if not len(vertices) or spacing == 0.0:
+        none = np.zeros(0)
+        return OnEdge(none.astype(np.int64), np.zeros((0, 2), np.int64), none, none)
+    count = np.clip(np.ceil(length / spacing), 1, MOST_SAMPLES).astype(np.int64)
+    owner = np.repeat(np.arange(len(edges)), count)
+    part = (np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[owner]
+    start, end = points[edges[owner, 0]], points[edges[owner, 1]]
+    reach = within.max() + 0.5 * float((length / count).max())
+    tree = cKDTree(start + part[:, None] * (end - start))
+    found = tree.query(points[vertices], k=min(NEAREST, len(owner)), distance_upper_bound=reach)[1]
+    found = found.reshape(len(vertices), -1)
+    row, column = np.nonzero(found < len(owner))
+    vertex, edge = vertices[row], edges[owner[found[row, column]]]
+    beside = _neighbours(edges, vertex, edge)
+    near = _on_edges(points, vertex[~beside], edge[~beside])
+    order = np.lexsort((near.distance, near.vertex))
+    near = near.where(order)
+    near = near.where(np.unique(near.vertex, return_index=True)[1])
+    limit = np.zeros(len(points))
+    limit[vertices] = within
+    return near.where(near.distance <= limit[near.vertex])
+
+
+def _neighbours(edges: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """Whether an edge ends in a vertex or in one that an open edge joins to it, shape (N,)."""
+    size = int(max(edges.max(), vertex.max(initial=0))) + 1
+    known = np.sort(np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]]))
+    beside = (edge == vertex[:, None]).any(axis=1)
+    for end in edge.T:
+        wanted = vertex * size + end
+        beside |= known[np.minimum(np.searchsorted(known, wanted), len(known) - 1)] == wanted
+    return beside
+
+
+def _on_edges(points: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> OnEdge:
+    """The nearest point of a given edge to each vertex."""
+    start, way = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
+    squared = np.maximum((way**2).sum(axis=1), np.finfo(float).tiny)
+    part = np.clip(((points[vertex] - start) * way).sum(axis=1) / squared, 0.0, 1.0)
+    distance = np.linalg.norm(points[vertex] - start - part[:, None] * way, axis=1)
+    return OnEdge(vertex, edge, part, distance)

@@ -1,0 +1,47 @@
+"""Sharp edges of closed pieces, such as the rim of a thick garment: smooth subdivision and rest angles keep them."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .topology import PolygonMesh, find_edges
+
+SHARP = 45.0
+"""Angle between the normals of two faces at rest from which their edge is sharp [degrees]."""
+
+
+def creases_of(
+    mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], closed: Bool[np.ndarray, " vertices"] | None
+) -> Int[np.ndarray, "creases 2"]:
+    """End vertices of the sharp edges of closed pieces, in the order of the mesh's edges.
+
+    Args:
+        mesh: The cage.
+        rest: Rest positions [m].
+        closed: Whether each vertex belongs to a closed piece; None without such pieces.
+    """
+    if closed is None or not closed.any():
+        return np.zeros((0, 2), np.int32)
+    half = mesh.half_edges
+    normal = np.zeros((mesh.face_count, 3))
+    np.add.at(normal, mesh.corner_face, np.cross(rest[mesh.indices], rest[mesh.indices[mesh.next_corner]]))
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    order = np.argsort(half.edge, kind="stable")
+    starts = np.cumsum(half.count) - half.count
+    double = np.flatnonzero((half.count == 2) & closed[half.edges[:, 0]])
+    one, two = order[starts[double]], order[starts[double] + 1]
+    same = np.where(half.forward[one] != half.forward[two], 1.0, -1.0)  # Faces that are wound against one another.
+    cosine = same * (normal[mesh.corner_face[one]] * normal[mesh.corner_face[two]]).sum(axis=1)
+    return half.edges[double[cosine < np.cos(np.radians(SHARP))]]
+
+
+def halves_of(edges: Int[np.ndarray, "edges 2"], middle: Int[np.ndarray, " edges"]) -> Int[np.ndarray, "halves 2"]:
+    """Edges of the next subdivision along edges with given middle vertices, lower vertex first, in order."""
+    halves = np.concatenate([np.stack([edges[:, side], middle], axis=1) for side in (0, 1)])
+    return halves[np.lexsort((halves[:, 1], halves[:, 0]))].astype(np.int32)
+
+
+def on_edges(mesh: PolygonMesh, creases: Int[np.ndarray, "creases 2"]) -> Bool[np.ndarray, " edges"] | None:
+    """Whether each edge of a mesh is one of the creases; None without creases."""
+    return find_edges(creases, mesh.half_edges.edges) >= 0 if len(creases) else None

@@ -1,0 +1,72 @@
+"""Pieces of a garment's mesh that are no sheet: closed shells, and small parts such as buttons, which are rigid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .topology import PolygonMesh, joined_by
+
+SMALL = 0.25
+"""Size of a closed piece under which it is a rigid part, in sizes of the largest piece."""
+LIGHT = 0.01
+"""Area under which a piece is a rigid part, in areas of the largest piece: either bound alone takes in pockets."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Vertices of the pieces that are no sheet.
+
+    Attributes:
+        closed: Whether each vertex belongs to a closed piece that is not rigid, shape (V,).
+        rigid: Number of the rigid part of each vertex, -1 for cloth, shape (V,).
+        joined: Whether faces asked to be rigid share vertices with cloth; these faces stay cloth.
+    """
+
+    closed: Bool[np.ndarray, " vertices"]
+    rigid: Int[np.ndarray, " vertices"]
+    joined: bool
+
+
+def pieces_of(mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], asked: Bool[np.ndarray, " faces"]) -> Pieces:
+    """Find the pieces.
+
+    A piece is rigid if it is closed and small beside the largest piece, if it is smaller than an edge of that, or if
+    all of its faces are asked for.
+
+    Args:
+        mesh: The mesh, welded.
+        rest: Rest positions [m].
+        asked: Faces that are to be rigid.
+    """
+    ends = mesh.half_edges.edges
+    piece = joined_by(ends, mesh.vertex_count)
+    of_face = piece[mesh.indices[mesh.starts[:-1]]]
+    count = int(piece.max(initial=-1)) + 1
+    area = np.bincount(of_face, _areas(mesh, rest), count)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, piece, rest)
+    np.maximum.at(high, piece, rest)
+    size = np.linalg.norm(high - low, axis=1)
+    open_side = np.bincount(piece[ends[mesh.half_edges.count == 1, 0]], minlength=count) > 0
+    faces = np.bincount(of_face, minlength=count)
+    closed = ~open_side & (faces > 1)
+    largest = int(area.argmax())
+    length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
+    edge = float(length[piece[ends[:, 0]] == largest].mean())
+    light = (area < LIGHT * area[largest]) & (faces > 0)
+    rigid = light & ((closed & (size < SMALL * size[largest])) | (size < edge))
+    wanted = np.bincount(of_face, asked, count)
+    rigid |= (wanted == faces) & (faces > 0)
+    number = np.where(rigid, np.cumsum(rigid) - 1, -1)
+    return Pieces((closed & ~rigid)[piece], number[piece], bool(((wanted > 0) & (wanted < faces)).any()))
+
+
+def _areas(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
+    """Area of each face [m^2], shape (F,)."""
+    here, after = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
+    sums = np.zeros((mesh.face_count, 3))
+    np.add.at(sums, mesh.corner_face, np.cross(here, after))
+    return 0.5 * np.linalg.norm(sums, axis=1)

@@ -1,0 +1,143 @@
+"""Seams of a shot that welding does not close, and borders that run side by side and are not sewn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ...solver.mesh.borders import OnEdge, nearest_edges, open_edges
+from ...solver.mesh.topology import joined_by
+from ...solver.mesh.weld import pairs_within
+from ...solver.scene import Garment
+from ...solver.seams import finer_side
+from ..stage import Notice
+
+POSES = 10
+"""Frames, spread over the shot, in all of which sewn points must be together."""
+BESIDE = 0.1
+"""Distance under which two borders run side by side, in the edges at a vertex."""
+LONG = 4
+"""Edges along which they must, to be told of."""
+Cages = Sequence[np.ndarray | None]
+"""World positions of each garment [m] in one frame, None where it is not there."""
+
+
+def sewn_garments(
+    garments: Sequence[Garment], reaches: Sequence[float], poses: Callable[[int], Iterator[Cages]]
+) -> tuple[list[Garment], list[Notice]]:
+    """Garments with the places at which their vertices are sewn, and notices of borders side by side.
+
+    Vertices of any garments are sewn if they are together in every pose, those of one garment only if they are in its
+    rest shape, too.
+
+    Args:
+        garments: The garments, welded.
+        reaches: Distance within which each garment's borders are sewn [m].
+        poses: Cages in at most so many frames of the shot.
+    """
+    first = next(poses(1), None)
+    if first is None:
+        return [*garments], []
+    cloth = _Cloth(garments, reaches)
+    points = cloth.together(first)
+    pairs, between, beside = cloth.look(points)
+    if not len(pairs) and not len(between.vertex) and not len(beside.vertex):
+        return [*garments], []
+    for cages in poses(POSES):
+        at = cloth.together(cages)
+        apart = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1) > cloth.reach(*pairs.T)
+        pairs = pairs[~apart]
+        between = between.where(~(between.at(at).distance > cloth.reach(between.vertex, between.edge[:, 0])))
+        away = beside.at(at).distance > BESIDE * cloth.edge_at(at, beside.vertex)
+        beside = beside.where(~away)
+    return cloth.sewn(points, pairs, between), cloth.notices(points, beside)
+
+
+class _Cloth:
+    """All garments of a shot side by side; vertices are numbered through."""
+
+    def __init__(self, garments: Sequence[Garment], reaches: Sequence[float]) -> None:
+        self._garments = garments
+        self._starts = np.cumsum([0, *(len(garment.rest) for garment in garments)])
+        self._owner = np.repeat(np.arange(len(garments)), np.diff(self._starts))
+        self._reach = np.asarray(reaches)[self._owner]
+        self._rest = np.concatenate([garment.rest for garment in garments])
+        edges = [open_edges(garment.mesh) + start for garment, start in zip(garments, self._starts, strict=False)]
+        self._borders = np.concatenate(edges)
+        used = [np.unique(garment.mesh.indices) + start for garment, start in zip(garments, self._starts, strict=False)]
+        self._used = np.concatenate(used)
+
+    def together(self, cages: Cages) -> np.ndarray:
+        """World positions of all vertices [m], NaN where a garment is not there."""
+        none = [np.full((len(garment.rest), 3), np.nan) for garment in self._garments]
+        return np.concatenate([blank if each is None else each for each, blank in zip(cages, none, strict=True)])
+
+    def reach(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Distance within which pairs of vertices are sewn [m]."""
+        return np.maximum(self._reach[first], self._reach[second])
+
+    def edge_at(self, points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """Length of the shortest border edge at each vertex [m]."""
+        length = np.linalg.norm(points[self._borders[:, 0]] - points[self._borders[:, 1]], axis=1)
+        shortest = np.full(len(points), np.inf)
+        np.minimum.at(shortest, self._borders, length[:, None])
+        return shortest[vertices]
+
+    def look(self, points: np.ndarray) -> tuple[np.ndarray, OnEdge, OnEdge]:
+        """Pairs of vertices at one place, vertices on another border's edge, and vertices beside another border."""
+        pairs = pairs_within([points], self._used, float(self._reach.max(initial=0.0)))
+        together = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
+        pairs = pairs[together & self._rest_together(pairs)]
+        there = np.isfinite(points).all(axis=1)
+        borders = self._borders[there[self._borders].all(axis=1)]
+        alone = np.setdiff1d(borders, pairs)
+        near = nearest_edges(points, alone, borders, BESIDE * self.edge_at(points, alone))
+        on = near.distance <= self.reach(near.vertex, near.edge[:, 0])
+        return pairs, near.where(on & self._rest_on(near)), near.where(~on)
+
+    def _rest_together(self, pairs: np.ndarray) -> np.ndarray:
+        apart = self._owner[pairs[:, 0]] != self._owner[pairs[:, 1]]
+        return apart | (np.linalg.norm(self._rest[pairs[:, 0]] - self._rest[pairs[:, 1]], axis=1) <= self.reach(*pairs.T))
+
+    def _rest_on(self, near: OnEdge) -> np.ndarray:
+        apart = self._owner[near.vertex] != self._owner[near.edge[:, 0]]
+        return apart | (near.at(self._rest).distance <= self.reach(near.vertex, near.edge[:, 0]))
+
+    def sewn(self, points: np.ndarray, pairs: np.ndarray, between: OnEdge) -> list[Garment]:
+        """Garments with the places of their sewn vertices, seams closed: the mean of a pair, or a point on an edge."""
+        between = finer_side(points, self._borders, between)
+        group = joined_by(pairs, len(points)) if len(pairs) else np.arange(len(points))
+        sums, count = np.zeros((group.max(initial=-1) + 1, 3)), np.bincount(group)
+        np.add.at(sums, group, points)
+        closed = (sums / count[:, None])[group]
+        out = np.full_like(points, np.nan)
+        for used in (pairs.ravel(), between.edge.ravel()):
+            out[used] = closed[used]
+        out[between.vertex] = between.place(closed)
+        spans = [out[a:b] for a, b in zip(self._starts[:-1], self._starts[1:], strict=True)]
+        pieces = zip(self._garments, spans, strict=True)
+        return [replace(each, sewn_at=at) if np.isfinite(at).any() else each for each, at in pieces]
+
+    def notices(self, points: np.ndarray, beside: OnEdge) -> list[Notice]:
+        """A notice of each garment with a border that runs along one without being sewn to it."""
+        found = []
+        known = np.zeros(len(points), bool)
+        known[beside.vertex] = True
+        distance = np.zeros(len(points))
+        distance[beside.vertex] = beside.distance
+        other = np.full(len(points), -1)
+        other[beside.vertex] = self._owner[beside.edge[:, 0]]
+        along = self._borders[known[self._borders].all(axis=1)]
+        for garment, index in zip(self._garments, range(len(self._garments)), strict=True):
+            own = along[self._owner[along[:, 0]] == index]
+            if len(own) < LONG:
+                continue
+            length = float(np.linalg.norm(points[own[:, 0]] - points[own[:, 1]], axis=1).sum())
+            gap = float(distance[own].max())
+            others = {self._garments[each].path for each in other[own].ravel().tolist()} - {garment.path}
+            whose = "one another" if not others else " and ".join(f"<{path}>" for path in sorted(others))
+            message = f"borders run along {whose} for {length:.3g} m, at most {1e3 * gap:.2g} mm apart, and are not sewn"
+            found.append(Notice(garment.path, None, f"{message}; sew them with --set seam:tolerance={1.5 * gap:.2g}"))
+        return found
