@@ -12,6 +12,7 @@ import torch
 import trimesh
 from click.testing import CliRunner
 from cloth import frame_of, settings_of, sheet, wave
+from folds import sewn
 from pxr import Usd
 from sheets import garment_of
 
@@ -135,8 +136,8 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     assert not any(crossing.any() for answer in answers for crossing in answer.crossing)
     assert np.abs(answers[1].points[0] - answers[0].points[0]).max() < 1e-3 * 0.05
     assert np.array_equal(answers[1].points[0], answers[2].points[0])
-    sewn = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points, axis=2) < 1e-9, 1))
-    assert np.array_equal(answers[1].points[0][sewn[:, 0]], answers[1].points[0][sewn[:, 1]])
+    pairs = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points, axis=2) < 1e-9, 1))
+    assert np.array_equal(answers[1].points[0][pairs[:, 0]], answers[1].points[0][pairs[:, 1]])
 
 
 def test_what_a_bodys_normals_tell_is_the_same_asked_together(monkeypatch: pytest.MonkeyPatch) -> None:

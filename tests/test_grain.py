@@ -18,6 +18,7 @@ from physgraph_usd.solver.forces.membrane import in_plane_terms, shear_stiffness
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
+from physgraph_usd.solver.mesh.weld import unwelded
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Grain, Scene
 from physgraph_usd.usd.read.grain import read_grain
 from physgraph_usd.usd.schema import fabric_values

@@ -174,7 +174,12 @@ def test_a_cut_sheet_in_tension_is_the_whole_one(count: int):
         x = cloth[1][:, 0]
         pin = ((x < 0.01) | (x > x.max() - 0.01)) * 1.0
         solver = refiner_with(
-            sewn([named(cloth, pin=pin)], cloth[1]), level=1, gravity=np.zeros(3), dtype=torch.float64, steps=400, tolerance=1e-8
+            sewn([named(cloth, pin=pin)], cloth[1]),
+            level=1,
+            gravity=np.zeros(3),
+            dtype=torch.float64,
+            steps=400,
+            tolerance=1e-8,
         )
         frame = frame_with([stretched(cloth[1])], fabric=SOFT, guide=0.0)
         answers.append((solver.solve(frame).points[0], base_of(cloth[0], cloth[1], 1)))

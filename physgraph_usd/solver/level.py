@@ -16,13 +16,13 @@ from torch import Tensor
 
 from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
-from .mesh.defects import FLAT
 from .mesh.creases import creases_of, halves_of, on_edges
+from .mesh.defects import FLAT
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
 from .mesh.lengths import ANGLES, LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, on_triangles, smooth, subdivide_times
-from .mesh.topology import TriangleSplit, edges_of, find_edges
+from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
@@ -261,19 +261,9 @@ class _GarmentLevel:
 
 def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
     """Carry one garment to a level, or to the end of its chain of refinements, at which it stays."""
-    mesh, chain = garment.mesh, whole[:index]
-    linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
-    creases = creases_of(mesh, garment.rest, garment.closed)
-    face = np.arange(mesh.face_count)
-    for number, refinement in enumerate(chain):
-        split = mesh.triangulate(None if number else garment.rest)
-        flat_step = on_triangles(mesh, refinement, split)
-        linear_step, smooth_step = refinement.linear, sp.csr_matrix(smooth(mesh, refinement, creased=on_edges(mesh, creases)))
-        smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
-        creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
-        mesh, face = refinement.mesh, face[refinement.parent_face]
-    if index > len(chain):
-        linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    chain = whole[:index]
+    mesh, face, creases, maps = _carried(garment, chain, stays=index > len(chain))
+    linear, smoothing = maps["linear"], maps["smooth"]
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
     split = _sound(mesh.triangulate(rest if not chain else None), rest, rigid=_is_rigid(garment, linear))
     elements = elastic_elements(mesh, split, rest)
@@ -294,12 +284,31 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         bent=garment.bent_rest | (find_edges(creases, elements.hinges[:, :2]) >= 0),
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
-        linear=linear,
-        smooth=smoothing,
-        linear_step=linear_step,
-        smooth_step=smooth_step,
-        flat_step=flat_step,
+        **maps,
     )
+
+
+def _carried(
+    garment: Garment, chain: Sequence[Refinement], *, stays: bool
+) -> tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]:
+    """A garment's mesh after subdivisions, the cage's face of each face, its creases, and its maps by name.
+
+    Maps from the level below are the identity where the garment stays at the end of its chain.
+    """
+    mesh, face = garment.mesh, np.arange(garment.mesh.face_count)
+    linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    creases = creases_of(mesh, garment.rest, garment.closed)
+    for number, refinement in enumerate(chain):
+        flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
+        linear_step = refinement.linear
+        smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=on_edges(mesh, creases)))
+        smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
+        creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
+        mesh, face = refinement.mesh, face[refinement.parent_face]
+    if stays:
+        linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    steps = {"linear_step": linear_step, "smooth_step": smooth_step, "flat_step": flat_step}
+    return mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
 
 
 def _size(linear: sp.csr_matrix, elements: ElasticElements, rest: np.ndarray, smooth_rest: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@
 | symbol | here | meaning |
 |---|---|---|
 | A | ``Seam.closed`` | sewn points at their mean, at a vertex that may not move, or on the edge they follow |
-| A^T | ``Seam.shared`` | each of n points at one place feels an n-th of the forces on all; ends of an edge feel theirs |
+| A^T | ``Seam.shared`` | each of n points at one place feels an n-th of the forces on all |
 
 So a seam holds exactly, however stiff the cloth, and an integrator need not know of it: steps that would open it change
 neither energy nor force.
@@ -56,7 +56,9 @@ class Seam:
         free = level.free[:, 0].cpu().numpy()[sewn]
         held = np.bincount(group, ~free, minlength=1)[group] > 0
         leads = np.where(held, ~free, True)
-        member = sp.csr_matrix((leads.astype(float), (group, np.arange(len(sewn)))), shape=(group.max(initial=-1) + 1, len(sewn)))
+        member = sp.csr_matrix(
+            (leads.astype(float), (group, np.arange(len(sewn)))), shape=(group.max(initial=-1) + 1, len(sewn))
+        )
         mean = sp.csr_matrix(sp.diags(1.0 / np.asarray(member.sum(axis=1)).ravel()) @ member)[group]
         first = np.asarray(member.argmax(axis=1)).ravel()[group]
         device, dtype = level.device, level.dtype

@@ -43,7 +43,7 @@ class Group:
         moving_frames: Of the cage, which carry the last frame's detail.
         followers: What no solve moves.
         cloth: The cloth's contact with itself.
-        seams: The seam of each level, None without seams.
+        seams: The seam of each level, or None.
     """
 
     garments: tuple[Garment, ...]
@@ -162,9 +162,8 @@ class Group:
             return None
         fabrics = [each.fabric for each in frame.garments]
         settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics))
-        bodies = None
-        if touching:
-            bodies = FrameBodies.begin(self.levels, touching, cage.points, origin=cage.origin, settings=settings)
+        place = {"origin": cage.origin, "settings": settings}
+        bodies = FrameBodies.begin(self.levels, touching, cage.points, **place) if touching else None
         cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
         return FrameContact(self.levels, cage.points, bodies=bodies, cloth=cloth, **cloths, target=target)
 

@@ -45,7 +45,7 @@ class OnEdge:
         return OnEdge(self.vertex[kept], self.edge[kept], self.part[kept], self.distance[kept])
 
     def at(self, points: Float[np.ndarray, "vertices 3"]) -> OnEdge:
-        """The same vertices and edges in another pose."""
+        """Places and distances of the vertices in another pose."""
         return _on_edges(points, self.vertex, self.edge)
 
     def place(self, points: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "near 3"]:

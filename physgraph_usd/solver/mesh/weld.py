@@ -1,21 +1,23 @@
-"""Welding: borders of one mesh that stay at one place are one line of vertices to the solver.
+"""Welding: vertices of one mesh that stay at one place are one vertex to the solver.
 
-Exporters split a garment at its seams. Forces that bend, smooth surfaces and normals need a face on both sides of an
-edge, so open edges that lie on one another are joined two by two. Edges where more than two sheets meet, and sheets
-that lie on one another all over, stay as they are: `seams` sews those.
+Exporters split a garment at its seams, and draw a sheet twice to show it from both sides. Forces that bend, smooth
+surfaces and normals need a face on both sides of an edge, so open edges that lie on one another are joined two by two,
+and of faces that lie on one another one is solved. Edges where more than two sheets meet stay as they are: `seams`
+sews those.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from .borders import open_edges
-from .subdivide import Refinement, subdivide_times
+from .subdivide import Refinement, face_points, subdivide_times
 from .topology import PolygonMesh, find_edges, joined_by
 
 AT_ONE_PLACE = 5e-3
@@ -30,17 +32,19 @@ class Weld:
 
     Attributes:
         apart: The mesh as it was.
-        mesh: The welded mesh, with the same faces in the same order.
+        mesh: The welded mesh, wound alike: its faces are in the order of ``apart``, without those on an earlier one.
         number: Vertex of the welded mesh for each vertex, shape (V,).
+        faces: Faces of ``apart`` that the welded mesh has, ascending.
     """
 
     apart: PolygonMesh
     mesh: PolygonMesh
     number: Int[np.ndarray, " vertices"]
+    faces: Int[np.ndarray, " faces"]
 
     @property
     def is_none(self) -> bool:
-        """Whether no vertices were joined."""
+        """Whether the mesh is as it was."""
         return self.mesh is self.apart
 
     def joined(self, values: np.ndarray) -> np.ndarray:
@@ -67,18 +71,28 @@ class Weld:
         """Subdivisions of the mesh as it was, and the weld of the finest one."""
         steps = subdivide_times(self.apart, levels)
         if not steps or self.is_none:
-            finest = steps[-1].mesh if steps else self.apart
-            return steps, Weld(finest, finest, np.arange(finest.vertex_count))
-        welded, number, apart = self.mesh, self.number, self.apart
+            return steps, unwelded(steps[-1].mesh) if steps else self
+        welded, number, apart, faces = self.mesh, self.number, self.apart, self.faces
         for step, fine in zip(steps, subdivide_times(self.mesh, levels), strict=True):
+            face = np.arange(apart.face_count)
+            if len(faces) < apart.face_count:
+                own = _sorted_corners(apart, number[apart.indices])
+                face = _first_like(own, _sorted_corners(welded, welded.indices))
             of_edges = welded.vertex_count + find_edges(fine.edges, number[step.edges])
-            centres = step.mesh.vertex_count - apart.vertex_count - len(step.edges)
-            of_faces = fine.mesh.vertex_count - centres + np.arange(centres)
+            of_faces = face_points(welded)[face[apart.is_polygon]]
             number = np.concatenate([number, of_edges, of_faces])
+            faces = np.flatnonzero(np.isin(step.parent_face, faces))
             apart, welded = step.mesh, fine.mesh
-        return steps, Weld(apart, welded, number)
+        return steps, Weld(apart, welded, number, faces)
 
     @property
+    def sides(self) -> Int[np.ndarray, " vertices"]:
+        """A number for each vertex, the same for those that have one normal: the two sides of a sheet have two."""
+        shown = np.zeros(len(self.number), bool)
+        shown[self.apart.indices[np.isin(self.apart.corner_face, self.faces)]] = True
+        return np.unique(2 * self.number + ~shown, return_inverse=True)[1].reshape(-1)
+
+    @cached_property
     def _first(self) -> np.ndarray:
         """The first vertex of each welded one, shape (W,)."""
         return np.unique(self.number, return_index=True)[1]
@@ -86,43 +100,115 @@ class Weld:
 
 def unwelded(mesh: PolygonMesh) -> Weld:
     """A mesh that stays as it is."""
-    return Weld(mesh, mesh, np.arange(mesh.vertex_count))
+    return Weld(mesh, mesh, np.arange(mesh.vertex_count), np.arange(mesh.face_count))
 
 
 def weld(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]], within: float) -> Weld:
-    """Join the open edges of a mesh that lie on one another in every pose, two by two.
+    """Join the vertices of faces that lie on one another in every pose, and of open edges that do, two by two.
 
     Args:
         mesh: The mesh.
         poses: Positions [m], at least one.
         within: Distance under which two vertices are at one place [m].
     """
-    edges = open_edges(mesh)
-    pairs = pairs_within(poses, np.unique(edges), within)
+    pairs = pairs_within(poses, np.unique(mesh.indices), within)
     pairs = pairs[~_in_one_face(mesh, pairs)]
     if not len(pairs):
-        return unwelded(mesh)
+        return replace(unwelded(mesh), mesh=wound_alike(mesh, poses[0]))
     place = joined_by(pairs, mesh.vertex_count)
-    ends = np.sort(place[edges], axis=1)
-    order = np.lexsort(ends.T)
-    same = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
-    count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    alone = count[2][count[1].reshape(-1)][order[same]] == 2
-    first, second = edges[order[same[alone]]], edges[order[same[alone] + 1]]
-    kept = (place[first[:, 0]] != place[first[:, 1]]) & ~_on_one_another(mesh, poses[0], first, second, within)
-    first, second = first[kept], second[kept]
-    crossed = place[first[:, 0]] != place[second[:, 0]]
-    second = np.where(crossed[:, None], second[:, ::-1], second)
-    joined = np.stack([first.ravel(), second.ravel()], axis=1)
-    if not len(joined):
-        return unwelded(mesh)
-    label = joined_by(joined, mesh.vertex_count)
-    _, first_of, number = np.unique(label, return_index=True, return_inverse=True)
-    rank = np.empty(len(first_of), np.int64)
-    rank[np.argsort(first_of)] = np.arange(len(first_of))  # Welded vertices keep the order of the vertices.
-    number = rank[number.reshape(-1)]
-    whole = replace(mesh, indices=number[mesh.indices].astype(np.int32), vertex_count=len(first_of))
-    return Weld(mesh, whole, number)
+    corners = _sorted_corners(mesh, place[mesh.indices])
+    like = _first_like(corners, corners)
+    faces, again = (np.flatnonzero(mask) for mask in (like == np.arange(len(like)), like != np.arange(len(like))))
+    doubled = _corners_together(mesh, place, again, like[again])
+    label = _lowest(mesh.vertex_count, doubled)
+    kept = np.isin(mesh.corner_face, faces)
+    single = replace(mesh, counts=mesh.counts[faces], indices=label[mesh.indices[kept]])
+    number = _lowest(mesh.vertex_count, np.concatenate([doubled, _edge_pairs(single, place)]))
+    used, number = np.unique(number, return_inverse=True)
+    if len(used) == mesh.vertex_count:
+        return replace(unwelded(mesh), mesh=wound_alike(mesh, poses[0]))
+    number = number.reshape(-1)
+    indices = number[mesh.indices[kept]].astype(np.int32)
+    whole = replace(mesh, counts=mesh.counts[faces], indices=indices, vertex_count=len(used))
+    first = np.unique(number, return_index=True)[1]
+    return Weld(mesh, wound_alike(whole, poses[0][first]), number, faces)
+
+
+def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> PolygonMesh:
+    """The mesh with faces turned over so that neighbours are wound alike; itself where none need be.
+
+    Pieces in which some are not are wound counter-clockwise seen from outside.
+    """
+    half, count = mesh.half_edges, mesh.face_count
+    order = np.argsort(half.edge, kind="stable")
+    starts = np.cumsum(half.count) - half.count
+    double = np.flatnonzero((half.count == 2) & (half.edges[:, 0] != half.edges[:, 1]))
+    one, two = order[starts[double]], order[starts[double] + 1]
+    unlike = half.forward[one] == half.forward[two]
+    if not unlike.any():
+        return mesh
+    a, b = mesh.corner_face[one].astype(np.int64), mesh.corner_face[two].astype(np.int64)
+    # Each face stands twice in a graph, as it is and turned: neighbours wound alike link like to like.
+    links = np.concatenate(
+        [np.stack([a, np.where(unlike, b + count, b)], 1), np.stack([a + count, np.where(unlike, b, b + count)], 1)]
+    )
+    label = joined_by(links, 2 * count)
+    piece = np.minimum(label[:count], label[count:])
+    turned = label[:count] > label[count:]
+    mixed = np.zeros(2 * count, bool)
+    mixed[piece[a[unlike]]] = True
+    mixed[piece[label[:count] == label[count:]]] = False  # A Moebius strip has no two sides.
+    sign = np.where(turned, -1.0, 1.0)
+    turned ^= (np.bincount(piece, sign * _volumes(mesh, points, piece), 2 * count) < 0.0)[piece]
+    corner = np.arange(len(mesh.indices)) - mesh.starts[mesh.corner_face]
+    mirrored = mesh.starts[mesh.corner_face] + (mesh.counts[mesh.corner_face] - corner) % mesh.counts[mesh.corner_face]
+    flips = (turned & mixed[piece])[mesh.corner_face]
+    return replace(mesh, indices=mesh.indices[np.where(flips, mirrored, np.arange(len(mesh.indices)))])
+
+
+def _lowest(count: int, links: np.ndarray) -> np.ndarray:
+    """The lowest of the vertices that links join to each, shape (count,)."""
+    label = joined_by(links, count)
+    return np.unique(label, return_index=True)[1][label]
+
+
+def _first_like(corners: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The first of other faces with the same sorted corners as each face; there is one, shape (F,)."""
+    width = max(corners.shape[1], others.shape[1])
+    rows = [np.pad(each, ((0, 0), (width - each.shape[1], 0)), constant_values=-1) for each in (corners, others)]
+    label = np.unique(np.concatenate(rows), axis=0, return_inverse=True)[1].reshape(-1)
+    known, first = np.unique(label[len(corners) :], return_index=True)
+    return first[np.searchsorted(known, label[: len(corners)])]
+
+
+def _sorted_corners(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
+    """Values at the corners of each face in ascending order, padded with -1 in front, shape (F, most corners)."""
+    out = np.full((mesh.face_count, int(mesh.counts.max(initial=0))), -1, np.int64)
+    out[mesh.corner_face, np.arange(len(mesh.indices)) - mesh.starts[mesh.corner_face]] = values
+    return np.sort(out, axis=1)
+
+
+def _corners_together(mesh: PolygonMesh, place: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Pairs of corners at one place of pairs of faces that lie on one another, shape (N, 2)."""
+    pairs = [np.zeros((0, 2), np.int64)]
+    for a, b in zip(one.tolist(), other.tolist(), strict=True):
+        here, there = (mesh.indices[mesh.starts[face] : mesh.starts[face + 1]].astype(np.int64) for face in (a, b))
+        pairs.append(np.stack([here[np.argsort(place[here])], there[np.argsort(place[there])]], axis=1))
+    return np.concatenate(pairs)
+
+
+def _edge_pairs(mesh: PolygonMesh, place: np.ndarray) -> np.ndarray:
+    """Pairs of ends of open edges at one place, of places at which there are two, shape (N, 2)."""
+    edges = open_edges(mesh)
+    edges = edges[place[edges[:, 0]] != place[edges[:, 1]]]
+    turned = place[edges[:, 0]] > place[edges[:, 1]]
+    edges = np.where(turned[:, None], edges[:, ::-1], edges)
+    ends = place[edges]
+    _, where, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    where = where.reshape(-1)
+    order = np.argsort(where, kind="stable")
+    twice = edges[order[count[where][order] == 2]].reshape(-1, 2, 2)
+    return np.concatenate([twice[:, :, 0], twice[:, :, 1]])
 
 
 def seam_reach(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"], tolerance: float) -> float:
@@ -168,16 +254,12 @@ def _in_one_face(mesh: PolygonMesh, pairs: np.ndarray) -> np.ndarray:
     return found
 
 
-def _on_one_another(
-    mesh: PolygonMesh, points: np.ndarray, first: np.ndarray, second: np.ndarray, within: float
-) -> np.ndarray:
-    """Whether the faces of two open edges have their middles at one place, as a doubled sheet's have, shape (N,)."""
-    half = mesh.half_edges
-    face_of = np.empty(len(half.edges), np.int64)
-    face_of[half.edge] = mesh.corner_face
-    sums = np.zeros((mesh.face_count, 3))
-    np.add.at(sums, mesh.corner_face, points[mesh.indices])
-    middle = sums / np.maximum(mesh.counts, 1)[:, None]
-    one, two = (middle[face_of[find_edges(half.edges, each)]] for each in (first, second))
-    length = np.linalg.norm(points[first[:, 0]] - points[first[:, 1]], axis=1)
-    return np.linalg.norm(one - two, axis=1) <= np.maximum(within, AT_ONE_PLACE * length)
+def _volumes(mesh: PolygonMesh, points: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Signed volume between each face and the middle of its piece [m^3], shape (F,)."""
+    owner = piece[mesh.corner_face]
+    sums, count = np.zeros((len(piece) * 2, 3)), np.bincount(owner, minlength=len(piece) * 2)
+    np.add.at(sums, owner, points[mesh.indices])
+    about = points[mesh.indices] - (sums / np.maximum(count, 1)[:, None])[owner]
+    first = about[mesh.starts[mesh.corner_face]]
+    each = (first * np.cross(about, about[mesh.next_corner])).sum(axis=1) / 6.0
+    return np.bincount(mesh.corner_face, each, mesh.face_count)

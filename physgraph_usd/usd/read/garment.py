@@ -12,10 +12,9 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import GarmentError, SchemaError, counted
-from ...solver.mesh.borders import open_edges
 from ...solver.mesh.pieces import pieces_of
 from ...solver.mesh.topology import PolygonMesh
-from ...solver.mesh.weld import Weld, seam_reach, unwelded, weld
+from ...solver.mesh.weld import Weld, seam_reach, weld
 from ...solver.scene import Garment, GarmentFrame
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..schema import GARMENT
@@ -144,33 +143,30 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     absent = within(samples.absent, request.frames)
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
-    self_contact, layer, raises, level = _constants(prim, request)
+    constants, of_constants = _constants(prim, request)
     painted, cut = _painted(prim, weld, notices, values=values)
-    closed, rigid, odd_pieces = _pieces(prim, weld, rest.points, cage.kept_faces)
+    pieces, odd_pieces = _pieces(prim, weld, rest.points, cage.kept_faces[weld.faces])
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
-        *(str(prim.GetPath()), weld.mesh, weld.joined(rest.points), round(level.at(None) or 0.0), is_flipped(prim, matrix), bent),
-        self_contact=bool(self_contact.at(None)),
-        layer=None if (order := layer.at(None)) is None else round(order),
+        str(prim.GetPath()),
+        weld.mesh,
+        weld.joined(rest.points),
+        flipped=is_flipped(prim, matrix),
+        bent_rest=bent,
         grain=grain,
-        raises_bending=bool(raises.at(None)),
-        closed=closed,
-        rigid=rigid,
-        **painted,
+        **constants | pieces | painted,
     )
     size = _size_notices(garment.path, animation.first, request)
     notices += [*rest.notices, *odd_pieces, *size, *_unit_notices(prim, matrix, request)]
-    sources = {"contact:selfCollision": self_contact.source, "contact:layer": layer.source, "rest": rest.source}
-    sources |= {"grain": lies, "refine:raiseBending": raises.source}
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, weld, prim.GetPath() in request.bake.skinned, tuple(roots), times),
-        sources | values.sources | {"refine:level": level.source},
+        {"rest": rest.source, "grain": lies} | values.sources | of_constants,
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         absent=absent,
         velocities=has_velocities(prim, points.count),
-        subsets=(subsets := _subsets(prim, cage.kept_faces)),
-        words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(cage.kept_faces)]),
+        subsets=(subsets := _subsets(prim, cage.kept_faces[weld.faces])),
+        words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(weld.faces)]),
     )
     return GarmentReader(garment, source, values, points, edges, weld, [*notices, *values.notices])
 
@@ -194,13 +190,20 @@ def _animation(
     return Animation(every, read(times[0] if times else None)[0], read)
 
 
-def _constants(prim: Usd.Prim, request: Request) -> list[Found]:
-    """Self-collision, layer, whether bending is raised, and level, which never change over a shot."""
+def _constants(prim: Usd.Prim, request: Request) -> tuple[dict[str, Any], dict[str, str]]:
+    """Values of a garment that never change over a shot, by field name, and their sources by schema name."""
     names = ("contact:selfCollision", "contact:layer", "refine:raiseBending", "refine:level")
-    *others, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
+    self_contact, layer, raises, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
     if request.level is not None and level.source != "--set":
         level = Found(level.row, "--level", None, request.level)
-    return [*others, level]
+    found = {
+        "self_contact": bool(self_contact.at(None)),
+        "layer": None if (order := layer.at(None)) is None else round(order),
+        "raises_bending": bool(raises.at(None)),
+        "level": round(level.at(None) or 0.0),
+    }
+    each = zip(names, (self_contact, layer, raises, level), strict=True)
+    return found, {name: value.source for name, value in each}
 
 
 def has_velocities(prim: Usd.Prim, count: int) -> bool:
@@ -212,8 +215,8 @@ def has_velocities(prim: Usd.Prim, count: int) -> bool:
 
 def _pieces(
     prim: Usd.Prim, weld: Weld, rest: np.ndarray, kept: np.ndarray
-) -> tuple[np.ndarray | None, np.ndarray | None, list[Notice]]:
-    """Vertices of closed pieces, numbers of rigid parts at the vertices, None without any, and notices of them."""
+) -> tuple[dict[str, np.ndarray | None], list[Notice]]:
+    """Closed pieces and rigid parts by field name, and notices of them."""
     asked = np.zeros(len(kept), bool)
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
         attribute = subset.GetPrim().GetAttribute(RIGID)
@@ -230,7 +233,8 @@ def _pieces(
     if found.joined:
         message = f"{RIGID} is for pieces that share no vertices with cloth; paint bendScale to stiffen the others"
         notices.append(Notice(path, None, message))
-    return found.closed if found.closed.any() else None, found.rigid if count else None, notices
+    fields = {"closed": found.closed if found.closed.any() else None, "rigid": found.rigid if count else None}
+    return fields, notices
 
 
 def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
@@ -255,11 +259,9 @@ def _rest_and_weld(
     prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray
 ) -> tuple[Rest, Weld]:
     """Rest shape as authored or fitted, and the weld of the borders that stay together there and over the shot."""
-    found = unwelded(mesh)
-    poses, within = [*animation.poses(1).values()] or [animation.first], 0.0
-    if len(open_edges(mesh)):
-        within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
-        found = weld(mesh, poses, within)
+    poses = [*animation.poses(1).values()] or [animation.first]
+    within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
+    found = weld(mesh, poses, within)
     if not found.is_none:
         poses = [*animation.poses().values()]
         found = weld(mesh, poses, within)

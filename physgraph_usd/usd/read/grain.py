@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
 from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.weld import Weld
 from ...solver.scene import Grain
 from ..stage import first_value
 
@@ -55,7 +56,7 @@ def read_grain(
     warp = np.cos(turn)[:, None] * warp + np.sin(turn)[:, None] * np.cross(normal, warp)
     if turn.any():
         source += ", turned by primvars:physgraph:grain"
-    return Grain(warp, weld.joined(painted["easeScale"]), weld.joined(painted["gather"] / 100.0)), source
+    return Grain(warp[weld.faces], weld.joined(painted["easeScale"]), weld.joined(painted["gather"] / 100.0)), source
 
 
 def face_normals(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:

@@ -260,7 +260,6 @@ def open_shot(
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
-        readers = _sewn(stage, readers, request, notices)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
         notices += _timing(stage, readers, solids, bake=bake)
@@ -306,7 +305,8 @@ def _link(
     request: Request,
     notices: list[Notice],
 ) -> tuple[list[GarmentReader], list[ColliderReader]]:
-    """Garments with the numbers of the colliders that they feel, and these colliders."""
+    """Garments with their seams and the numbers of the colliders that they feel, and these colliders."""
+    readers = _sewn(stage, readers, request, notices)
     prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
     cloth = {prim.GetPath() for prim in prims}
     reachable = felt_by(stage, prims, wanted, overrides=request.overrides)

@@ -99,7 +99,9 @@ class _Cloth:
 
     def _rest_together(self, pairs: np.ndarray) -> np.ndarray:
         apart = self._owner[pairs[:, 0]] != self._owner[pairs[:, 1]]
-        return apart | (np.linalg.norm(self._rest[pairs[:, 0]] - self._rest[pairs[:, 1]], axis=1) <= self.reach(*pairs.T))
+        return apart | (
+            np.linalg.norm(self._rest[pairs[:, 0]] - self._rest[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
+        )
 
     def _rest_on(self, near: OnEdge) -> np.ndarray:
         apart = self._owner[near.vertex] != self._owner[near.edge[:, 0]]
@@ -138,6 +140,8 @@ class _Cloth:
             gap = float(distance[own].max())
             others = {self._garments[each].path for each in other[own].ravel().tolist()} - {garment.path}
             whose = "one another" if not others else " and ".join(f"<{path}>" for path in sorted(others))
-            message = f"borders run along {whose} for {length:.3g} m, at most {1e3 * gap:.2g} mm apart, and are not sewn"
+            message = (
+                f"borders run along {whose} for {length:.3g} m, at most {1e3 * gap:.2g} mm apart, and are not sewn"
+            )
             found.append(Notice(garment.path, None, f"{message}; sew them with --set seam:tolerance={1.5 * gap:.2g}"))
         return found

@@ -213,7 +213,7 @@ def _normals(layer: Sdf.Layer, path: str) -> VertexNormals:
     time = samples_and_blocks(layer, f"{path}.normals")[0][0]
     points, there = (np.asarray(layer.QueryTimeSample(f"{path}.{name}", time)) for name in ("points", "normals"))
     mesh = PolygonMesh(*topology_of(layer, path), len(points))
-    welded = weld(mesh, [points], 0.0).number
+    welded = weld(mesh, [points], 0.0).sides
     found = VertexNormals(mesh, welded=welded)
     agrees = float((found(points) * there).sum()) >= 0
     return found if agrees else VertexNormals(mesh, left_handed=True, welded=welded)

@@ -257,7 +257,7 @@ class _RefinedMesh:
         self.notices += overs.author_rest_points(stream, target, prim, fine)
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         rest = None if source.skinned or not source.times else _refined_default(prim, fine)
-        normals = VertexNormals(fine.fine, left_handed=left, welded=self._weld.number)
+        normals = VertexNormals(fine.fine, left_handed=left, welded=self._weld.sides)
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
         moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}

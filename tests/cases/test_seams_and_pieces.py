@@ -1,0 +1,282 @@
+"""Seams stay closed and buttons stay buttons: each kind by its right value on a small stage of its own."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cloth import settings_of
+from layers import open_over
+from pxr import Sdf, Usd, UsdGeom, Vt
+from scipy.spatial import cKDTree
+from shots import faults, fine, refine
+from stages import new_stage, save, vec3
+from test_bodies_as_drawn import Faces, tube
+
+from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.mesh.subdivide import compose, subdivide_times
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.mesh.weld import weld
+from physgraph_usd.usd.read.reader import Shot, open_shot
+
+FRAMES, LEVEL, SAME = 5, 1, 1e-6
+Shape = tuple[np.ndarray, Faces]
+
+
+def panel(x: float, width: float, columns: int, *, rows: int = 8, height: float = 0.24) -> Shape:
+    """A sheet of quads in the plane of x and y, from x to the right [m]."""
+    across, up = np.linspace(x, x + width, columns + 1), np.linspace(-height, 0.0, rows + 1)
+    points = np.array([[a, b, 0.0] for b in up for a in across])
+    ids = np.arange(len(points)).reshape(rows + 1, columns + 1)
+    faces = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1)
+    return points, faces.reshape(-1, 4).tolist()
+
+
+def together(*shapes: Shape) -> Shape:
+    """Shapes as one mesh in pieces."""
+    starts = np.cumsum([0, *(len(points) for points, _ in shapes)])
+    moved = [
+        [corner + int(start) for corner in face]
+        for (_, faces), start in zip(shapes, starts, strict=False)
+        for face in faces
+    ]
+    return np.concatenate([points for points, _ in shapes]), moved
+
+
+def box(middle: np.ndarray, size: np.ndarray) -> Shape:
+    """A closed box [m]."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return middle + corners * size, faces
+
+
+def mesh_of(shape: Shape) -> PolygonMesh:
+    """The topology of a shape."""
+    points, faces = shape
+    return PolygonMesh([len(face) for face in faces], [corner for face in faces for corner in face], len(points))
+
+
+def shortened(points: np.ndarray, time: int) -> np.ndarray:
+    """Pressed together along x by 2% a frame, on a slight wave."""
+    out = points * [1.0 - 0.02 * (time - 1), 1.0, 1.0]
+    out[:, 2] += 0.002 * (time - 1) * np.sin(12.0 * points[:, 0] + 6.0 * points[:, 1])
+    return out
+
+
+def shot_of(folder: Path, **shapes: Shape) -> Path:
+    """A shot of garments that are pressed together."""
+    stage = new_stage(folder / "shot.usda")
+    for name, (points, faces) in shapes.items():
+        mesh = UsdGeom.Mesh.Define(stage, f"/World/{name}")
+        mesh.CreateFaceVertexCountsAttr([len(face) for face in faces])
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray([corner for face in faces for corner in face]))
+        mesh.GetPrim().AddAppliedSchema("PhysGraphGarmentAPI")
+        mesh.CreatePointsAttr(vec3(points))
+        for time in range(1, FRAMES + 1):
+            mesh.GetPointsAttr().Set(vec3(shortened(points, time)), time)
+    return save(stage)
+
+
+def widest_gap(shot: Path, layer: Path, within: float = SAME, **shapes: Shape) -> float:
+    """How far fine points that lie together in the shapes are apart in any frame, at most [m]."""
+    rest = np.concatenate([compose(subdivide_times(mesh_of(each), LEVEL)) @ each[0] for each in shapes.values()])
+    pairs = cKDTree(rest).query_pairs(within, output_type="ndarray")
+    assert len(pairs) > 4
+    widest = 0.0
+    for time in range(1, FRAMES + 1):
+        points = np.concatenate([fine(shot, layer, time, prim=f"/World/{name}") for name in shapes])
+        widest = max(widest, float(np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1).max()))
+    return widest
+
+
+def warnings_of(shot: Path, **options: object) -> str:
+    """What opening a shot warns of."""
+    with closing(open_shot(str(shot), **options)) as opened:
+        return "; ".join(map(str, opened.warnings))
+
+
+class TestWelded:
+    """Open borders of one mesh at one place."""
+
+    def test_a_mesh_cut_along_a_seam_is_the_whole_one(self, tmp_path: Path):
+        whole = panel(-0.12, 0.24, 8)
+        halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
+        points = []
+        for name, shape in (("whole", whole), ("halves", halves)):
+            (tmp_path / name).mkdir()
+            shot = shot_of(tmp_path / name, sheet=shape)
+            refine(shot, tmp_path / f"{name}.usdc")
+            points.append(fine(shot, tmp_path / f"{name}.usdc", FRAMES, prim="/World/sheet"))
+            assert not faults(tmp_path / f"{name}.usdc", shot)
+        rest = [compose(subdivide_times(mesh_of(each), LEVEL)) @ each[0] for each in (whole, halves)]
+        same = cKDTree(rest[0]).query(rest[1])[1]
+        assert len(points[1]) > len(points[0])
+        assert np.abs(points[1] - points[0][same]).max() < 5e-4, "numbering alone differs"
+        assert widest_gap(tmp_path / "halves" / "shot.usda", tmp_path / "halves.usdc", sheet=halves) == 0.0
+
+    def test_points_at_one_place_have_one_normal(self, tmp_path: Path):
+        halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
+        shot = shot_of(tmp_path, sheet=halves)
+        refine(shot, tmp_path / "fine.usdc")
+        stage = open_over(shot, tmp_path / "fine.usdc")
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/sheet"))
+        points, normals = (np.asarray(each.Get(FRAMES)) for each in (mesh.GetPointsAttr(), mesh.GetNormalsAttr()))
+        pairs = cKDTree(points).query_pairs(0.0, output_type="ndarray")
+        assert len(pairs) == 17
+        assert np.array_equal(normals[pairs[:, 0]], normals[pairs[:, 1]])
+
+    @pytest.mark.parametrize("turn", [0, 1])
+    def test_a_sheet_drawn_twice_is_solved_once_and_has_two_sides(self, tmp_path: Path, turn: int):
+        sheet = panel(0.0, 0.24, 8)
+        back = (sheet[0].copy(), [[*face[turn:], *face[:turn]][::-1] for face in sheet[1]])
+        points = []
+        for name, shape in (("one", sheet), ("two", together(sheet, back))):
+            (tmp_path / name).mkdir()
+            shot = shot_of(tmp_path / name, sheet=shape)
+            refine(shot, tmp_path / f"{name}.usdc")
+            points.append(fine(shot, tmp_path / f"{name}.usdc", FRAMES, prim="/World/sheet"))
+        rest = [compose(subdivide_times(mesh_of(each), LEVEL)) @ each[0] for each in (sheet, together(sheet, back))]
+        distance, same = cKDTree(rest[0]).query(rest[1])
+        assert distance.max() < SAME
+        assert np.array_equal(points[1], points[0][same])
+        stage = open_over(shot, tmp_path / "two.usdc")
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/sheet"))
+        normals = np.asarray(mesh.GetNormalsAttr().Get(FRAMES))
+        front = np.array([np.flatnonzero(same == vertex)[0] for vertex in range(len(rest[0]))])
+        behind = np.array([np.flatnonzero(same == vertex)[1] for vertex in range(len(rest[0]))])
+        np.testing.assert_allclose(normals[front], -normals[behind], atol=1e-5)
+
+    def test_borders_that_part_in_a_frame_are_not_welded(self):
+        points, _ = halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
+        later = points + np.where(np.arange(len(points)) < len(points) // 2, 0.0, 0.01)[:, None] * [1.0, 0.0, 0.0]
+        assert not weld(mesh_of(halves), [points], 1e-5).is_none
+        assert weld(mesh_of(halves), [points, later], 1e-5).is_none
+
+    def test_an_edge_of_three_sheets_stays_open(self):
+        wall = panel(0.0, 0.12, 4)
+        standing = (wall[0][:, [2, 1, 0]], wall[1])
+        points, _ = three = together(panel(-0.12, 0.12, 4), wall, standing)
+        assert weld(mesh_of(three), [points], 1e-5).is_none
+
+    def test_values_of_joined_points_are_their_mean_and_come_back(self):
+        points, _ = halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
+        found = weld(mesh_of(halves), [points], 1e-5)
+        assert found.mesh.vertex_count == len(points) - 9
+        np.testing.assert_array_equal(found.split(found.joined(points)), points)
+        for level in range(3):
+            steps, finest = found.subdivided(level)
+            apart = compose(steps) @ points if steps else points
+            chain = subdivide_times(found.mesh, level)
+            one = compose(chain) @ found.joined(points) if chain else found.joined(points)
+            np.testing.assert_allclose(finest.split(one), apart, atol=1e-15)
+
+
+class TestSewn:
+    """Borders of garments, and of unequal resolution."""
+
+    def test_two_garments_stay_together(self, tmp_path: Path):
+        shapes = {"left": panel(-0.12, 0.12, 4), "right": panel(0.0, 0.12, 4)}
+        refine(shot := shot_of(tmp_path, **shapes), tmp_path / "fine.usdc")
+        assert widest_gap(shot, tmp_path / "fine.usdc", **shapes) < 1e-6
+
+    @pytest.mark.parametrize("rows", [12, 16, 24])
+    @pytest.mark.parametrize("meshes", [1, 2])
+    def test_a_finer_border_follows_the_coarser_one(self, tmp_path: Path, rows: int, meshes: int):
+        parts = panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4 * rows // 8, rows=rows)
+        shapes = {"sheet": together(*parts)} if meshes == 1 else dict(zip(("left", "right"), parts, strict=True))
+        report = refine(shot := shot_of(tmp_path, **shapes), tmp_path / "fine.usdc")
+        assert widest_gap(shot, tmp_path / "fine.usdc", **shapes) < 1e-6
+        assert not report.unsettled
+        assert "not sewn" not in warnings_of(shot)
+
+    @pytest.mark.parametrize("meshes", [1, 2])
+    def test_borders_beside_one_another_are_told_of_and_sewn_on_request(self, tmp_path: Path, meshes: int):
+        parts = panel(-0.12, 0.12, 4), panel(3e-4, 0.12, 4)
+        shapes = {"sheet": together(*parts)} if meshes == 1 else dict(zip(("left", "right"), parts, strict=True))
+        shot = shot_of(tmp_path, **shapes)
+        told = warnings_of(shot)
+        assert "not sewn" in told
+        remedy = told.partition("--set ")[2].split(";")[0].split()[0]
+        assert "not sewn" not in warnings_of(shot, overrides=[remedy])
+        refine(shot, tmp_path / "fine.usdc", overrides=(remedy,))
+        assert widest_gap(shot, tmp_path / "fine.usdc", 4e-4, **shapes) < 1e-6
+
+    def test_a_hem_over_a_hem_is_told_of_once_and_a_body_apart_not_at_all(self, tmp_path: Path):
+        apart = {"left": panel(-0.12, 0.12, 4), "right": panel(0.004, 0.12, 4)}
+        assert "not sewn" not in warnings_of(shot_of(tmp_path, **apart))
+
+
+def pieces_of(shot: Shot) -> np.ndarray | None:
+    """Numbers of the rigid parts of the first garment."""
+    return shot.scene.garments[0].rigid
+
+
+class TestPieces:
+    """Parts of a garment's mesh that are no sheet."""
+
+    def test_buttons_keep_their_shape_and_stay_on_the_cloth(self, tmp_path: Path):
+        size = np.array([0.012, 0.012, 0.003])
+        buttons = [box(np.array([x, -0.12, 0.0027]), size) for x in (-0.06, 0.0, 0.06)]
+        cloth = panel(-0.12, 0.24, 8)
+        shape = together(cloth, *buttons)
+        shot = shot_of(tmp_path, sheet=shape)
+        assert "3 pieces of it moved rigidly" in warnings_of(shot)
+        refine(shot, tmp_path / "fine.usdc")
+        mesh, count = mesh_of(shape), len(cloth[0])
+        owner = np.r_[np.zeros(count), np.repeat([1, 2, 3], 8)]
+        fine_owner = compose(subdivide_times(mesh, LEVEL)) @ owner
+        for time in range(1, FRAMES + 1):
+            points = fine(shot, tmp_path / "fine.usdc", time, prim="/World/sheet")
+            tree = cKDTree(points[fine_owner == 0])
+            for number in (1, 2, 3):
+                button = points[fine_owner == number]
+                cage = (compose(subdivide_times(mesh, LEVEL)) @ shortened(shape[0], time))[fine_owner == number]
+                spans = [np.linalg.norm(each[:, None] - each, axis=2) for each in (button, cage)]
+                np.testing.assert_allclose(spans[0], spans[1], atol=1e-6)
+                assert tree.query(button)[0].min() < 0.009, "as near as the mesh's vertices can be"
+
+    def test_pieces_that_are_asked_for_are_rigid(self, tmp_path: Path):
+        shape = together(panel(-0.12, 0.24, 8), panel(-0.05, 0.1, 4, rows=4, height=0.1))
+        shot = shot_of(tmp_path, sheet=shape)
+        stage = Usd.Stage.Open(str(shot))
+        prim = stage.GetPrimAtPath("/World/sheet")
+        with closing(open_shot(str(shot))) as opened:
+            assert pieces_of(opened) is None
+        subset = UsdGeom.Subset.Define(stage, "/World/sheet/badge")
+        subset.CreateIndicesAttr(Vt.IntArray([*range(64, 80)]))
+        subset.GetPrim().CreateAttribute("physgraph:rigid", Sdf.ValueTypeNames.Bool).Set(True)
+        stage.Save()
+        with closing(open_shot(str(shot))) as opened:
+            assert (pieces_of(opened) >= 0).sum() == 25
+        subset.GetIndicesAttr().Set(Vt.IntArray([*range(8)]))
+        stage.Save()
+        assert "paint bendScale" in warnings_of(shot)
+        assert prim
+
+    def test_a_thick_garment_keeps_its_rim(self, tmp_path: Path):
+        (outer, sides), (inner, _) = tube(0.102, 0.0, 0.2), tube(0.1, 0.0, 0.2)
+        count, around = len(outer), 16
+        faces = [*sides, *([corner + count for corner in face[::-1]] for face in sides)]
+        for row, turn in ((0, 1), (count - around, -1)):
+            ring = [row + k for k in range(around)]
+            quads = [
+                [ring[k], ring[(k + 1) % around], ring[(k + 1) % around] + count, ring[k] + count]
+                for k in range(around)
+            ]
+            faces += [quad[::turn] for quad in quads]
+        shape = np.concatenate([outer, inner]), faces
+        shot = shot_of(tmp_path, sheet=shape)
+        assert "closed shell" in warnings_of(shot)
+        with closing(open_shot(str(shot))) as opened:
+            garment, frame = opened.scene.garments[0], opened.frame(1.0)
+            rims = []
+            for each in (garment, replace(garment, closed=None)):
+                scene = replace(opened.scene, garments=(each,))
+                points = Refiner(scene, settings_of(), levels=[LEVEL]).solve(frame).points[0]
+                assert points is not None
+                rims.append(np.linalg.norm(points[:count] - points[count : 2 * count], axis=1)[[*range(around)]])
+        assert rims[0].min() > 1e-3
+        assert rims[0].max() < 5e-3
