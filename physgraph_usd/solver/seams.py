@@ -24,7 +24,7 @@ def level_seams(levels: Sequence[Level], garments: Sequence[Garment]) -> list[Se
 
 def _seam(level: Level, sewn_at: Float[np.ndarray, "coarse 3"]) -> Seam | None:
     """The seam of one level, by the places at which sewn vertices of the cage lie in one pose [m]."""
-    sewn = np.isfinite(sewn_at).all(axis=1)
+    sewn = np.asarray(np.isfinite(sewn_at).all(axis=1))
     if not sewn.any():
         return None
     # A fine vertex lies on a seam if all cage vertices do that it is made of; one without area is no cloth to sew.

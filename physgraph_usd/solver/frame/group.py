@@ -156,9 +156,7 @@ class Group:
         settings = settings or self.settings.contact
         touching = frame.touching if settings.form != "off" else ()
         cloth = self.cloth if settings.cloth != "off" and self.cloth.meets.any() else None
-        if not len(self.levels[0].triangles):
-            return None
-        if cloth is None and not touching and not any(self.seams):
+        if not len(self.levels[0].triangles) or not (cloth or touching or any(self.seams)):
             return None
         fabrics = [each.fabric for each in frame.garments]
         settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics))

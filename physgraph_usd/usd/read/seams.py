@@ -90,7 +90,7 @@ class _Cloth:
         pairs = pairs_within([points], self._used, float(self._reach.max(initial=0.0)))
         together = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
         pairs = pairs[together & self._rest_together(pairs)]
-        there = np.isfinite(points).all(axis=1)
+        there = np.asarray(np.isfinite(points).all(axis=1))
         borders = self._borders[there[self._borders].all(axis=1)]
         alone = np.setdiff1d(borders, pairs)
         near = nearest_edges(points, alone, borders, BESIDE * self.edge_at(points, alone))
