@@ -8,14 +8,16 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from ..errors import AbsentError, LayerError, PhysGraphError, StageError
-from ..solver.mesh.weld import Weld
 from .view import StageView
+
+if TYPE_CHECKING:
+    from ..solver.mesh.weld import Weld
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
 """The name of a rule of USD's own parser, which tells a user nothing."""

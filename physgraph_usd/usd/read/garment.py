@@ -213,9 +213,7 @@ def has_velocities(prim: Usd.Prim, count: int) -> bool:
     return any(len(attribute.Get(code) or ()) == count for code in codes)
 
 
-def _pieces(
-    prim: Usd.Prim, weld: Weld, rest: np.ndarray, kept: np.ndarray
-) -> tuple[dict[str, Any], list[Notice]]:
+def _pieces(prim: Usd.Prim, weld: Weld, rest: np.ndarray, kept: np.ndarray) -> tuple[dict[str, Any], list[Notice]]:
     """Closed pieces and rigid parts by field name, and notices of them."""
     asked = np.zeros(len(kept), bool)
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
