@@ -111,7 +111,8 @@ def test_killed_at_any_moment_from_start_to_end(shot: Path, whole: bytes, tmp_pa
 def says_interrupted(out: Path, report: Path, summary: Path, *, code: int, of: int) -> int:
     """Report and summary agree on what is kept, which is what lies there; returns how many frames that are."""
     count = len(finished(out))
-    said = f"interrupted, {count} of {of} frames are kept in {frames_folder(out)}; --resume goes on from them"
+    are, them = ("is", "it") if count == 1 else ("are", "them")
+    said = f"interrupted, {count} of {of} frames {are} kept in {frames_folder(out)}; --resume goes on from {them}"
     plain, batch = (json.loads(file.read_text(encoding="utf-8")) for file in (report, summary))
     assert (plain["exit_code"], plain["error"]) == (code, said if count else "interrupted, no frame is kept")
     row = batch["shots"][0]

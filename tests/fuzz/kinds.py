@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from . import files, meshes, odd, records, values, wholes
+from . import files, meshes, odd, records, shown, values, wholes
 
-KINDS = (*files.KINDS, *meshes.KINDS, *values.KINDS, *wholes.KINDS, *odd.KINDS, *records.KINDS)
+KINDS = (*files.KINDS, *meshes.KINDS, *values.KINDS, *wholes.KINDS, *odd.KINDS, *records.KINDS, *shown.KINDS)

@@ -1,0 +1,146 @@
+"""What a renderer shows and when: purposes, blocked samples, gaps, holes, rates, open bodies, cuts and loose pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, Vt
+
+from .bases import garments_of
+from .damage import numbers
+from .meshes import OWN, a_mesh
+from .mutant import Draft, Kind
+
+
+def _vectors(points: np.ndarray) -> Vt.Vec3fArray:
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
+
+
+def _faces(mesh: UsdGeom.Mesh) -> list[np.ndarray]:
+    """Corners of each face."""
+    counts, indices = (
+        numbers(each.Get()) for each in (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    )
+    return np.split(indices, np.cumsum(counts)[:-1])
+
+
+def _set_faces(mesh: UsdGeom.Mesh, faces: list[np.ndarray]) -> None:
+    mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.array([len(face) for face in faces], np.int32)))
+    mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
+
+
+def _purpose(draft: Draft) -> None:
+    """Purposes and visibility of a mesh, or of what is above it, and bodies that are found or named."""
+    stage = draft.open()
+    prim = a_mesh(draft, stage).GetPrim()
+    prim = draft.pick([prim, prim.GetParent()])
+    purpose = draft.pick(["default", "render", "proxy", "guide"])
+    UsdGeom.Imageable(prim).CreatePurposeAttr(purpose)
+    if draft.chance(0.4):
+        UsdGeom.Imageable(prim).MakeInvisible(draft.pick([Usd.TimeCode.Default(), Usd.TimeCode(2.0)]))
+    draft.options["colliders"] = draft.pick([(), ("auto",), ("/World",)])
+    draft.save(stage, f"{prim.GetPath()}: purpose {purpose}, colliders {draft.options['colliders']}")
+
+
+def _blocks(draft: Draft) -> None:
+    """Samples of points that are blocked, empty, left out, or scaled to nothing."""
+    stage = draft.open()
+    mesh = a_mesh(draft, stage)
+    attribute = mesh.GetPointsAttr()
+    times = attribute.GetTimeSamples() or [1.0, 2.0]
+    some = [time for time in times if draft.chance(0.4)]
+    how = draft.pick(["block", "empty", "gap", "scale"])
+    for time in some:
+        if how == "gap":
+            attribute.ClearAtTime(time)
+        elif how == "scale":
+            UsdGeom.XformCommonAPI(mesh.GetPrim()).SetScale((0.0, 0.0, 0.0), time)
+        else:
+            attribute.Set(Sdf.ValueBlock() if how == "block" else Vt.Vec3fArray(), time)
+    if draft.chance(0.3) and some:
+        draft.options["frames"] = (min(some), max(some))
+    draft.save(stage, f"{attribute.GetPath()}: {how} at {some}")
+
+
+def _rates(draft: Draft) -> None:
+    """Samples at other times than the shot's, and stages of odd rates."""
+    stage = draft.open()
+    attribute = a_mesh(draft, stage).GetPointsAttr()
+    scale, shift = draft.pick([0.04, 0.5, 1.25, 24.0]), draft.pick([0.0, 0.5, 1000.0])
+    samples = {time: attribute.Get(time) for time in attribute.GetTimeSamples()}
+    for time in samples:
+        attribute.ClearAtTime(time)
+    for time, value in samples.items():
+        attribute.Set(value, scale * time + shift)
+    stage.SetTimeCodesPerSecond(draft.pick([1.0, 23.976, 24.0, 960.0]))
+    draft.save(stage, f"{attribute.GetPath()}: times by {scale:g} plus {shift:g}")
+
+
+def _open_bodies(draft: Draft) -> None:
+    """Meshes that lack faces: deleted, or in holeIndices, or drawn as a subdivision surface."""
+    stage = draft.open()
+    mesh = a_mesh(draft, stage)
+    faces = _faces(mesh)
+    gone = [index for index in range(len(faces)) if draft.chance(draft.pick([0.1, 0.5]))]
+    if draft.chance(0.5) and len(gone) < len(faces):
+        _set_faces(mesh, [face for index, face in enumerate(faces) if index not in gone])
+    else:
+        mesh.CreateHoleIndicesAttr(Vt.IntArray(gone))
+    mesh.CreateSubdivisionSchemeAttr(draft.pick(["none", "catmullClark", "loop", "bilinear"]))
+    draft.options["colliders"] = draft.pick([(), ("auto",)])
+    draft.save(stage, f"{mesh.GetPath()}: {len(gone)} of {len(faces)} faces gone")
+
+
+def _cut(draft: Draft) -> None:
+    """A garment whose faces have corners of their own, all or some, apart by nothing or a little; or a sheet twice."""
+    stage = draft.open()
+    mesh = UsdGeom.Mesh(draft.pick(garments_of(stage)))
+    faces = _faces(mesh)
+    twice, part = draft.chance(0.3), draft.pick([0.2, 1.0])
+    source, cut = [*range(1 + max(int(face.max()) for face in faces))], list[np.ndarray]()
+    for face in faces:
+        if draft.chance(part):
+            cut.append(np.arange(len(source), len(source) + len(face)))
+            source += face.tolist()
+        else:
+            cut.append(face)
+    _set_faces(mesh, [*faces, *(each[:: draft.pick([1, -1])] for each in cut)] if twice else cut)
+    apart = draft.pick([0.0, 0.0, 1e-5, 1e-2])
+    for code in (Usd.TimeCode.Default(), *map(Usd.TimeCode, mesh.GetPointsAttr().GetTimeSamples())):
+        points = numbers(mesh.GetPointsAttr().Get(code)).reshape(-1, 3)[source]
+        mesh.GetPointsAttr().Set(_vectors(points + apart * np.sin(np.arange(len(points)))[:, None]), code)
+    if draft.chance(0.3):
+        draft.options["overrides"] = (f"seam:tolerance={draft.pick(['1e-4', '0.1', '1'])}",)
+    draft.save(stage, f"{mesh.GetPath()}: {len(cut)} faces cut, {apart:g} apart" + ", twice" * twice)
+
+
+def _pieces(draft: Draft) -> None:
+    """Boxes on a garment as buttons are: small, large, or all there is; some asked to be rigid."""
+    stage = draft.open()
+    mesh = UsdGeom.Mesh(draft.pick(garments_of(stage)))
+    faces = _faces(mesh)
+    first = numbers(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime())).reshape(-1, 3)
+    box = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    size = draft.pick([0.0, 1e-3, 0.05, 2.0]) * float(np.ptp(first, axis=0).max())
+    extra = [np.array(side) + len(first) for side in sides]
+    alone = draft.chance(0.1)
+    _set_faces(mesh, extra if alone else [*faces, *extra])
+    for code in (Usd.TimeCode.Default(), *map(Usd.TimeCode, mesh.GetPointsAttr().GetTimeSamples())):
+        points = numbers(mesh.GetPointsAttr().Get(code)).reshape(-1, 3)
+        mesh.GetPointsAttr().Set(_vectors(np.vstack([points, points.mean(axis=0) + size * box])), code)
+    if draft.chance(0.5):
+        subset = UsdGeom.Subset.Define(stage, mesh.GetPath().AppendChild("badge"))
+        subset.CreateIndicesAttr(Vt.IntArray(draft.pick([[0, 1], [*range(len(faces))], [10**6], []])))
+        kind, value = draft.pick([("Bool", True), ("Bool", False), ("Int", 3), ("Token", "x")])
+        subset.GetPrim().CreateAttribute("physgraph:rigid", getattr(Sdf.ValueTypeNames, kind)).Set(value)
+    draft.save(stage, f"{mesh.GetPath()}: a box of {size:g}" + ", alone" * alone)
+
+
+KINDS = (
+    Kind("shown: purposes", _purpose, OWN),
+    Kind("shown: blocked samples", _blocks, OWN),
+    Kind("shown: other times", _rates, OWN),
+    Kind("shown: open bodies", _open_bodies, OWN),
+    Kind("shown: cut along edges", _cut, OWN),
+    Kind("shown: loose pieces", _pieces, OWN),
+)
