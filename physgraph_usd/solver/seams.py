@@ -1,4 +1,4 @@
-"""Seams that welding cannot close: between garments, where sheets lie on one another, and of unequal resolution."""
+"""Seams that welding cannot close: of two garments, of three sheets, and of borders with unequal resolution."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _seam(level: Level, sewn_at: Float[np.ndarray, "coarse 3"]) -> Seam | None:
     sewn = np.asarray(np.isfinite(sewn_at).all(axis=1))
     if not sewn.any():
         return None
-    # A fine vertex lies on a seam if all cage vertices do that it is made of; one without area is no cloth to sew.
+    # A fine vertex is sewn if all cage vertices of its stencil are. Vertices without area are no cloth.
     share = np.asarray(level.from_coarse @ sewn.astype(np.float64)).ravel()
     on_seam = (share > 1.0 - 1e-9) & (level.vertex_area > 0).cpu().numpy()
     points = np.asarray(level.from_coarse @ np.where(sewn[:, None], sewn_at, 0.0))
@@ -40,7 +40,7 @@ def _seam(level: Level, sewn_at: Float[np.ndarray, "coarse 3"]) -> Seam | None:
 
 
 def _between(level: Level, points: np.ndarray, on_seam: np.ndarray, alone: np.ndarray, within: float) -> OnEdge:
-    """Vertices that lie on another border's edges, between its vertices."""
+    """Border vertices between the vertices of another border, with the edge under each."""
     edges, triangles = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
     sides = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
     border = edges[np.bincount(sides, minlength=len(edges)) == 1]

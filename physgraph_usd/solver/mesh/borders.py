@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 from .topology import PolygonMesh
 
 SPACING = 0.25
-"""Distance of the points that stand for an edge in the search, in median border edges."""
+"""Distance between the sample points of an edge, in median border edges."""
 MOST_SAMPLES = 64
-"""Most such points of one edge."""
+"""Most sample points of one edge."""
 NEAREST = 16
-"""Points looked at for each vertex: the edges that meet in it have some, those of another border the rest."""
+"""Most sample points examined for each vertex, its own two edges' included."""
 
 
 def open_edges(mesh: PolygonMesh) -> Int[np.ndarray, "edges 2"]:

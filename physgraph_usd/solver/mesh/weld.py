@@ -1,9 +1,8 @@
-"""Welding: vertices of one mesh that stay at one place are one vertex to the solver.
+"""Welding: coincident vertices of one mesh become one vertex of the solver's mesh.
 
-Exporters split a garment at its seams, and draw a sheet twice to show it from both sides. Forces that bend, smooth
-surfaces and normals need a face on both sides of an edge, so open edges that lie on one another are joined two by two,
-and of faces that lie on one another one is solved. Edges where more than two sheets meet stay as they are: `seams`
-sews those.
+Exporters split a garment at its seams, and draw a sheet twice to show both sides. Bending forces, smooth surfaces and
+normals need a face on each side of an edge. So coincident open edges are joined in pairs, and of coincident faces the
+first is solved. Edges with more than two coincident copies stay apart: `seams` sews them.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from .subdivide import Refinement, face_points, subdivide_times
 from .topology import PolygonMesh, find_edges, joined_by
 
 AT_ONE_PLACE = 5e-3
-"""Distance under which points are at one place, in mean edges."""
+"""Distance under which vertices coincide, in mean edges: exporters round to a few micrometres."""
 WIDEST = 0.25
-"""Most that a tolerance may be, in mean edges."""
+"""Largest seam tolerance, in mean edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class Weld:
         return self.mesh is self.apart
 
     def joined(self, values: np.ndarray) -> np.ndarray:
-        """The mean value of the vertices that are one, exact where they are equal, shape (W, ...)."""
+        """Mean value of the vertices joined into each welded vertex, exact for equal values, shape (W, ...)."""
         if self.is_none:
             return values
         first = self._first
@@ -58,13 +57,13 @@ class Weld:
         return values[first] + (out / count).astype(values.dtype)
 
     def largest(self, values: Float[np.ndarray, " vertices"]) -> Float[np.ndarray, " welded"]:
-        """The largest value of the vertices that are one."""
+        """Largest value of the vertices joined into each welded vertex."""
         out = np.full(len(self._first), -np.inf)
         np.maximum.at(out, self.number, values)
         return out
 
     def split(self, values: np.ndarray) -> np.ndarray:
-        """Values of the welded vertices at the vertices they were, shape (V, ...)."""
+        """Values of the welded vertices at the authored vertices, shape (V, ...)."""
         return values if self.is_none else values[self.number]
 
     def subdivided(self, levels: int) -> tuple[tuple[Refinement, ...], Weld]:
@@ -87,7 +86,7 @@ class Weld:
 
     @property
     def sides(self) -> Int[np.ndarray, " vertices"]:
-        """A number for each vertex, the same for those that have one normal: the two sides of a sheet have two."""
+        """A number for each vertex; vertices with one normal share it. The two sides of a doubled sheet have two."""
         shown = np.zeros(len(self.number), bool)
         shown[self.apart.indices[np.isin(self.apart.corner_face, self.faces)]] = True
         return np.unique(2 * self.number + ~shown, return_inverse=True)[1].reshape(-1)
@@ -189,7 +188,7 @@ def _sorted_corners(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
 
 
 def _corners_together(mesh: PolygonMesh, place: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Pairs of corners at one place of pairs of faces that lie on one another, shape (N, 2)."""
+    """Pairs of coincident corners of pairs of coincident faces, shape (N, 2)."""
     pairs = [np.zeros((0, 2), np.int64)]
     for a, b in zip(one.tolist(), other.tolist(), strict=True):
         here, there = (mesh.indices[mesh.starts[face] : mesh.starts[face + 1]].astype(np.int64) for face in (a, b))
@@ -198,7 +197,7 @@ def _corners_together(mesh: PolygonMesh, place: np.ndarray, one: np.ndarray, oth
 
 
 def _edge_pairs(mesh: PolygonMesh, place: np.ndarray) -> np.ndarray:
-    """Pairs of ends of open edges at one place, of places at which there are two, shape (N, 2)."""
+    """Pairs of ends of coincident open edges, of which there are exactly two, shape (N, 2)."""
     edges = open_edges(mesh)
     edges = edges[place[edges[:, 0]] != place[edges[:, 1]]]
     turned = place[edges[:, 0]] > place[edges[:, 1]]
@@ -212,9 +211,9 @@ def _edge_pairs(mesh: PolygonMesh, place: np.ndarray) -> np.ndarray:
 
 
 def seam_reach(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"], tolerance: float) -> float:
-    """Distance under which vertices are at one place [m]: the tolerance, or `AT_ONE_PLACE` where that is larger.
+    """Distance under which vertices coincide [m]: the tolerance, at least `AT_ONE_PLACE`, at most `WIDEST`.
 
-    Never more than a quarter of the mean edge, or vertices of one border would be taken for one.
+    A larger tolerance would join neighbours of one border.
     """
     ends = mesh.half_edges.edges
     edge = float(np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1).mean())
@@ -222,7 +221,7 @@ def seam_reach(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"], toler
 
 
 def pairs_within(poses: Sequence[np.ndarray], which: np.ndarray, within: float) -> np.ndarray:
-    """Pairs of some vertices that are nearer than a distance [m] in every pose, shape (N, 2)."""
+    """Pairs of some vertices within a distance [m] in every pose, shape (N, 2)."""
     for pose in poses:
         which = which[np.isfinite(pose[which]).all(axis=1)]
     if len(which) < 2:

@@ -15,13 +15,13 @@ from ...solver.seams import finer_side
 from ..stage import Notice
 
 POSES = 10
-"""Frames, spread over the shot, in all of which sewn points must be together."""
+"""Number of frames, spread over the shot. Sewn points are together in all of them."""
 BESIDE = 0.1
-"""Distance under which two borders run side by side, in the edges at a vertex."""
+"""Distance between two borders under which they run side by side, in border edges."""
 LONG = 4
-"""Edges along which they must, to be told of."""
+"""Fewest border edges side by side that are worth a warning."""
 Cages = Sequence[np.ndarray | None]
-"""World positions of each garment [m] in one frame, None where it is not there."""
+"""World positions of each garment [m] in one frame; None for an absent garment."""
 
 
 def sewn_garments(
@@ -86,7 +86,7 @@ class _Cloth:
         return shortest[vertices]
 
     def look(self, points: np.ndarray) -> tuple[np.ndarray, OnEdge, OnEdge]:
-        """Pairs of vertices at one place, vertices on another border's edge, and vertices beside another border."""
+        """Pairs of coincident vertices, border vertices on an edge of another border, and vertices beside one."""
         pairs = pairs_within([points], self._used, float(self._reach.max(initial=0.0)))
         together = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
         pairs = pairs[together & self._rest_together(pairs)]
