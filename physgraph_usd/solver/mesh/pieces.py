@@ -53,7 +53,7 @@ def pieces_of(mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], asked: B
     open_side = np.bincount(piece[ends[mesh.half_edges.count == 1, 0]], minlength=count) > 0
     faces = np.bincount(of_face, minlength=count)
     closed = ~open_side & (faces > 1)
-    largest = int(area.argmax())
+    largest = int(np.where(faces > 0, area, -1.0).argmax())
     length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
     edge = float(length[piece[ends[:, 0]] == largest].mean())
     light = (area < LIGHT * area[largest]) & (faces > 0)
