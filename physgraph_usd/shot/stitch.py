@@ -20,6 +20,7 @@ import numpy as np
 from ..errors import LayerError, UsageError, counted
 from ..interrupts import signals_noted
 from ..solver.mesh.subdivide import subdivide_times
+from ..solver.mesh.weld import Weld
 from ..usd.files import LAYER_SUFFIXES, check_targets, files_of
 from ..usd.provenance import is_only_ours, recorded_shot, write_root
 from ..usd.read.reader import Shot
@@ -377,7 +378,8 @@ def _mover(stack: ExitStack, shot: Path, parts: Sequence[ChunkLayer]) -> tuple[l
     opened = stack.enter_context(closing(open_with_colliders(str(shot), **how)))
     paths = [str(source.path) + ("_refined" if options.mode == "sibling" else "") for source in opened.sources]
     levels = [_level_of(opened, index, counts.get(path)) for index, path in enumerate(paths)]
-    mover = partial(_move_local, opened, SafeMover(opened, options, levels))
+    welds = [source.weld.subdivided(level)[1] for source, level in zip(opened.sources, levels, strict=True)]
+    mover = partial(_move_local, opened, welds, SafeMover(opened, options, levels))
     return list(dict.fromkeys([*paths, *counts])), mover
 
 
@@ -399,21 +401,27 @@ def _rounded(_time: object, _near: object, _far: object, wanted: Positions) -> t
 
 
 def _move_local(
-    opened: Shot, mover: SafeMover, time: float | None, near: Positions, far: Positions, wanted: Positions
+    opened: Shot,
+    welds: Sequence[Weld],
+    mover: SafeMover,
+    time: float | None,
+    near: Positions,
+    far: Positions,
+    wanted: Positions,
 ) -> tuple[list[np.ndarray | None], str]:
     """Move as `Mover` does, in local positions of the shot's garments; others go where they are wanted."""
     found, _ = _rounded(time, near, far, wanted)
     garments = range(len(opened.sources))
     matrices = [None if found[index] is None else opened.to_metres(index, time) for index in garments]
-    worlds = [list(map(_world, side, matrices)) for side in (near, far, found)]
+    worlds = [list(map(_world, side, matrices, welds)) for side in (near, far, found)]
     moved, worse = mover(time, *worlds)
     for index, start, end, matrix in zip(garments, worlds[2], moved, matrices, strict=True):
         if start is not None and end is not None and matrix is not None and not np.array_equal(start, end):
-            found[index] = to_local(end, matrix, str(opened.sources[index].path), time)
+            found[index] = to_local(welds[index].split(end), matrix, str(opened.sources[index].path), time)
     return found, worse
 
 
-def _world(local: np.ndarray | None, to_metres: np.ndarray | None) -> np.ndarray | None:
+def _world(local: np.ndarray | None, to_metres: np.ndarray | None, weld: Weld) -> np.ndarray | None:
     if local is None or to_metres is None:
         return None
-    return local.astype(np.float64) @ to_metres[:3, :3].T + to_metres[:3, 3]
+    return weld.joined(local.astype(np.float64) @ to_metres[:3, :3].T + to_metres[:3, 3])

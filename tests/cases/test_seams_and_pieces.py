@@ -16,6 +16,7 @@ from shots import faults, fine, refine
 from stages import new_stage, save, vec3
 from test_bodies_as_drawn import Faces, tube
 
+from physgraph_usd.shot.stitch import stitch
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.mesh.subdivide import compose, subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -148,6 +149,16 @@ class TestWelded:
         front = np.array([np.flatnonzero(same == vertex)[0] for vertex in range(len(rest[0]))])
         behind = np.array([np.flatnonzero(same == vertex)[1] for vertex in range(len(rest[0]))])
         np.testing.assert_allclose(normals[front], -normals[behind], atol=1e-5)
+
+    def test_chunks_are_stitched(self, tmp_path: Path):
+        """Both frames before the seam in time are solved twice, and moved safely."""
+        halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
+        shot = shot_of(tmp_path, sheet=halves)
+        refine(shot, tmp_path / "a.usdc", frames=(1.0, 3.0), preroll=2)
+        refine(shot, tmp_path / "b.usdc", frames=(4.0, 5.0), preroll=2)
+        stitch([tmp_path / "a.usdc", tmp_path / "b.usdc"], tmp_path / "fine.usdc")
+        assert widest_gap(shot, tmp_path / "fine.usdc", sheet=halves) == 0.0
+        assert not faults(tmp_path / "fine.usdc", shot)
 
     def test_borders_that_part_in_a_frame_are_not_welded(self):
         points, _ = halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
