@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from .forces.seam import Seam
 from .level import Level
-from .mesh.borders import OnEdge, nearest_edges
+from .mesh.borders import OnEdge, finer_side, nearest_edges
 from .mesh.topology import find_edges
 from .mesh.weld import AT_ONE_PLACE, pairs_within
 from .scene import Garment
@@ -46,27 +46,3 @@ def _between(level: Level, points: np.ndarray, on_seam: np.ndarray, alone: np.nd
     border = edges[np.bincount(sides, minlength=len(edges)) == 1]
     border = border[on_seam[border].all(axis=1)]
     return finer_side(points, border, nearest_edges(points, alone, border, np.full(len(alone), within)))
-
-
-def finer_side(points: Float[np.ndarray, "vertices 3"], borders: np.ndarray, near: OnEdge) -> OnEdge:
-    """Of vertices on edges of other borders those that follow such an edge: the finer border follows the coarser.
-
-    No edge that is followed ends in a vertex that follows.
-
-    Args:
-        points: Positions [m].
-        borders: Open edges, shape (E, 2).
-        near: Vertices of the borders and the edges they lie on.
-    """
-    length = np.linalg.norm(points[borders[:, 0]] - points[borders[:, 1]], axis=1)
-    own = np.full(len(points), np.inf)
-    np.minimum.at(own, borders, length[:, None])
-    other = np.linalg.norm(points[near.edge[:, 0]] - points[near.edge[:, 1]], axis=1)
-    follows, followed, kept = set[int](), set[int](), np.zeros(len(near.vertex), bool)
-    for row in np.argsort(-other / own[near.vertex], kind="stable").tolist():
-        vertex, ends = int(near.vertex[row]), near.edge[row].tolist()
-        if vertex not in followed and follows.isdisjoint(ends):
-            follows.add(vertex)
-            followed.update(ends)
-            kept[row] = True
-    return near.where(kept)

@@ -172,8 +172,12 @@ class TestWelded:
         points, _ = three = together(panel(-0.12, 0.12, 4), wall, standing)
         assert weld(mesh_of(three), [points], 1e-5).is_none
 
-    def test_values_of_joined_points_are_their_mean_and_come_back(self):
-        points, _ = halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
+    @pytest.mark.parametrize("turned", [False, True])
+    def test_values_of_joined_points_are_their_mean_and_come_back(self, turned: bool):
+        right, faces = panel(0.0, 0.12, 4)
+        points, _ = halves = together(
+            panel(-0.12, 0.12, 4), (right, [face[::-1] for face in faces] if turned else faces)
+        )
         found = weld(mesh_of(halves), [points], 1e-5)
         assert found.mesh.vertex_count == len(points) - 9
         np.testing.assert_array_equal(found.split(found.joined(points)), points)

@@ -93,6 +93,30 @@ def nearest_edges(
     return near.where(near.distance <= limit[near.vertex])
 
 
+def finer_side(points: Float[np.ndarray, "vertices 3"], borders: np.ndarray, near: OnEdge) -> OnEdge:
+    """Of vertices on edges of other borders those that follow such an edge: the finer border follows the coarser.
+
+    No edge that is followed ends in a vertex that follows.
+
+    Args:
+        points: Positions [m].
+        borders: Open edges, shape (E, 2).
+        near: Vertices of the borders and the edges they lie on.
+    """
+    length = np.linalg.norm(points[borders[:, 0]] - points[borders[:, 1]], axis=1)
+    own = np.full(len(points), np.inf)
+    np.minimum.at(own, borders, length[:, None])
+    other = np.linalg.norm(points[near.edge[:, 0]] - points[near.edge[:, 1]], axis=1)
+    follows, followed, kept = set[int](), set[int](), np.zeros(len(near.vertex), bool)
+    for row in np.argsort(-other / own[near.vertex], kind="stable").tolist():
+        vertex, ends = int(near.vertex[row]), near.edge[row].tolist()
+        if vertex not in followed and follows.isdisjoint(ends):
+            follows.add(vertex)
+            followed.update(ends)
+            kept[row] = True
+    return near.where(kept)
+
+
 def _neighbours(edges: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """Whether an edge ends in a vertex or in one that an open edge joins to it, shape (N,)."""
     size = int(max(edges.max(), vertex.max(initial=0))) + 1

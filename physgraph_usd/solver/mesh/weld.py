@@ -73,10 +73,9 @@ class Weld:
             return steps, unwelded(steps[-1].mesh) if steps else self
         welded, number, apart, faces = self.mesh, self.number, self.apart, self.faces
         for step, fine in zip(steps, subdivide_times(self.mesh, levels), strict=True):
-            face = np.arange(apart.face_count)
-            if len(faces) < apart.face_count:
-                own = _sorted_corners(apart, number[apart.indices])
-                face = _first_like(own, _sorted_corners(welded, welded.indices))
+            # Children of a face that was turned over come in another order.
+            own = _sorted_corners(apart, number[apart.indices])
+            face = _first_like(own, _sorted_corners(welded, welded.indices))
             of_edges = welded.vertex_count + find_edges(fine.edges, number[step.edges])
             of_faces = face_points(welded)[face[apart.is_polygon]]
             number = np.concatenate([number, of_edges, of_faces])

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...solver.mesh.borders import OnEdge, nearest_edges, open_edges
+from ...solver.mesh.borders import OnEdge, finer_side, nearest_edges, open_edges
 from ...solver.mesh.topology import joined_by
 from ...solver.mesh.weld import pairs_within
 from ...solver.scene import Garment
-from ...solver.seams import finer_side
 from ..stage import Notice
 
 POSES = 10
