@@ -83,7 +83,7 @@ def shot_of(folder: Path, **shapes: Shape) -> Path:
     return Path(save(stage))
 
 
-def widest_gap(shot: Path, layer: Path, shapes: dict[str, Shape], within: float = SAME) -> float:
+def widest_gap(shot: Path, layer: Path, shapes: dict[str, Shape], *, within: float = SAME) -> float:
     """How far fine points that lie together in the shapes are apart in any frame, at most [m]."""
     rest = np.concatenate([compose(subdivide_times(mesh_of(each), LEVEL)) @ each[0] for each in shapes.values()])
     pairs = cKDTree(rest).query_pairs(within, output_type="ndarray")
@@ -223,7 +223,7 @@ class TestSewn:
         remedy = told.partition("--set ")[2].split(";")[0].split()[0]
         assert "not sewn" not in warnings_of(shot, overrides=[remedy])
         refine(shot, tmp_path / "fine.usdc", overrides=(remedy,))
-        assert widest_gap(shot, tmp_path / "fine.usdc", shapes, 4e-4) < 1e-6
+        assert widest_gap(shot, tmp_path / "fine.usdc", shapes, within=4e-4) < 1e-6
 
     def test_a_hem_over_a_hem_is_told_of_once_and_a_body_apart_not_at_all(self, tmp_path: Path):
         apart = {"left": panel(-0.12, 0.12, 4), "right": panel(0.004, 0.12, 4)}
