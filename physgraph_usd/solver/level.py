@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
-from .mesh.creases import creases_of, halves_of, on_edges
+from .mesh.creases import crease_mask, creases_of, halves_of
 from .mesh.defects import FLAT
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
 from .mesh.lengths import ANGLES, LENGTHS, NORMALS, ElementValues
@@ -301,7 +301,7 @@ def _carried(
     for number, refinement in enumerate(chain):
         flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
         linear_step = refinement.linear
-        smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=on_edges(mesh, creases)))
+        smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=crease_mask(mesh, creases)))
         smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
         creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
         mesh, face = refinement.mesh, face[refinement.parent_face]

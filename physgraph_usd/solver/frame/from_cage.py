@@ -130,7 +130,7 @@ class Followers:
         if self._inverse is not None:
             base = self._from_coarse @ coarse
             out[self._which] = base[self._which] + self._inverse.solve(self._beside @ (out - base))
-            self._rigid.place(out, base)
+        self._rigid.place(out, self._from_coarse, coarse)
         return out
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from ..level import Level
+from ..level import PIN_MARGIN, Level
 from ..rigid import best_motion
 from ..scene import Garment
 
@@ -30,21 +31,26 @@ class RigidParts:
                 continue
             tree = cKDTree(rest[under])
             for members in parts_of(level, garment.rigid, span):
+                if not (level.pin[members] < 1.0 - PIN_MARGIN).all():
+                    continue  # Pinned parts stay on the cage.
                 middle = rest[members].mean(axis=0)
                 radius = float(np.linalg.norm(rest[members] - middle, axis=1).max())
                 near = tree.query(middle, k=min(LEAST, len(under)))[1].reshape(-1)
                 around = np.asarray(tree.query_ball_point(middle, radius + spacing), np.int64)
                 self._parts.append((members, under[np.union1d(near, around).astype(np.int64)]))
 
-    def place(self, out: Float[np.ndarray, "vertices 3"], base: Float[np.ndarray, "vertices 3"]) -> None:
-        """Move the parts from their places on the upsampled cage to those on the cloth [m]; ``out`` is written to.
+    def place(
+        self, out: Float[np.ndarray, "vertices 3"], from_coarse: sp.csr_matrix, coarse: Float[np.ndarray, "coarse 3"]
+    ) -> None:
+        """Move the parts from their places on the upsampled cage to the cloth [m]; ``out`` is written to.
 
         Each part goes with the best rigid motion of the cloth under it, and then away from the cloth until no vertex
         under it is nearer to the part than on the cage.
         """
         for members, under in self._parts:
-            motion = best_motion(base[under], out[under])
-            part, before, after = motion(base[members]), motion(base[under]), out[under]
+            base, cage = from_coarse[under] @ coarse, from_coarse[members] @ coarse
+            motion = best_motion(base, out[under])
+            part, before, after = motion(cage), motion(base), out[under]
             away = _normal(before, part)
             out[members] = part + max(0.0, float(((after - before) @ away).max())) * away
 

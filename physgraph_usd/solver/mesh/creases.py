@@ -42,6 +42,6 @@ def halves_of(edges: Int[np.ndarray, "edges 2"], middle: Int[np.ndarray, " edges
     return halves[np.lexsort((halves[:, 1], halves[:, 0]))].astype(np.int32)
 
 
-def on_edges(mesh: PolygonMesh, creases: Int[np.ndarray, "creases 2"]) -> Bool[np.ndarray, " edges"] | None:
+def crease_mask(mesh: PolygonMesh, creases: Int[np.ndarray, "creases 2"]) -> Bool[np.ndarray, " edges"] | None:
     """Whether each edge of a mesh is one of the creases; None without creases."""
     return find_edges(creases, mesh.half_edges.edges) >= 0 if len(creases) else None

@@ -16,7 +16,7 @@ LIGHT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class PieceKinds:
     """Vertices of the pieces that are no sheet.
 
     Attributes:
@@ -30,7 +30,9 @@ class Pieces:
     joined: bool
 
 
-def pieces_of(mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], asked: Bool[np.ndarray, " faces"]) -> Pieces:
+def sort_pieces(
+    mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], asked: Bool[np.ndarray, " faces"]
+) -> PieceKinds:
     """Find the pieces.
 
     A piece is rigid if it is closed and small beside the largest piece, if it is smaller than an edge of that, or if
@@ -61,7 +63,7 @@ def pieces_of(mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], asked: B
     wanted = np.bincount(of_face, asked, count)
     rigid |= (wanted == faces) & (faces > 0)
     number = np.where(rigid, np.cumsum(rigid) - 1, -1)
-    return Pieces((closed & ~rigid)[piece], number[piece], bool(((wanted > 0) & (wanted < faces)).any()))
+    return PieceKinds((closed & ~rigid)[piece], number[piece], bool(((wanted > 0) & (wanted < faces)).any()))
 
 
 def _areas(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:

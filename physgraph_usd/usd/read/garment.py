@@ -12,7 +12,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import GarmentError, SchemaError, counted
-from ...solver.mesh.pieces import pieces_of
+from ...solver.mesh.pieces import sort_pieces
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.mesh.weld import Weld, seam_reach, weld
 from ...solver.scene import Garment, GarmentFrame
@@ -221,7 +221,7 @@ def _pieces(prim: Usd.Prim, weld: Weld, rest: np.ndarray, kept: np.ndarray) -> t
         if attribute and attribute.Get():
             faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
             asked |= np.isin(kept, [] if faces is None else np.asarray(faces))
-    found, path, notices = pieces_of(weld.mesh, weld.joined(rest), asked), str(prim.GetPath()), []
+    found, path, notices = sort_pieces(weld.mesh, weld.joined(rest), asked), str(prim.GetPath()), []
     if count := int(found.rigid.max(initial=-1)) + 1:
         message = f"{counted(count, 'piece')} of it moved rigidly with the cloth under, as buttons are"
         notices.append(Notice(path, None, message))
@@ -261,7 +261,7 @@ def _rest_and_weld(
     within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
     found = weld(mesh, poses, within)
     if not found.is_none:
-        poses = [*animation.poses().values()]
+        poses = [*animation.poses().values()] or poses
         found = weld(mesh, poses, within)
     rest = _rest(prim, found, animation, request, matrix=matrix)
     return rest, found if found.is_none else weld(mesh, [*poses, rest.points], within)
