@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .topology import PolygonMesh, find_edges
+from .topology import PolygonMesh, face_normals, find_edges
 
 SHARP = 45.0
 """Angle between the normals of two faces at rest from which their edge is sharp [degrees]."""
@@ -23,17 +23,11 @@ def creases_of(
     """
     if closed is None or not closed.any():
         return np.zeros((0, 2), np.int32)
-    half = mesh.half_edges
-    normal = np.zeros((mesh.face_count, 3))
-    np.add.at(normal, mesh.corner_face, np.cross(rest[mesh.indices], rest[mesh.indices[mesh.next_corner]]))
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-    order = np.argsort(half.edge, kind="stable")
-    starts = np.cumsum(half.count) - half.count
-    double = np.flatnonzero((half.count == 2) & closed[half.edges[:, 0]])
-    one, two = order[starts[double]], order[starts[double] + 1]
-    same = np.where(half.forward[one] != half.forward[two], 1.0, -1.0)  # Faces that are wound against one another.
+    half, normal = mesh.half_edges, face_normals(mesh, rest)
+    one, two = mesh.twin_corners[closed[mesh.indices[mesh.twin_corners[:, 0]]]].T
+    same = np.where(half.forward[one] != half.forward[two], 1.0, -1.0)  # Neighbours may be wound unlike.
     cosine = same * (normal[mesh.corner_face[one]] * normal[mesh.corner_face[two]]).sum(axis=1)
-    return half.edges[double[cosine < np.cos(np.radians(SHARP))]]
+    return half.edges[half.edge[one[cosine < np.cos(np.radians(SHARP))]]]
 
 
 def halves_of(edges: Int[np.ndarray, "edges 2"], middle: Int[np.ndarray, " edges"]) -> Int[np.ndarray, "halves 2"]:

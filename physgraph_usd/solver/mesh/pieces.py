@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .topology import PolygonMesh, joined_by
+from .topology import PolygonMesh, area_vectors, joined_by
 
 SMALL = 0.25
 """Size of a closed piece under which it is a rigid part, in sizes of the largest piece."""
@@ -47,7 +47,7 @@ def sort_pieces(
     piece = joined_by(ends, mesh.vertex_count)
     of_face = piece[mesh.indices[mesh.starts[:-1]]]
     count = int(piece.max(initial=-1)) + 1
-    area = np.bincount(of_face, _areas(mesh, rest), count)
+    area = np.bincount(of_face, 0.5 * np.linalg.norm(area_vectors(mesh, rest), axis=1), count)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, piece, rest)
     np.maximum.at(high, piece, rest)
@@ -64,11 +64,3 @@ def sort_pieces(
     rigid |= (wanted == faces) & (faces > 0)
     number = np.where(rigid, np.cumsum(rigid) - 1, -1)
     return PieceKinds((closed & ~rigid)[piece], number[piece], bool(((wanted > 0) & (wanted < faces)).any()))
-
-
-def _areas(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
-    """Area of each face [m^2], shape (F,)."""
-    here, after = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
-    sums = np.zeros((mesh.face_count, 3))
-    np.add.at(sums, mesh.corner_face, np.cross(here, after))
-    return 0.5 * np.linalg.norm(sums, axis=1)

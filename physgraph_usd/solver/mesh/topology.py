@@ -140,6 +140,14 @@ class PolygonMesh:
         edges = np.stack([unique // stride, unique % stride], axis=1).astype(np.int32)
         return HalfEdges(edges, edge.reshape(-1).astype(np.int32), here <= there, count.astype(np.int32))
 
+    @cached_property
+    def twin_corners(self) -> np.ndarray:
+        """The two corners whose half-edges are one edge, of each edge with two, shape (N, 2), in the edges' order."""
+        half = self.half_edges
+        order, starts = np.argsort(half.edge, kind="stable"), np.cumsum(half.count) - half.count
+        double = starts[(half.count == 2) & (half.edges[:, 0] != half.edges[:, 1])]
+        return np.stack([order[double], order[double + 1]], axis=1)
+
     def check_range(self) -> None:
         """Check the indices.
 
@@ -196,6 +204,18 @@ class PolygonMesh:
             turned = np.take_along_axis(corners, (first[:, None] + np.arange(size)) % size, axis=1)
             triangles[offsets[faces, None] + np.arange(size - 2)] = _fans(turned)
         return TriangleSplit(triangles, np.repeat(np.arange(self.face_count, dtype=np.int32), pieces))
+
+
+def area_vectors(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
+    """Twice the area vector of each face [m^2], shape (F, 3), by Newell's sum; faces have corners."""
+    here, after = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
+    return np.add.reduceat(np.cross(here, after), mesh.starts[: mesh.face_count])
+
+
+def face_normals(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
+    """Unit normal of each face, shape (F, 3); 0 for a face without area."""
+    area = area_vectors(mesh, points)
+    return area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def _fans(corners: np.ndarray) -> np.ndarray:

@@ -20,7 +20,8 @@ from .subdivide import Refinement, face_points, subdivide_times
 from .topology import PolygonMesh, find_edges, joined_by
 
 AT_ONE_PLACE = 5e-3
-"""Distance under which vertices coincide, in mean edges: exporters round to a few micrometres."""
+"""Distance under which vertices coincide, in mean edges: 4% of an edge after three subdivisions. With a thousandth, a
+border whose gap is near that is sewn at every second vertex, which is worse than either."""
 WIDEST = 0.25
 """Largest seam tolerance, in mean edges."""
 
@@ -138,10 +139,7 @@ def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> P
     Pieces in which some are not are wound counter-clockwise seen from outside.
     """
     half, count = mesh.half_edges, mesh.face_count
-    order = np.argsort(half.edge, kind="stable")
-    starts = np.cumsum(half.count) - half.count
-    double = np.flatnonzero((half.count == 2) & (half.edges[:, 0] != half.edges[:, 1]))
-    one, two = order[starts[double]], order[starts[double] + 1]
+    one, two = mesh.twin_corners.T
     unlike = half.forward[one] == half.forward[two]
     if not unlike.any():
         return mesh

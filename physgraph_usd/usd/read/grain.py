@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
-from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.topology import PolygonMesh, face_normals
 from ...solver.mesh.weld import Weld
 from ...solver.scene import Grain
 from ..stage import first_value
@@ -57,13 +57,6 @@ def read_grain(
     if turn.any():
         source += ", turned by primvars:physgraph:grain"
     return Grain(warp[weld.faces], weld.joined(painted["easeScale"]), weld.joined(painted["gather"] / 100.0)), source
-
-
-def face_normals(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
-    """Unit normal of each face by its area vector, shape (F, 3); 0 where it has none."""
-    here, after = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
-    area = np.add.reduceat(np.cross(here, after), mesh.starts[: mesh.face_count])
-    return area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def _down(normal: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -24,7 +24,6 @@ from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...interrupts import leave_if_asked
 from ...solver.colliders.choose_side import choose_side
 from ...solver.colliders.pose import MeshPose
-from ...solver.mesh.weld import seam_reach
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
 from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
@@ -349,14 +348,7 @@ def _sewn(
                 yield [points if np.ptp(points, axis=0).any() else None for points in cages]
 
     tolerances = [seam_tolerance(prim, request.overrides) for prim in prims]
-    first = next(poses(1), [])
-    reaches = [
-        0.0 if points is None else seam_reach(reader.garment.mesh, points, tolerance)
-        for reader, points, tolerance in zip(readers, first, tolerances, strict=False)
-    ]
-    if not first:
-        return [*readers]
-    garments, odd = sewn_garments([reader.garment for reader in readers], reaches, poses)
+    garments, odd = sewn_garments([reader.garment for reader in readers], tolerances, poses)
     notices += odd
     return [replace(reader, garment=garment) for reader, garment in zip(readers, garments, strict=True)]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...solver.mesh.borders import OnEdge, finer_side, nearest_edges, open_edges
 from ...solver.mesh.topology import joined_by
-from ...solver.mesh.weld import pairs_within
+from ...solver.mesh.weld import pairs_within, seam_reach
 from ...solver.scene import Garment
 from ..stage import Notice
 
@@ -24,7 +24,7 @@ Cages = Sequence[np.ndarray | None]
 
 
 def sewn_garments(
-    garments: Sequence[Garment], reaches: Sequence[float], poses: Callable[[int], Iterator[Cages]]
+    garments: Sequence[Garment], tolerances: Sequence[float], poses: Callable[[int], Iterator[Cages]]
 ) -> tuple[list[Garment], list[Notice]]:
     """Garments with the places at which their vertices are sewn, and notices of borders side by side.
 
@@ -33,12 +33,14 @@ def sewn_garments(
 
     Args:
         garments: The garments, welded.
-        reaches: Distance within which each garment's borders are sewn [m].
+        tolerances: Seam tolerance of each garment [m], as `seam_reach` takes it.
         poses: Cages in at most so many frames of the shot.
     """
     first = next(poses(1), None)
     if first is None:
         return [*garments], []
+    pieces = zip(garments, first, tolerances, strict=True)
+    reaches = [0.0 if x is None else seam_reach(garment.mesh, x, tolerance) for garment, x, tolerance in pieces]
     cloth = _Cloth(garments, reaches)
     points = cloth.together(first)
     pairs, between, beside = cloth.look(points)
