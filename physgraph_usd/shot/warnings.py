@@ -245,7 +245,7 @@ def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
 
 
 def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Warnings of each garment's frames that reached their limit of time, and of those that follow their cage."""
+    """Warnings of frames stopped by the time limit, and of frames on their cage, by garment."""
     kinds = {LIMITED: LIMITED, COLLAPSED: UNSOLVED, UNSOLVED: UNSOLVED}
     known = [(str(entry["path"]), kinds[entry["stopped"]], entry) for entry in found if entry["stopped"] in kinds]
     for path, kind in dict.fromkeys((path, kind) for path, kind, _ in known):

@@ -148,7 +148,7 @@ class LevelContact:
         return x, passes
 
     def _letting_through(self, bodies: LevelBodies, x: Tensor) -> LevelBodies:
-        """Bodies that let cloth at x [m] through where they are between it and its target."""
+        """The bodies, open to cloth at x [m] that they part from its target."""
         return bodies if self.target is None else bodies.letting_through(x, self.target)
 
     def bodies_around(self, x: Float[Tensor, "vertices 3"]) -> LevelBodies | None:

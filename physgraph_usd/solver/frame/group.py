@@ -98,7 +98,7 @@ class Group:
 
     @property
     def outward(self) -> Float[Tensor, " garments"]:
-        """1 where a garment's normals look outward, -1 where they look inward."""
+        """Sign of each garment's normals: 1 for outward, -1 for inward."""
         return torch.tensor([-1.0 if each.flipped else 1.0 for each in self.garments], device=self.levels[0].device)
 
     def tensor(self, array: np.ndarray) -> Tensor:

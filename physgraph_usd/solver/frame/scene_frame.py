@@ -273,7 +273,7 @@ class SceneFrame:
         return (np.concatenate(found), self.walked[1]) if len(found) == len(part) else None
 
     def _refuse_strayed(self, part: tuple[int, ...], points: Sequence[np.ndarray]) -> None:
-        """Refuse cloth that is no more where its cage is."""
+        """Refuse cloth that has strayed from its cage."""
         for index, fine in zip(part, points, strict=True):
             last = self.memories[index].last
             before = None if last is None else last.frame.points

@@ -154,7 +154,7 @@ class ColliderReader:
         return float(np.linalg.norm(linear, 2)) if np.isfinite(linear).all() and linear.any() else self.metres
 
     def _coarse(self, drawn: DrawnSurface) -> tuple[Notice, ...]:
-        """A notice where a mesh is so coarse that what is drawn comes through cloth that keeps its offset."""
+        """A notice of a mesh too coarse: its drawn surface comes through cloth at the contact offset."""
         error = drawn.error * self._scale()
         if error <= self.within / DRAWN_NEAR:
             return ()

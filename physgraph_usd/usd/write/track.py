@@ -181,7 +181,7 @@ class PointTrack:
             self._run_end = None
 
     def _emit(self, sample: _Sample) -> None:
-        """Author one sample, and the velocity of the one before it."""
+        """Author a sample, and the velocity of the sample before."""
         self._author(sample.time, sample.points)
         if self._rate is None:
             return
