@@ -99,8 +99,7 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
         part = movers[name] / movers.total()
         report.modelled["network"] = f"{name} made {part:.0%} of the steps (--integrator {asked})"
     else:
-        reasons = sorted({str(entry["chosen"]) for entry in entries if "chosen" in entry})
-        report.left_out["network"] = f"--integrator {asked}" + "".join(f"; {reason}" for reason in reasons)
+        report.left_out["network"] = f"--integrator {asked}"
 
 
 def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> GarmentError | None:

@@ -238,7 +238,6 @@ def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
     for body, measured in contact.get("bodies", {}).items():
         measures.append(("crossing", "crossings", f"with <{body}>", measured, "crossings"))
         measures.append(("vertex", "vertices", f"inside <{body}>", measured, "inside"))
-        measures.append(("vertex", "vertices", f"on the far side of <{body}>", measured, "passing"))
     for noun, plural, where, measured, name in measures:
         after, before = (int(measured.get(side, {}).get(name, 0)) for side in ("after", "before"))
         yield f"{counted(after, noun, plural)} {where}", after, before

@@ -23,17 +23,12 @@ from ..forces.seam import Seam
 from ..level import Level
 from ..mesh.topology import patches_with
 from .measure import depths, penetration
-from .room import room_above
 from .settings import ContactSettings
 from .sight import Sight
 from .track import Track
 
 STALE = 0.1
 """How far a vertex moves before the plane that it sees is found anew, in edge lengths."""
-HOLLOW = 0.02
-"""How far in front of a plane seen before the closest point lies in a crease of the body, in edge lengths."""
-PASSING = 2.0
-"""Edges from its target beyond which a vertex may pass through a body to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +69,14 @@ class LevelBodies:
         before = self.sights or [Sight.none(x)] * len(self.tracks)
         looks = [self._look(*each, x) for each in zip(self.tracks, before, strict=True)]
         tracks, sights = tuple(track for track, _ in looks), tuple(sight for _, sight in looks)
-        planes = [each.planes() for sight in sights for each in (sight.closest, sight.crease)]
+        planes = [sight.planes() for sight in sights]
         there = any(len(each.vertex) for each in planes)
         force = Contact(self.level, planes, self.settings.stiffness) if there else None
         return replace(self, tracks=tracks, sights=sights), force
 
     def _look(self, track: Track, known: Sight, x: Tensor) -> tuple[Track, Sight]:
         """What is seen of one body; planes of vertices that have hardly moved stay."""
-        still = known.closest.there & ((x - known.at).norm(dim=1) <= STALE * self.level.spacing)
+        still = known.there & ((x - known.at).norm(dim=1) <= STALE * self.level.spacing)
         reach = track.offset + float(self.level.spacing.mean())
         asked = torch.where(still, torch.full_like(reach, -torch.inf), reach)
         track, vertex, normal, signed = track.refresh(x, asked)
@@ -93,16 +88,9 @@ class LevelBodies:
             vertex=vertex,
             normal=normal,
             signed=signed,
-            offset=kept(self.level, track, x[vertex], normal, signed, track.offset[vertex]),
-            # Where parts of the body overlap there is no room in the crease between them.
-            hollow=HOLLOW * self.level.spacing if track.lost is None else None,
+            offset=track.offset[vertex],
         )
         return track, sight
-
-    def letting_through(self, x: Float[Tensor, "vertices 3"], target: Float[Tensor, "vertices 3"]) -> LevelBodies:
-        """The same, where vertices at x [m] pass through bodies that are between them and a target [m]."""
-        least = PASSING * self.level.spacing
-        return replace(self, tracks=tuple(each.letting_through(x, target, least) for each in self.tracks))
 
     def within(self, x: Float[Tensor, "vertices 3"]) -> tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
         """Vertices inside closed bodies at x [m], and those of them that are pinched."""
@@ -136,22 +124,6 @@ class LevelBodies:
         kept[some], wanted[seeds] = True, True
         masks = (each.cpu().numpy() for each in (kept, wanted))
         return torch.as_tensor(patches_with(self.level.edges.cpu().numpy(), *masks), device=kept.device)
-
-
-def kept(level: Level, track: Track, x: Tensor, normal: Tensor, signed: Tensor, wanted: Tensor) -> Tensor:
-    """The distance to keep from a surface [m]: half the room that it leaves, where that is less than what is wanted.
-
-    Args:
-        level: The level.
-        track: What is known of the surface.
-        x: Positions of some vertices [m], shape (N, 3).
-        normal: Unit normals of the planes that they see, shape (N, 3).
-        signed: Distances to these [m], shape (N,).
-        wanted: Distances wanted [m], shape (N,).
-    """
-    foot = x - signed.unsqueeze(1) * normal + track.shift
-    room = room_above(track.surface, foot, normal, reach=2.0 * wanted.clamp_min(0.0), threads=level.threads)
-    return torch.minimum(wanted, 0.5 * room)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,9 +208,9 @@ class FrameBodies:
             least = last.least(x) if surface.closed else None
             signed = signed_distances(surface, at, finest.edges, reach=float(finest.spacing.max()), least=least)
             signed = torch.where(track.offset.isfinite(), signed, torch.full_like(signed, float("inf")))
-            longest, passing = track.longest, None if view is None else last.passing
+            longest = track.longest
             before = penetration(surface, finest, base + track.shift, track.known, longest=longest, inside=track.inside)
-            after = penetration(surface, finest, at, signed, longest=longest, lost=last.lost, passing=passing)
+            after = penetration(surface, finest, at, signed, longest=longest, lost=last.lost)
             name = each.path if surface.closed else f"{each.path} (open part)"
             bodies[name] = {"before": asdict(before), "after": asdict(after)}
         return {"bodies": bodies}

@@ -7,18 +7,16 @@ nearest alone: cloth that pushes with one part and is held by another would stay
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.crossings import Crossings, crossings
 from ..collide.detector import Detector
 from ..collide.narrow_phase import Reach
-from ..collide.near import NearPairs, near_pairs
 from ..collide.parts import Parts
 from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
@@ -26,9 +24,8 @@ from ..level import Level
 from ..scene import Garment
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
-from .layers import Layers
 from .settings import ContactSettings
-from .springs import HALF, MARGIN, ClothSprings, NearSprings
+from .springs import HALF, MARGIN, ClothSprings
 from .tangles import Tangles, gaps_out
 
 TANGLED = 2
@@ -48,7 +45,6 @@ class ClothContact:
             garments: The garments.
         """
         self.meets = np.array([[_meet(a, b) for b in garments] for a in garments], dtype=bool)
-        self.layers = Layers.of(garments, levels[0])
         self._meshes: dict[int, tuple[bytes, ClothMesh]] = {}
 
     def mesh(self, level: Level, seam: Seam | None) -> ClothMesh:
@@ -157,62 +153,39 @@ class ClothView:
             self._looked = _Looked(x, x._version, found, tangles)
         return self._looked
 
-    def tangles(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> Tangles | None:
-        """What crosses at x [m], or is in no order where that counts, and what lies round it; None where nothing is."""
-        known = self._look(x)
-        if not order or self._lasting.layers is None:
-            return known.tangles
-        near = self._near_pairs(x)
-        wrong = near.corners[self._lasting.layers.wrong(self._level, near, x)].long()
-        corners = torch.cat([self.mesh.corners_of(known.crossings), wrong[:, [0, 1, 2, 3, 3]]])
-        return Tangles.find(self.mesh, corners, rings=TANGLED) if len(corners) else None
+    def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
+        """What crosses at x [m] and what lies round it; None where nothing does."""
+        return self._look(x).tangles
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Take it that nothing crosses at x [m]: it was reached safely from where nothing did."""
         self._looked = _Looked(x, x._version, Crossings.none(x.device), None)
 
-    def term(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> SelfContact | None:
+    def term(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> SelfContact | None:
         """The force between parts that are near one another, or None where no parts are; what crosses is drawn out.
 
         Args:
             x: Positions [m].
-            order: Whether garments are brought in their order, and even what is hopeless is drawn out.
+            all_crossings: Whether even tangles that are hopeless are drawn out.
         """
         found, tangles = self.crossings(x), self.tangles(x)
-        gaps = self._gaps(x, found, order=order)
-        found = found if tangles is None or order else tangles.hopeful(found)
+        gaps = self._gaps(x, found, all_crossings=all_crossings)
+        found = found if tangles is None or all_crossings else tangles.hopeful(found)
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
         self.came_near = bool(self.came_near) or len(gaps.corners) > 0
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
-    def _near_pairs(self, x: Tensor) -> NearPairs:
-        """Parts that are near one another at x [m]."""
-        return near_pairs(self.parts, x, self.near, detector=self.detector)
-
-    def _gaps(self, x: Tensor, found: Crossings, *, order: bool) -> PairConstraints:
+    def _gaps(self, x: Tensor, found: Crossings, *, all_crossings: bool) -> PairConstraints:
         """The springs between all parts that are near and do not cross."""
-        layers = self._lasting.layers if order else None
-        near = self._springs.find(x, self.detector.near(x), wide=layers is not None)
-        if layers is not None:
-            near = self._in_order(layers, near, x)
+        near = self._springs.find(x, self.detector.near(x))
         if found.count:
             corners, tangles = near.near.corners.long(), self.tangles(x)
             kept = ~self.mesh.crossed(found)[corners].any(dim=1)
-            kept &= tangles is None or order or ~tangles.given_up[corners].all(dim=1)
+            kept &= tangles is None or all_crossings or ~tangles.given_up[corners].all(dim=1)
             near = near.where(kept)
         return self._springs.constraints(near)
-
-    def _in_order(self, layers: Layers, springs: NearSprings, x: Tensor) -> NearSprings:
-        """Springs that bring garments back in their order where they are on the wrong side."""
-        near = springs.near
-        wrong, most = layers.wrong(self._level, near, x), OUT * float(self._level.spacing.mean())
-        # What is on the wrong side comes back a little each round: all at once would tear the cloth.
-        back = torch.minimum(springs.offset, most - near.way.norm(dim=1))
-        way = torch.where(wrong.unsqueeze(1), -near.way, near.way)
-        turned = NearSprings(replace(near, way=way), torch.where(wrong, back, springs.offset))
-        return turned.where(self._springs.reached(turned))
 
     def measure(
         self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]

@@ -47,14 +47,12 @@ class LevelContact:
         cloth: Its view of the cloth, or None when cloth is not to touch cloth.
         seam: What is sewn together, or None without seams.
         promise: What moves cloth safely, or None where nothing keeps its side.
-        target: Where a warm frame's cloth is to go [m], or None: bodies on the way there let it through.
     """
 
     bodies: LevelBodies | None
     cloth: ClothView | None
     seam: Seam | None = None
     promise: Promise | None = None
-    target: Float[Tensor, "vertices 3"] | None = None
 
     def metric(
         self,
@@ -78,10 +76,10 @@ class LevelContact:
         """Whether cloth crosses cloth at positions x [m], where it keeps its sides."""
         return self.promise is not None and self.promise.view.crossings(x).count > 0
 
-    def comes_apart(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> bool:
-        """Whether what crosses there, or is in no order where that counts, may come apart: not what is hopeless."""
-        tangles = None if self.promise is None else self.promise.view.tangles(x, order=order)
-        return tangles is not None and (order or not bool(tangles.hopeless.all()))
+    def comes_apart(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> bool:
+        """Whether anything that crosses there may come apart: not what is hopeless, unless all crossings are asked."""
+        tangles = None if self.promise is None else self.promise.view.tangles(x)
+        return tangles is not None and (all_crossings or not bool(tangles.hopeless.all()))
 
     def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
         """Where a level begins [m], seams closed: what crosses here, crossed in the input or at the level below."""
@@ -113,13 +111,15 @@ class LevelContact:
         if self.promise is not None:
             self.promise.view.remember(x)
 
-    def terms(self, x: Float[Tensor, "vertices 3"], *, order: bool = False) -> tuple[LevelContact, tuple[Touch, ...]]:
+    def terms(
+        self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False
+    ) -> tuple[LevelContact, tuple[Touch, ...]]:
         """The view from positions x [m], and the forces of what is near them; none where nothing is.
 
         The rest is as for `ClothView.term`.
         """
-        seen, body = (None, None) if self.bodies is None else self._letting_through(self.bodies, x).seen(x)
-        cloth = None if self.cloth is None else self.cloth.term(x, order=order)
+        seen, body = (None, None) if self.bodies is None else self.bodies.seen(x)
+        cloth = None if self.cloth is None else self.cloth.term(x, all_crossings=all_crossings)
         return replace(self, bodies=seen), tuple(term for term in (body, cloth) if term is not None)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
@@ -141,19 +141,11 @@ class LevelContact:
         passes, bodies = 0, self.bodies
         for _ in range(PUSHES if bodies is not None else 0):
             assert bodies is not None
-            bodies, out, more = projected(self._letting_through(bodies, x), x)
+            bodies, out, more = projected(bodies, x)
             start, x, passes = x, self.moved(x, out), passes + more
             if out is start or x is out or is_over():
                 break
         return x, passes
-
-    def _letting_through(self, bodies: LevelBodies, x: Tensor) -> LevelBodies:
-        """The bodies, open to cloth at x [m] that they part from its target."""
-        return bodies if self.target is None else bodies.letting_through(x, self.target)
-
-    def bodies_around(self, x: Float[Tensor, "vertices 3"]) -> LevelBodies | None:
-        """The view of the bodies at x [m], which lets through what they let through there."""
-        return None if self.bodies is None else self._letting_through(self.bodies, x)
 
 
 class FrameContact:
@@ -169,7 +161,6 @@ class FrameContact:
         thickness: Sequence[float],
         settings: ContactSettings,
         seams: Sequence[Seam | None] = (),
-        target: Float[Tensor, "vertices 3"] | None = None,
     ) -> None:
         """Take the frame.
 
@@ -181,10 +172,9 @@ class FrameContact:
             thickness: Of each garment's cloth [m].
             settings: How contact is solved, with k_c itself as its stiffness.
             seams: The seam of each level, None without seams; () for none.
-            target: Where the finest level's cloth is to go in a warm frame [m], or None.
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
-        self._bodies, self._cloth, self._seams, self._target = bodies, cloth, seams, target
+        self._bodies, self._cloth, self._seams = bodies, cloth, seams
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
         self._views: dict[int, LevelContact] = {}
 
@@ -230,7 +220,6 @@ class FrameContact:
         """The view of one level, the same at each call; what is near goes by its rest shape, without ease."""
         if level.index not in self._views:
             level = self._levels[level.index]
-            finest = level is self._levels[-1]
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
             base = level.base.apply(self.aim)
             seam = self._seam_at(level)
@@ -240,19 +229,8 @@ class FrameContact:
                 own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
                 cloth = ClothView(self._cloth, level, **own)
                 promise = Promise(cloth, FLOOR * float(self._thickness.min())) if cloth.keeps_sides else None
-            target = self._target if finest else None
-            self._views[level.index] = LevelContact(bodies, cloth, seam, promise, target)
+            self._views[level.index] = LevelContact(bodies, cloth, seam, promise)
         return self._views[level.index]
-
-    @property
-    def crowding(self) -> float:
-        """Part of the finest vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
-        finest = self._levels[-1]
-        view, base = self.at(finest), finest.base.apply(self.aim)
-        if view.crosses(base):
-            return 1.0
-        term = None if view.cloth is None else view.cloth.term(base)
-        return 0.0 if term is None else float(term.near(finest).to(base).mean())
 
     def _seam_at(self, level: Level) -> Seam | None:
         """The seam of a level."""
@@ -284,7 +262,7 @@ class FrameContact:
         base = finest.base.apply(self._coarse)
         said: dict[str, object] = {}
         if self._bodies is not None:
-            said |= self._bodies.measure(finest, base, x, view=view.bodies_around(x))
+            said |= self._bodies.measure(finest, base, x, view=view.bodies)
         if view.cloth is not None:
             cloth, crossing = view.cloth.measure(view.closed(base), x)
             near = view.cloth.came_near

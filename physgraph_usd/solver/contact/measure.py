@@ -42,7 +42,6 @@ class Penetration:
         pinched: Free vertices inside whose cloth lies between overlapping parts of the body in the input, or that are
             there now and farther from any way out than half a cage edge: they stay, out of sight; forced out, they
             would fold through their neighbours.
-        passing: Free vertices inside that the body lets through, for it lies between them and where the cage has them.
         crossings: Edges of the cloth through faces of the body, and edges of the body through faces of the cloth.
     """
 
@@ -51,7 +50,6 @@ class Penetration:
     deepest_mm: float
     pinned: int
     pinched: int
-    passing: int
     crossings: int
 
 
@@ -64,7 +62,6 @@ def penetration(
     longest: float,
     held: Bool[Tensor, " vertices"] | None = None,
     lost: Bool[Tensor, " vertices"] | None = None,
-    passing: Bool[Tensor, " vertices"] | None = None,
     inside: Nearest | None = None,
     crossings: int | None = None,
 ) -> Penetration:
@@ -78,23 +75,20 @@ def penetration(
         longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
         held: Vertices that count as pinched there however short the way out, or None.
         lost: Vertices of cloth that lies between overlapping parts, or None.
-        passing: Vertices that the surface lets through, or None.
         inside: The closest points of vertices with negative distances, where they are known.
         crossings: How many edges pass through faces, where that is known.
     """
     free = level.free[:, 0]
     depth, stays = depths(surface, x, signed, longest, held=held, lost=lost, inside=inside)
     deep = (depth > DEEP) & ~stays
-    through = torch.zeros_like(deep) if passing is None else passing
-    count = int((deep & free & ~through).sum())
-    deepest = float((depth * (free & ~stays & ~through)).max()) if len(depth) else 0.0
+    count = int((deep & free).sum())
+    deepest = float((depth * (free & ~stays)).max()) if len(depth) else 0.0
     return Penetration(
         inside=count,
         percent=round(100.0 * count / max(int(free.sum()), 1), 4),
         deepest_mm=round(1e3 * deepest, 4),
         pinned=int((deep & ~free).sum()),
         pinched=int((stays & free).sum()),
-        passing=int((deep & free & through).sum()),
         crossings=len(pierced(surface, level, x, signed.abs())) if crossings is None else crossings,
     )
 

@@ -71,8 +71,8 @@ class Promise:
         return x
 
     def draw(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """The same where tangles may come to cross more for a while, and garments are brought in their order."""
-        tangles = self.view.tangles(start, order=True)
+        """The same where tangles may come to cross more for a while."""
+        tangles = self.view.tangles(start)
         return self._go(start, wanted, None if tangles is None else tangles.label)
 
     def _go(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None) -> Placed:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..deadline import is_over
-from .bodies import LevelBodies, kept
+from .bodies import LevelBodies
 from .corners import lift_over
 from .measure import DEEP
 from .track import Track
@@ -88,7 +88,7 @@ def _pushes(bodies: LevelBodies, track: Track, x: Tensor) -> tuple[Track, Tensor
     """Vertices that are under their least clearance to a surface, and the ways to it."""
     least = bodies.settings.clearance * track.offset
     track, vertex, normal, signed = track.refresh(x, least)
-    lack = kept(bodies.level, track, x[vertex], normal, signed, least[vertex]) - signed
+    lack = least[vertex] - signed
     push = (lack > 1e-7) & bodies.level.free[vertex, 0]
     return track, vertex[push], lack[push].unsqueeze(1) * normal[push]
 

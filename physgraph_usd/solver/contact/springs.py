@@ -47,7 +47,6 @@ def _apart(weight: wp.vec4d, c: wp.vec4i, x: wp.array(dtype=wp.vec3d)):
 @wp.kernel
 def _find_springs(
     first: wp.int32,
-    wide: wp.bool,
     x: wp.array(dtype=wp.vec3d),
     rest: wp.array(dtype=wp.vec3d),
     base: wp.array(dtype=wp.vec3d),
@@ -73,7 +72,7 @@ def _find_springs(
         keeps = wp.min(thick, wp.max(wp.length(_apart(w, c, base)), _LEAST * thick))
         if garment[c[0]] == garment[c[3]]:
             keeps = wp.min(keeps, _HALF * wp.length(_apart(w, c, rest)))
-        near = wide or distance < keeps + _MARGIN * edge
+        near = distance < keeps + _MARGIN * edge
         weight[i] = w
         way[i] = between
         offset[i] = keeps
@@ -116,13 +115,12 @@ class ClothSprings:
         self._garment = level.vertex_garment.to(torch.int32).contiguous()
         self._thickness, self._spacing = thickness.double().contiguous(), level.spacing.double().contiguous()
 
-    def find(self, x: Float[Tensor, "vertices 3"], pairs: Pairs, *, wide: bool = False) -> NearSprings:
+    def find(self, x: Float[Tensor, "vertices 3"], pairs: Pairs) -> NearSprings:
         """The pairs that have a spring.
 
         Args:
             x: Positions [m].
             pairs: At least those that are near there, each once.
-            wide: Whether those are found too that are near and keep less.
         """
         count, device = len(pairs.face), x.device
         weight, way, offset = (
@@ -130,7 +128,7 @@ class ClothSprings:
         )
         kept = torch.empty(count, dtype=torch.bool, device=device)
         at = x.double().contiguous()
-        inputs = [wide, *(argument(each, wp.vec3d) for each in (at, self._rest, self._base))]
+        inputs: list[object] = [argument(each, wp.vec3d) for each in (at, self._rest, self._base)]
         inputs += [argument(each) for each in (self._garment, self._thickness, self._spacing)]
         inputs += [argument(pairs.corners, wp.vec4i), argument(pairs.face)]
         inputs += [argument(weight, wp.vec4d), argument(way, wp.vec3d), argument(offset), argument(kept)]
@@ -138,11 +136,6 @@ class ClothSprings:
         some = torch.nonzero(kept).squeeze(1)  # Once for all that follows.
         near = NearPairs(pairs.corners[some], weight[some].to(x), way[some].to(x), pairs.face[some])
         return NearSprings(near, offset[some].to(x))
-
-    def reached(self, springs: NearSprings) -> Bool[Tensor, " pairs"]:
-        """Which of them are nearer than what they keep and a little more."""
-        edge = self._level.spacing[springs.near.corners.long()].amin(dim=1)
-        return springs.near.way.norm(dim=1) < springs.offset + MARGIN * edge
 
     def constraints(self, springs: NearSprings) -> PairConstraints:
         """Springs as the force reads them."""

@@ -15,8 +15,6 @@ from ..colliders.sign import MARGIN, ROUNDING, behind, is_clear
 from ..level import Level
 from .measure import Pierced, is_between, pierced, pinched
 
-THROUGH = (0.2, 0.4, 0.6, 0.8, 1.0)
-"""Where on the way to its target a vertex must be inside a body for that to let it pass."""
 ON_SURFACE = 1e-6
 """Distance under which the direction to the closest point is rounding and the face's normal is taken [m]."""
 
@@ -34,7 +32,6 @@ class Track:
         known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
         longest: Longest way out from between overlapping parts that a vertex is sent [m].
         lost: Vertices that lay between overlapping parts in the input, and stay while inside, shape (V,), or None.
-        passing: Vertices whose way to where they belong leads through the body, which lets them, shape (V,), or None.
         inside: Closest points of the vertices with negative distances, as they were found first; or None.
     """
 
@@ -46,7 +43,6 @@ class Track:
     known: Tensor
     longest: float
     lost: Tensor | None = None
-    passing: Tensor | None = None
     inside: Nearest | None = None
 
     def pierced(self, level: Level, x: Tensor) -> Pierced:
@@ -88,8 +84,6 @@ class Track:
         outward = outward * self._outward(which).unsqueeze(1)
         normal = torch.where((distance > ON_SURFACE).unsqueeze(1), away, outward)
         normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
-        if self.passing is not None:
-            kept &= ~self.passing[which]
         kept = torch.nonzero(kept).squeeze(1)
         return replace(self, at=at, known=known), which[kept], normal[kept], (distance * sign)[kept]
 
@@ -108,23 +102,6 @@ class Track:
             which, asked, found = which[within], asked[within], found.some(within)
         between = torch.nonzero(is_between(found, self.surface.exit(asked, found))).squeeze(1)
         return which[between], self.surface.inside(asked[between], parts=2)
-
-    def letting_through(self, x: Tensor, target: Tensor, least: Tensor) -> Track:
-        """The same, which lets vertices at x [m] pass whose way to a target, farther than the least, is through it."""
-        if not self.surface.closed:
-            return self
-        way = target - x
-        length = way.norm(dim=1)
-        near = (self.known - MARGIN * (x - self.at).norm(dim=1) < length) & (length > least) & self.offset.isfinite()
-        which = torch.nonzero(near).squeeze(1)
-        if not len(which):
-            return replace(self, passing=None)
-        through = torch.zeros_like(which, dtype=torch.bool)
-        for part in THROUGH:
-            through |= self.surface.inside(x[which] + part * way[which] + self.shift)
-        passing = torch.zeros_like(near)
-        passing[which[through]] = True
-        return replace(self, passing=passing)
 
     def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
         """How far to look for the surface: what is farther away outside is known well enough by that bound."""

@@ -19,7 +19,7 @@ from typing import Any
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -122,12 +122,6 @@ class SelfContact:
         # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
         out = torch.zeros_like(x[:, 0])
         return out.index_put_((self.gaps.corners.long().reshape(-1),), value.reshape(-1) / 3.0, accumulate=True)
-
-    def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
-        """Which vertices belong to a pair."""
-        near = torch.zeros_like(level.free)
-        near[self.gaps.corners.long().reshape(-1)] = True
-        return near
 
     def rest_matrix(self) -> sp.csr_matrix | None:
         """None: at rest nothing touches."""

@@ -96,11 +96,6 @@ class Group:
             seams=level_seams(levels, garments),
         )
 
-    @property
-    def outward(self) -> Float[Tensor, " garments"]:
-        """Sign of each garment's normals: 1 for outward, -1 for inward."""
-        return torch.tensor([-1.0 if each.flipped else 1.0 for each in self.garments], device=self.levels[0].device)
-
     def tensor(self, array: np.ndarray) -> Tensor:
         """An array in the type and on the device of the solve."""
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)
@@ -123,10 +118,10 @@ class Group:
             self._forces[key] = made
         return self._forces[key]
 
-    def integrator(self, *, learned: bool) -> Integrator:
-        """The network's integrator, where the settings leave the choice, or their own; built when first asked for."""
-        method = self.settings.method
-        return self._built(method.learned if learned and method.learned else method.build)
+    @property
+    def integrator(self) -> Integrator:
+        """The settings' integrator, built when first asked for."""
+        return self._built(self.settings.method.build)
 
     @property
     def untangler(self) -> Integrator:
@@ -143,7 +138,6 @@ class Group:
         cage: Cage,
         *,
         settings: ContactSettings | None = None,
-        target: Tensor | None = None,
     ) -> FrameContact | None:
         """Contact of a frame's cloth, or None when nothing may touch.
 
@@ -151,7 +145,6 @@ class Group:
             frame: The frame.
             cage: Where the cages are.
             settings: How contact is solved; the group's own when None.
-            target: Where a warm frame's cloth is to go [m], or None.
         """
         settings = settings or self.settings.contact
         touching = frame.touching if settings.form != "off" else ()
@@ -163,7 +156,7 @@ class Group:
         place = {"origin": cage.origin, "settings": settings}
         bodies = FrameBodies.begin(self.levels, touching, cage.points, **place) if touching else None
         cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
-        return FrameContact(self.levels, cage.points, bodies=bodies, cloth=cloth, **cloths, target=target)
+        return FrameContact(self.levels, cage.points, bodies=bodies, cloth=cloth, **cloths)
 
     def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:
         """World positions of each garment [m] on its cage's smooth surface, not solved."""

@@ -18,7 +18,7 @@ from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
 from .creases import keeps_creases
 from .level_forces import named
-from .problem import Choice, Problem
+from .problem import Problem
 from .values import State
 
 
@@ -75,9 +75,7 @@ def state_left(problem: Problem, x: Placed) -> State:
     )
 
 
-def telemetry_of(
-    problem: Problem, x: Tensor, module: ForceModule, *, reports: Sequence[LevelReport], choice: Choice
-) -> dict[str, Any]:
+def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: Sequence[LevelReport]) -> dict[str, Any]:
     """How a frame was solved and how its result lies, as plain values.
 
     Args:
@@ -85,7 +83,6 @@ def telemetry_of(
         x: The result [m].
         module: The terms at the finest level.
         reports: Those of the levels' rounds.
-        choice: How it was solved.
     """
     finest = problem.forces[-1].level
     base = finest.base.apply(problem.cage.points)
@@ -95,7 +92,7 @@ def telemetry_of(
         "sharp_folds": sharp_folds(finest, x),
         "strain": edge_strain(finest, x),
         "start": problem.start.why,
-    } | ({"chosen": choice.reason} if choice.reason else {})
+    }
 
 
 def measured(problem: Problem, x: Tensor) -> tuple[dict[str, object], np.ndarray]:

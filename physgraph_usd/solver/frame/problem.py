@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,16 +24,8 @@ from .level_forces import LevelForces
 from .start import Start, start_of
 from .values import Cage, FrameInput, State
 
-LONGER, LONGER_CUDA = 4, 8
-"""Steps of the finest level alone over those that it takes after coarse ones, on the CPU and on CUDA."""
-CROWDED = 0.1
-"""Fraction of the vertices with cloth near them from which a cold frame goes through the levels."""
-FEWER = 1.0 / 3.0
-"""Part of the steps that the network makes of a warm frame where something touches, if they bring it near rest: one
-round."""
-FAR = 0.4
-"""Remaining move of the cage, in its edge lengths, from which it is far from rest; under it CUDA solves cold frames at
-the finest level."""
+NEAR = 10.0
+"""Remaining move [tolerances] under which a warm frame in contact is done after a part of its steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +40,7 @@ class LevelProblem:
         integrator: What makes the steps.
         untangler: What makes those that draw apart what crosses.
         budget: When to stop.
-        touching: When to stop where something touches.
-        outward: As `leave_saddle` takes it.
+        near: Remaining move [tolerances] under which a frame in contact is done after a part of its steps; 0 for never.
     """
 
     lasting: LevelForces
@@ -60,8 +50,7 @@ class LevelProblem:
     integrator: Integrator
     untangler: Integrator
     budget: Budget
-    touching: Budget
-    outward: Float[Tensor, " garments"]
+    near: float
 
     @property
     def level(self) -> Level:
@@ -136,32 +125,12 @@ class Problem:
         """Whether the cage crosses itself."""
         return self.contact is not None and self.contact.crossed
 
-    @property
-    def crowding(self) -> float:
-        """Fraction of the vertices that have cloth near them in the upsampled cage; 1 where it crosses."""
-        return 0.0 if self.contact is None else self.contact.crowding
-
-    @property
-    def unresolved(self) -> bool:
-        """Whether the cage's edges are too long for the folds of some fabric."""
-        return self.forces[0].unresolved
-
-    @cached_property
-    def remaining(self) -> float:
-        """The cage's remaining move, in its edge lengths."""
-        return self.forces[0].remaining(self.aim)
-
     @cached_property
     def carried(self) -> Float[Tensor, "vertices 3"]:
         """The finest vertices with the last frame's detail, as far as they come from where they were [m]."""
         view, warm = self.view(self.finest), self.start.detailed
         assert warm is not None
         return warm if view is None or self.before is None else view.moved(self.before, warm)
-
-    @property
-    def device(self) -> str:
-        """Where the frame is solved."""
-        return self.forces[0].level.device
 
     @property
     def finest(self) -> int:
@@ -172,16 +141,17 @@ class Problem:
         """Contact of a level's cloth."""
         return None if self.contact is None else self.contact.at(self.forces[index].level)
 
-    def levels(self, *, nested: bool) -> range:
-        """Numbers of the levels that are solved; what crosses in a cold frame is untangled at the cage."""
-        return range(0 if nested or (not self.warm and self.crossed) else self.finest, self.finest + 1)
+    @property
+    def levels(self) -> range:
+        """Numbers of the levels that are solved: all in a cold frame that is nested or has crossings to untangle."""
+        from_cage = not self.warm and (self.group.settings.method.nested or self.crossed)
+        return range(0 if from_cage else self.finest, self.finest + 1)
 
-    def level(self, index: int, choice: Choice, *, since: float) -> LevelProblem:
+    def level(self, index: int, *, since: float) -> LevelProblem:
         """One level.
 
         Args:
             index: Its number.
-            choice: How the frame is solved.
             since: When the frame was ready to be solved [s].
         """
         lasting, settings = self.forces[index], self.group.settings
@@ -191,15 +161,14 @@ class Problem:
         # What is recorded of a level's steps on CUDA serves in the next frame too.
         recorded = lasting.level.device != "cpu"
         alone = lasting.lasting_system(self.aim, tie, rest_angle=angles) if recorded else lasting.system(module, tie)
-        budget = settings.budget(self.finest - index, since, more=choice.steps, warm=self.warm)
+        budget = settings.budget(self.finest - index, since, warm=self.warm)
         if self.creases is not None and self.start.held:  # What fades is less than the stopping measure sees.
             budget = replace(budget, rest=0.0)
         budget = replace(budget, steps=0) if self.start.rests else budget
-        # With creases it sees less of what is left than there is.
-        part = choice.touching if self.creases is None else 1.0
-        touching = replace(budget, steps=math.ceil(part * budget.steps))
-        who, outward = (self.group.integrator(learned=choice.learned), self.group.untangler), self.group.outward
-        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, touching, outward)
+        # With creases the stopping measure sees less of what is left than there is.
+        near = NEAR if self.warm and self.creases is None else 0.0
+        who = (self.group.integrator, self.group.untangler)
+        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, near)
 
     def begun(
         self, index: int, below: Float[Tensor, "below 3"] | None
@@ -244,7 +213,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved, pace=1.0 if creases is None else creases.pace)
-    contact = group.contact(frame, cage, target=start.detailed)
+    contact = group.contact(frame, cage)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
     return Problem(
@@ -261,66 +230,3 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
         creases=None if start.detailed is None else creases,
     )
-
-
-@dataclass(frozen=True)
-class Choice:
-    """How a frame is solved, as ``auto``, refine's default, decides frame by frame.
-
-    The network makes the steps, in cold frames and in warm ones, where cloth touches and where it does not, and where
-    the cage crosses itself: on the CPU it is within 1.1 of the best method's time to its energy more often than
-    quasi-Newton is, in each of these (`python -m benchmarks.choice`; docs/notes/chart.md has the table). Quasi-Newton
-    draws apart what crosses, and solves cages that are not subdivided.
-
-    Coarse levels are cheap and carry folds far, but each has a start of its own. Under one subdivision lies one
-    coarse level, a quarter of the finest, and more steps at the finest alone get as far in less time. Not where cloth
-    lies near cloth: who lies above whom is settled at the cage. What starts from the last frame's detail starts at the
-    finest level in any case.
-
-    On CUDA a coarse level's steps take as long as the finest's, so a cold frame goes there only where the cage is far
-    from rest: folded, or pressed on by bodies, it is what coarse levels carry far (`python -m benchmarks.front
-    --device cuda`).
-
-    Under one subdivision, folds that the cage's edges are too long for begin as short as the mesh's edges, and stay
-    so. They go through the cage too, where raised bending gives them a length.
-
-    Attributes:
-        nested: Coarse levels first; otherwise the finest level only.
-        steps: Steps at the finest level, over those that were asked for.
-        reason: Why, or "" where nothing was left to choose.
-        learned: Whether the network makes the steps, not quasi-Newton.
-        touching: Part of the steps after which a frame that is near rest is done where something touches.
-    """
-
-    nested: bool
-    steps: int = 1
-    reason: str = ""
-    learned: bool = False
-    touching: float = 1.0
-
-
-def choose(problem: Problem, nested: bool | None) -> Choice:
-    """Choose for one frame.
-
-    Args:
-        problem: The frame; how crowded the cage is and how far from rest are found only where they matter.
-        nested: What the method asks for; None leaves it open.
-    """
-    warm, subdivisions = problem.warm, problem.finest
-    if nested is not None:
-        return Choice(nested and not warm)
-    learned = subdivisions > 0
-    if warm:
-        return Choice(False, learned=learned, touching=FEWER if learned else 1.0)
-    cuda = problem.device != "cpu"
-    if not (subdivisions == 1 or (cuda and subdivisions > 1 and problem.remaining < FAR)):
-        return Choice(True, reason=f"level by level: {subdivisions} subdivisions", learned=learned)
-    if problem.crowding > CROWDED:
-        reason = "level by level: cloth crosses cloth, or much of it lies near"
-        return Choice(True, reason=reason, learned=learned)
-    if subdivisions == 1 and problem.unresolved:
-        return Choice(True, reason="level by level: the cage is too coarse for the fabric's folds", learned=learned)
-    why = "one subdivision" if subdivisions == 1 else "the cage is not far from rest"
-    near = "little" if problem.crowding else "no"
-    reason = f"the finest level alone: {why}, and {near} cloth lies near cloth"
-    return Choice(False, LONGER_CUDA if cuda else LONGER, reason, learned)

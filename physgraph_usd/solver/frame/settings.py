@@ -63,20 +63,19 @@ class SolveSettings:
     contact: ContactSettings = field(default_factory=ContactSettings)
     cancelled: Callable[[], bool] | None = None
 
-    def budget(self, below: int, clock: float, *, more: int, warm: bool) -> Budget:
+    def budget(self, below: int, clock: float, *, warm: bool) -> Budget:
         """Steps and deadline of a level; the finest makes one step in any case.
 
         Args:
             below: How many levels lie above it.
             clock: When the frame was ready to be solved [s].
-            more: How many times its steps the finest level takes.
             warm: Whether it starts from the last frame's result.
         """
         deadline = None
         if self.budget_ms is not None:
             deadline = clock + 1e-3 * self.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
         if not below:
-            rest, extra = (REST, 0) if warm else (1.0, EXTRA * more * self.steps)
-            return Budget(more * self.steps, self.tolerance, deadline, rest, extra, self.cancelled, least=1)
+            rest, extra = (REST, 0) if warm else (1.0, EXTRA * self.steps)
+            return Budget(self.steps, self.tolerance, deadline, rest, extra, self.cancelled, least=1)
         steps, tolerance = COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance
         return Budget(steps, tolerance, deadline, cancelled=self.cancelled)

@@ -8,10 +8,8 @@ crosses.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from ...errors import SolveError
@@ -21,25 +19,22 @@ from ..deadline import is_over
 from ..forces.base import ForceModule
 from ..integrate.base import Carry, System
 from ..integrate.guard import PATIENCE
-from ..integrate.saddle import leave_saddle
 from ..integrate.solve import Budget, LevelReport, descend, solve_level
 from ..level import Placed, unhindered
 from .group import Group
 from .level_forces import blame
 from .outcome import measured, refuse_swallowed, scaled, state_left, telemetry_of
-from .problem import LevelProblem, begin, choose
+from .problem import LevelProblem, begin
 from .values import FrameInput, Solved, State
 
 STEPS, LONGEST = 4, 16
 """Steps of a round where something is near, and where nothing is: then pairs are found anew."""
 MOST, TOUCHING = 40, 3
 """Steps of a level where something touches: so many times the budget's, but no more than the first, or the budget's."""
-NEAR = 10.0
-"""Tolerances of remaining move under which a warm frame makes no more steps than its budget has."""
+FEWER = 1.0 / 3.0
+"""Part of its steps after which a warm frame in contact is done, if it is near rest: one round."""
 UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
 """Most rounds that untangle what crosses: from cold at the cage, and in a warm frame."""
-HALVINGS = 4
-"""How often a step is halved on which cloth that is blocked raises the energy, before all of it stays."""
 
 
 def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
@@ -57,10 +52,9 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
     refuse_swallowed(problem)
     prepared = time.perf_counter()
     try:
-        choice = choose(problem, group.settings.method.nested)
         x, reports, module = None, list[LevelReport](), ForceModule(())
-        for index in problem.levels(nested=choice.nested):
-            level = problem.level(index, choice, since=prepared)
+        for index in problem.levels:
+            level = problem.level(index, since=prepared)
             x, made, module = solve_one_level(level, *problem.begun(index, x))
             if index < problem.finest:
                 made[-1].energies = module.energies(x)
@@ -74,7 +68,7 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
     if problem.contact is not None:
         shown, finish = problem.contact.finish(shown)
     solved = time.perf_counter()
-    telemetry = telemetry_of(problem, shown, module, reports=reports, choice=choice)
+    telemetry = telemetry_of(problem, shown, module, reports=reports)
     contact, crossing = measured(problem, shown)
     telemetry |= {"contact": contact | finish} if contact else {}
     marks = (problem.began, prepared, solved, time.perf_counter())
@@ -99,19 +93,16 @@ def solve_one_level(
     """
     level, view, budget = problem.level, problem.view, problem.budget
     if view is None:
-        x = x if smoothing is None else leave_saddle(problem.alone, level, x + smoothing, outward=problem.outward)
+        x = x if smoothing is None else x + smoothing
         x, report = solve_level(problem.alone, problem.integrator, x, level=level.index, budget=budget)
         return unhindered(x), [report], problem.module
     x, reports = _untangle(problem, view, view.begun(x))
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
-        view, terms = view.terms(x)
-        x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
     carry, last, terms, made, touched, integrator = None, None, (), 0, False, problem.integrator
     while not made or made < _most_steps(problem.budget, reports[-1], touched=touched):
         view, terms = view.terms(x)
-        if terms and not touched:
-            touched, budget = True, problem.touching
+        touched = touched or bool(terms)
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
         of_round = _round_budget(budget, system, first=not made, steps=STEPS if terms else LONGEST)
@@ -120,13 +111,14 @@ def solve_one_level(
         reports.append(report)
         made += report.steps
         wanted = carry.x
-        x, last = _safe_step(view.moved, system, x, wanted), system
+        x, last = view.moved(x, wanted), system
         blocked = x is not wanted
-        if _is_last(report, blocked=blocked) or (smoothing is None and _is_near(report, budget, made)):
+        near = touched and made >= FEWER * budget.steps and report.remaining_move < problem.near * budget.tolerance
+        if near or _is_last(report, blocked=blocked):
             break
         replaceable = smoothing is None and integrator.name != problem.untangler.name
         if carry.setbacks >= PATIENCE or (replaceable and _went_up(reports)):
-            integrator, budget, carry = problem.untangler, problem.budget, None
+            integrator, carry = problem.untangler, None
         elif blocked:  # Corrections of the guard were made for other positions.
             carry = None if carry.setbacks else replace(carry, x=x)
     return x, reports, ForceModule((*problem.module.forces, *terms))
@@ -140,29 +132,14 @@ def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Pla
     reports: list[LevelReport] = []
     short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0, least=0)
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
-        if is_over() or not view.comes_apart(x, order=cold):
+        if is_over() or not view.comes_apart(x, all_crossings=cold):
             break
-        view, terms = view.terms(x, order=cold)
+        view, terms = view.terms(x, all_crossings=cold)
         system = problem.system(view, terms, x)
         wanted, report = solve_level(system, problem.untangler, x, level=level.index, budget=short)
-        x = _safe_step(view.drawn if cold else view.moved, system, x, wanted)
+        x = view.drawn(x, wanted) if cold else view.moved(x, wanted)
         reports.append(report)
     return view.without_hope(x, start) if cold else x, reports
-
-
-def _safe_step(move: Callable[[Placed, Tensor], Placed], system: System, x: Placed, wanted: Tensor) -> Placed:
-    """Where a safe move towards what is wanted ends [m]; a shorter one where blocked cloth raises the energy."""
-    moved = move(x, wanted)
-    if moved is wanted:
-        return moved
-    energy = system.energy_and_force(x)[0]
-    most = energy + torch.finfo(x.dtype).eps * abs(energy)
-    for _ in range(HALVINGS):
-        if system.energy_and_force(moved)[0] <= most:
-            return moved
-        wanted = x + 0.5 * (wanted - x)
-        moved = move(x, wanted)
-    return moved if system.energy_and_force(moved)[0] <= most else x
 
 
 def _most_steps(budget: Budget, report: LevelReport, *, touched: bool) -> int:
@@ -179,11 +156,6 @@ def _went_up(reports: list[LevelReport]) -> bool:
 def _is_last(report: LevelReport, *, blocked: bool) -> bool:
     """Whether no round follows one of this report; it does where one that settled was blocked."""
     return report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not blocked)
-
-
-def _is_near(report: LevelReport, budget: Budget, made: int) -> bool:
-    """Whether a warm frame has made its steps and is near enough to rest."""
-    return made >= budget.steps and report.remaining_move < NEAR * budget.tolerance
 
 
 def _round_budget(budget: Budget, system: System, *, first: bool, steps: int) -> Budget:

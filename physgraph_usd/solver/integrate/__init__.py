@@ -25,13 +25,11 @@ class Method:
 
     Attributes:
         build: Makes the integrator.
-        nested: Solve coarse levels first; otherwise the finest level only. None chooses frame by frame: `choice`.
-        learned: Makes the network's integrator, where frames choose; None where there is no choice.
+        nested: Whether cold frames solve coarse levels first; otherwise the finest level only.
     """
 
     build: Callable[[], Integrator]
-    nested: bool | None
-    learned: Callable[[], Integrator] | None = None
+    nested: bool
 
 
 def _shipped() -> Integrator:
@@ -40,7 +38,7 @@ def _shipped() -> Integrator:
 
 
 METHODS: dict[str, Method] = {
-    "auto": Method(QuasiNewton, nested=None, learned=_shipped),
+    "auto": Method(_shipped, nested=True),
     "quasi-newton": Method(QuasiNewton, nested=True),
     "quasi-newton-flat": Method(QuasiNewton, nested=False),
     "lbfgs": Method(lambda: QuasiNewton(use_metric=False), nested=False),
@@ -51,7 +49,7 @@ METHODS: dict[str, Method] = {
     "physgraph-paper": Method(lambda: guarded(shipped_network("physgraph-paper")), nested=False),
 }
 """Every method by its name on the command line."""
-LEARNED = ("physgraph", "physgraph-paper")
+LEARNED = ("auto", "physgraph", "physgraph-paper")
 """Those that have weights."""
 
 
@@ -71,11 +69,11 @@ def method_named(name: str, weights: Path | None = None) -> Method:
     method = METHODS[name]
     if weights is None:
         return method
-    if name not in LEARNED and method.learned is None:
-        raise UsageError(f"integrator '{name}' has no weights; name one that has: auto, {', '.join(LEARNED)}")
-    network = load_network(weights, kind=name if name in LEARNED else "physgraph")
+    if name not in LEARNED:
+        raise UsageError(f"integrator '{name}' has no weights; name one that has: {', '.join(LEARNED)}")
+    network = load_network(weights, kind="physgraph" if name == "auto" else name)
 
     def own() -> Integrator:
         return guarded(network)
 
-    return replace(method, build=own) if name in LEARNED else replace(method, learned=own)
+    return replace(method, build=own)
