@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from brute import Soup, crossings
@@ -10,15 +12,11 @@ from folds import EDGE, levels_of, named, promise_of, square
 from physgraph_usd.solver.collide.narrow_phase import Pairs
 from physgraph_usd.solver.collide.near import weights
 from physgraph_usd.solver.contact.along import COMES, Planes, along
-from physgraph_usd.solver.contact.safe_move import KEPT, kept
 from physgraph_usd.solver.level import Placed
 
 GAP = 0.2 * EDGE
-
-
-def keeps(distance: torch.Tensor) -> torch.Tensor:
-    """What pairs keep where edges are far longer than their distances."""
-    return kept(distance, spacing=10.0, floor=0.0)
+FLOOR = 0.02
+"""The gap that pairs keep [m], of distances of 0.1."""
 
 
 def two_sheets() -> tuple[list, torch.Tensor, torch.Tensor]:
@@ -63,20 +61,20 @@ class TestAlong:
 
     def test_no_pair_comes_nearer_than_it_may_and_together_they_go_as_far(self):
         x, way, pairs = self.scene()
-        out = along(way, Planes.of(x, None, pairs, keeps), free=torch.ones(8, 1, dtype=torch.bool))
+        out = along(way, Planes.of(x, x, pairs, FLOOR), free=torch.ones(8, 1, dtype=torch.bool))
         weight = weights(x, pairs.corners, pairs.face)
         nearer = -(weight * out[pairs.corners.long(), 1]).sum(dim=1)
-        assert torch.allclose(nearer, torch.full_like(nearer, COMES * (1.0 - KEPT) * 0.1), atol=1e-6)
+        assert torch.allclose(nearer, torch.full_like(nearer, COMES * (0.1 - FLOOR)), atol=1e-6)
         assert torch.allclose(out.sum(dim=0), way.sum(dim=0))
 
     def test_what_is_held_goes_its_own_way(self):
         x, way, pairs = self.scene()
         free = torch.ones(8, 1, dtype=torch.bool)
         free[0] = False
-        out = along(way, Planes.of(x, None, pairs, keeps), free=free)
+        out = along(way, Planes.of(x, x, pairs, FLOOR), free=free)
         assert torch.equal(out[0], way[0])
         weight = weights(x, pairs.corners, pairs.face)
-        assert float(-(weight[0] * out[pairs.corners[0].long(), 1]).sum()) <= COMES * (1.0 - KEPT) * 0.1 + 1e-6
+        assert float(-(weight[0] * out[pairs.corners[0].long(), 1]).sum()) <= COMES * (0.1 - FLOOR) + 1e-6
 
     def test_what_turns_on_its_way_is_held_where_it_meets_what_it_meets(self):
         """An edge over another slides along until its end, which goes down, is over it: no plane of its middle sees
@@ -85,13 +83,16 @@ class TestAlong:
         x, way = torch.tensor(ends, dtype=torch.float64), torch.zeros(4, 3, dtype=torch.float64)
         way[0], way[1] = torch.tensor([0.9, -0.4, 0.0]), torch.tensor([0.9, 0.3, 0.0])
         corners, free = torch.arange(4, dtype=torch.int32).reshape(1, 4), torch.ones(4, 1, dtype=torch.bool)
-        met = Pairs(corners, torch.tensor([0.43], dtype=torch.float64), torch.tensor([False]))
+        met = Pairs(corners, torch.ones(1, dtype=torch.float64), torch.tensor([False]))
 
         def gap(planes: Planes) -> float:
             end = x + along(way, planes, free=free)
             part = -end[0, 0] / (end[1, 0] - end[0, 0])
             return float(end[0, 1] + part * (end[1, 1] - end[0, 1]) - end[2:, 1].mean())
 
-        first = Planes.of(x, None, met, keeps)
-        assert gap(first) < 0.0
-        assert gap(first.joined(Planes.of(x, way, met, keeps))) > 0.0
+        planes = Planes.of(x, x, met, FLOOR)
+        assert gap(planes) < 0.0
+        for _ in range(2):
+            end = x + along(way, planes, free=free)
+            planes = planes.joined(Planes.of(x, end, replace(met, value=0.0 * met.value), FLOOR, corners=True))
+        assert gap(planes) > 0.0

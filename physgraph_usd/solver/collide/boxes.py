@@ -26,15 +26,13 @@ ROUNDING = wp.constant(wp.float64(2.4e-7))
 
 @wp.struct
 class Motion:
-    """Where vertices are, where they go, which pairs are asked for, what these keep of their distances (a share, up to
-    ``most``, and nine tenths of what is under a floor), and what is near where nothing moves."""
+    """Where vertices are, where they go, which pairs are asked for, the gap that these keep, and what is near where
+    nothing moves."""
 
     start: wp.array(dtype=wp.vec3d)
     path: wp.array(dtype=wp.vec3d)
     asked: wp.array(dtype=wp.bool)
     tangle: wp.array(dtype=wp.int32)
-    share: wp.float64
-    most: wp.float64
     floor: wp.float64
     is_still: wp.bool
     radius: wp.array(dtype=wp.float64)
@@ -103,7 +101,7 @@ def highest_of(v: wp.vec3d):
 @wp.func
 def room_of(boxes: Boxes, motion: Motion, i: wp.int32, j: wp.int32):
     """Distance of parts of two clusters from which on nothing is asked: nearness, or what pairs keep in a move."""
-    return boxes.radius[i] + boxes.radius[j] + wp.max(motion.most, motion.floor)
+    return boxes.radius[i] + boxes.radius[j] + motion.floor
 
 
 @wp.func

@@ -136,7 +136,6 @@ class Detector:
         start: Float[Tensor, "vertices 3"],
         end: Float[Tensor, "vertices 3"],
         *,
-        share: float,
         floor: float,
         asked: Bool[Tensor, " vertices"],
         tangle: Int[Tensor, " vertices"] | None = None,
@@ -146,8 +145,7 @@ class Detector:
         Args:
             start: Positions [m].
             end: Where the vertices go [m].
-            share: Fraction of their distance that pairs keep at least, or of a mean edge where that is less.
-            floor: Distance under which they keep nine tenths of it [m].
+            floor: Gap that they keep [m]; most of their distance where that is less.
             asked: Only pairs with one of these vertices are asked.
             tangle: The tangle that each vertex is in, int32, -1 where in none: pairs of one alone are not asked; or
                 None.
@@ -159,7 +157,7 @@ class Detector:
         found, last = self._broad(at, to, asked), self._listed
         near, asks = Pairs.none(at.device), ~found.apart
         motion = motion_of(at, path, asked=asked, tangle=tangle)
-        motion.share, motion.most, motion.floor = share, share * self.parts.spacing, floor
+        motion.floor = floor
         if last is not None and last.found is found:
             near = of_list(self.parts, last.doubtful, motion)
             asks &= last.drift + found.nearer(last.x, at, to) > found.allowed

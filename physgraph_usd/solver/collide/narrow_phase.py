@@ -16,7 +16,7 @@ from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, argument, run
 from .boxes import Boxes, Motion, highest_of, lowest_of, outside, overlap, pass_by, room_of
 from .broad_phase import launch
-from .impact import can_meet, distance_of, impact_of, motion_of
+from .impact import distance_of, impact_of
 from .parts import Parts
 from .topology import Topology
 
@@ -133,6 +133,34 @@ def box_gap(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 
 @wp.func
+def boxes_apart(
+    face: wp.bool,
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    d: wp.vec3d,
+    e: wp.vec3d,
+    f: wp.vec3d,
+    g: wp.vec3d,
+    h: wp.vec3d,
+    floor: wp.float64,
+):
+    """Whether along one axis the boxes of two parts are a floor apart, in one order, at the start and at the end."""
+    low, high, other_low, other_high = a, a, wp.min(c, d), wp.max(c, d)
+    to_low, to_high, other_to_low, other_to_high = e, e, wp.min(g, h), wp.max(g, h)
+    if face:
+        other_low, other_high = wp.min(b, other_low), wp.max(b, other_high)
+        other_to_low, other_to_high = wp.min(f, other_to_low), wp.max(f, other_to_high)
+    else:
+        low, high = wp.min(a, b), wp.max(a, b)
+        to_low, to_high = wp.min(e, f), wp.max(e, f)
+    above = wp.min(low - other_high, to_low - other_to_high)
+    below = wp.min(other_low - high, other_to_low - to_high)
+    most = wp.max(above, below)
+    return wp.max(most[0], wp.max(most[1], most[2])) >= floor
+
+
+@wp.func
 def nearness(face: wp.bool, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32, parts: Topology, motion: Motion):
     """Distance of a pair of parts over its contact range, which is smaller for pairs near at rest; at most 1."""
     one = wp.float64(1.0)
@@ -184,10 +212,9 @@ def value_of(
     if motion.is_still:
         return nearness(face, a, b, c, d, parts, motion)
     u, v, p, q = motion.path[a], motion.path[b], motion.path[c], motion.path[d]
-    share, most, floor = motion.share, motion.most, motion.floor
-    if not can_meet(box_gap(face, x, y, z, w), motion_of(face, u, v, p, q), share, most, floor):
+    if boxes_apart(face, x, y, z, w, x + u, y + v, z + p, w + q, motion.floor):
         return none
-    return impact_of(face, x, y, z, w, u, v, p, q, share, most, floor)
+    return impact_of(face, x, y, z, w, u, v, p, q, motion.floor)
 
 
 @wp.func

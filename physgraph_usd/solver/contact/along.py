@@ -4,7 +4,6 @@
 # pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -13,6 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..collide.impact import TIGHT
 from ..collide.narrow_phase import Pairs
 from ..collide.near import weights
 from ..mesh.kernels import KERNELS
@@ -22,8 +22,7 @@ from ..mesh.threads import Launch, argument
 wp.set_module_options(KERNELS)
 
 COMES = 0.8
-"""Part by which a pair may come nearer of what the promise lets it; the rest is for the little that it turns on its
-way. With 0.6 a draped sheet's moves were asked as often, and layers that fly side by side were held back farther."""
+"""Part by which a pair may come nearer of what the promise lets it; the rest is for what the passes leave."""
 PASSES = 16
 """Passes over the pairs: what is left is cut back by the promise."""
 
@@ -85,26 +84,27 @@ class Planes:
     may: Float[Tensor, " pairs"]
 
     @staticmethod
-    def of(x: Tensor, way: Tensor | None, met: Pairs, keeps: Callable[[Tensor], Tensor]) -> Planes:
-        """Planes between the parts of pairs: where they are, or where they came too near on a way.
+    def of(x: Tensor, ends: Tensor, met: Pairs, floor: float, *, corners: bool = False) -> Planes:
+        """Planes across the shortest ways between the parts of pairs, where they have come too near.
 
         Args:
             x: Positions [m], float64, shape (V, 3).
-            way: The way on which they came too near [m], float64, shape (V, 3); None where they are.
-            met: The pairs.
-            keeps: What pairs keep of their distances [m].
+            ends: Where the vertices go [m], float64, shape (V, 3).
+            met: The pairs that come too near on that way.
+            floor: Gap that they keep [m]; most of their distance where that is less.
+            corners: Whether the two corners that are nearest at the ends are held, not the points that were nearest.
         """
         met = met.where(_distinct(met, len(x)))
         places, face = met.corners.long(), met.face.bool()
-        at = x[places]
-        there = at if way is None else at + met.value.reshape(-1, 1, 1) * way[places]
-        own = torch.arange(4 * len(places), dtype=torch.int32, device=x.device).reshape(-1, 4)
-        weight = weights(there.reshape(-1, 3), own, face)
-        apart = (weight.unsqueeze(2) * there).sum(dim=1)
-        normal = apart / apart.norm(dim=1, keepdim=True).clamp_min(1e-300)
-        distance = _between(at, met) if way is not None else apart.norm(dim=1)
-        need = distance if way is not None else distance - COMES * (distance - keeps(distance))
-        return Planes(met.corners, weight, normal, (weight * (at @ normal.unsqueeze(2)).squeeze(2)).sum(dim=1) - need)
+        at, to = x[places], ends[places]
+        distance = _between(at, face)[1].norm(dim=1)
+        weight, way = _between(at + met.value.reshape(-1, 1, 1) * (to - at), face)
+        normal = way / way.norm(dim=1, keepdim=True).clamp_min(1e-300)
+        if corners:
+            weight = _nearest(to @ normal.unsqueeze(2), face)
+        gap = (weight * (at @ normal.unsqueeze(2)).squeeze(2)).sum(dim=1)
+        may = COMES * (distance - (TIGHT * distance).clamp_max(floor))
+        return Planes(met.corners, weight, normal, gap - distance + may)
 
     def joined(self, other: Planes) -> Planes:
         """These planes and others."""
@@ -150,11 +150,20 @@ def along(
     return moved
 
 
-def _between(at: Float[Tensor, "pairs 4 3"], met: Pairs) -> Float[Tensor, " pairs"]:
-    """Distance of each pair's parts, whose corners are there [m]."""
+def _between(at: Float[Tensor, "pairs 4 3"], face: Tensor) -> tuple[Float[Tensor, "pairs 4"], Float[Tensor, "pairs 3"]]:
+    """Weights of each pair's corners in the shortest way between its parts, and that way, by positions [m]."""
     own = torch.arange(4 * len(at), dtype=torch.int32, device=at.device).reshape(-1, 4)
-    weight = weights(at.reshape(-1, 3), own, met.face.bool())
-    return (weight.unsqueeze(2) * at).sum(dim=1).norm(dim=1)
+    weight = weights(at.reshape(-1, 3), own, face)
+    return weight, (weight.unsqueeze(2) * at).sum(dim=1)
+
+
+def _nearest(height: Float[Tensor, "pairs 4 1"], face: Bool[Tensor, " pairs"]) -> Float[Tensor, "pairs 4"]:
+    """1 for the lowest corner of each pair's first part, -1 for the highest of its second, by heights [m]."""
+    own = height.squeeze(2)
+    is_first = torch.arange(4, device=own.device) < torch.where(face, 1, 2).unsqueeze(1)
+    low = torch.where(is_first, own, torch.inf).argmin(dim=1, keepdim=True)
+    high = torch.where(is_first, -torch.inf, own).argmax(dim=1, keepdim=True)
+    return torch.zeros_like(own).scatter(1, low, 1.0).scatter(1, high, -1.0)
 
 
 def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import TypedDict
 
 import torch
@@ -12,19 +11,11 @@ from torch import Tensor
 
 from ..collide.detector import Detector
 from ..collide.narrow_phase import Pairs
-from ..deadline import is_over
 from ..level import Placed
 from .along import Planes, along
 from .cloth import ClothView
-from .safe_move import in_the_way, kept, safe_move
+from .safe_move import ROUNDS, in_the_way, safe_move
 
-LONG = 1.0
-"""Mean edges by which cloth may be cut short: what a move loses comes in the next round."""
-ROUNDS = 4
-"""How often it is found what else is in the way of vertices that go along what was, before they are cut short."""
-GOES, GAINS = 3, 0.5
-"""How often what is left of each way is gone: what was in the way may have gone too; no more where a go has left over
-so much of what was left before it."""
 TRIES = 4
 """How often tangles in which more crosses are held to the promise, before all are."""
 
@@ -78,46 +69,25 @@ class Promise:
     def _go(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None) -> Placed:
         """The same, with nothing promised to what is in a tangle against what is in the same.
 
-        Where something is in the way each vertex goes along it; what was cut short goes on from where it came to.
+        Where something is in the way each vertex goes along it. What has changed since it was asked last is asked
+        again, and nothing else; what is in the way still is cut short.
         """
         parts = self.view.parts
         options = _MoveOptions(floor=self.floor, tangle=tangle, detector=self.view.detector)
         met = in_the_way(start, aim, parts, **options)
         if not len(met.value):
             return Placed(aim)
-        x, late = start, torch.inf
-        for go in range(GOES):
-            known = late
-            x, late = self._along(x, aim, met, options)
-            if late <= LONG * parts.spacing or late > GAINS * known or go == GOES - 1 or is_over():
-                break
-            met = in_the_way(x, aim, parts, **options)
-        return x
-
-    def _along(self, start: Placed, aim: Tensor, met: Pairs, options: _MoveOptions) -> tuple[Placed, float]:
-        """Where cloth comes that goes along what is in its way, and by how much it was cut short at most [m].
-
-        What has changed since it was asked last is asked again, and nothing else.
-
-        Args:
-            start: Where it is [m].
-            aim: Where it is to go [m].
-            met: The pairs in the way.
-            options: As `safe_move` takes them.
-        """
-        parts, at, ends = self.view.parts, start.double(), aim
+        at, ends = start.double(), aim
         wanted, free = aim.double() - at, (aim != start).any(dim=1, keepdim=True) & parts.level.free
-        keeps = partial(kept, spacing=parts.spacing, floor=self.floor)
-        way, planes = wanted, Planes.of(at, None, met, keeps)
+        planes = Planes.of(at, aim.double(), met, self.floor)
         for _ in range(ROUNDS):
-            if not len(met.value):
-                return Placed(aim if torch.equal(ends, aim) else ends), 0.0
             last, way = ends, along(wanted, planes, free=free, threads=parts.level.threads)
             ends = self.view.closed((at + way).to(aim))
             met = in_the_way(start, ends, parts, **options, asked=_corners(met, (ends != last).any(dim=1)))
-            planes = planes.joined(Planes.of(at, ends.double() - at, met, keeps))
-        moved = safe_move(start, ends, parts, **options, asked=_corners(met, torch.zeros_like(free[:, 0])))
-        return moved.x, float(((1.0 - moved.share) * way.norm(dim=1)).max())
+            if not len(met.value):
+                return Placed(ends)
+            planes = planes.joined(Planes.of(at, ends.double(), met, self.floor, corners=True))
+        return safe_move(start, ends, parts, **options, asked=_corners(met, torch.zeros_like(free[:, 0]))).x
 
 
 def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:
