@@ -1,10 +1,9 @@
-"""Memory, layer size and time of the samples, measured and as `physgraph_usd.shot.estimate` expects them.
+"""Memory and layer size of the samples, measured and as `physgraph_usd.shot.estimate` expects them.
 
     python -m benchmarks.estimate [--short]
 
-Each case is refined by the command in a process of its own, for its peak memory and the size of its layer, and thrice
-in this one, for the time of processor cores that its first frame takes and that each of the six after the second
-takes. The last columns say how many times the estimate is what was measured.
+Each case refines two frames by the command in a process of its own, for its peak memory and the size of its layer. The
+last columns say how many times the estimate is what was measured.
 """
 
 from __future__ import annotations
@@ -13,25 +12,19 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from physgraph_usd.lab.samples import write_sample
-from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.usd.read.reader import open_shot
 
 CASES = (("sleeve", 1), ("sleeve", 2), ("flag", 2), ("skirt", 2), ("tshirt", 2), ("armpit", 2), ("layers", 2))
 LARGE = (("sleeve", 3), ("skirt", 3), ("flag", 4), ("sleeve", 4))
-FRAMES = (1, 2, 8)
 
 
 def main() -> None:
     """Print the table."""
     cases = CASES if "--short" in sys.argv else CASES + LARGE
-    sys.stdout.write(
-        "sample level  vertices  peak MB layer MB first s  warm s  over measured: memory, layer, first, warm\n"
-    )
+    sys.stdout.write("sample level  vertices  peak MB layer MB  over measured: memory, layer\n")
     with tempfile.TemporaryDirectory() as folder:
         for name, level in cases:
             sys.stdout.write(row(name, level, Path(folder)) + "\n")
@@ -47,19 +40,9 @@ def row(name: str, level: int, folder: Path) -> str:
     line += ["--level", level, "--frames", f"{times[0]:g}:{times[1]:g}"]
     subprocess.run([str(part) for part in line], check=True, capture_output=True)
     told = json.loads(report.read_text())
-    layer = out.stat().st_size / 1e6
-    spent = []
-    for count in FRAMES:
-        began = time.process_time()
-        frames = (times[0], times[count - 1])
-        refine_shot(shot, out, RefineOptions(level=level, overwrite=True, frames=frames))
-        spent.append(time.process_time() - began)
-    warm = (spent[2] - spent[1]) / (FRAMES[2] - FRAMES[1])
-    measured = {"memory_mb": 1.048576 * told["peak_memory_mb"], "layer_mb": layer}
-    measured |= {"first_frame_seconds": spent[0], "seconds_a_frame": warm}
+    measured = {"memory_mb": 1.048576 * told["peak_memory_mb"], "layer_mb": out.stat().st_size / 1e6}
     shown = "".join(f"{value:9.2f}" for value in measured.values())
-    said = inspect_shot(shot, level=level, frames=(times[0], times[-1]))["estimate"] | told["estimate"]
-    ratios = "  ".join(f"{said[key] / value:.2f}" for key, value in measured.items())
+    ratios = "  ".join(f"{told['estimate'][key] / value:.2f}" for key, value in measured.items())
     return f"{name:7}{level:5}{told['estimate']['fine_vertices']:10,}{shown}  {ratios}"
 
 

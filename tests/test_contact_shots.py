@@ -65,7 +65,7 @@ def test_real_shots(real_data: Path, tmp_path: Path, name: str):
 def test_groups_are_counted_once():
     """Garments solved together share their levels, and each may have more to tell."""
     levels, other = [{"level": 0}], [{"level": 0}]
-    told = [{"levels": levels}, {"levels": levels, "passed_through": 1}, {"start": "reused"}, {"levels": other}]
+    told = [{"levels": levels}, {"levels": levels, "near": []}, {"start": "reused"}, {"levels": other}]
     assert groups_of(told) == [told[1], told[3]]
 
 

@@ -10,13 +10,10 @@ import torch
 
 pytest.importorskip("trimesh", reason="benchmarks draw bodies with trimesh")
 
-from benchmarks.auto_level import bounded, seconds
 from benchmarks.ease_skinned import skinned
 from benchmarks.fidelity import Pressed, Task, garment_of, level_at, panel_of, problem_of
 from benchmarks.fidelity_stages import SCENES
-from physgraph_usd.solver.contact.crowding import Crowding
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.solver.resolution import LevelChoice
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -65,15 +62,6 @@ def test_a_skinned_sleeve_is_rigid_beyond_the_elbow():
     for side in (stage.rest[:, 0] > 0, stage.rest[:, 0] < 0):
         a, b = stage.rest[ends & side], moved[ends & side]
         assert np.linalg.norm(b - b[0], axis=1) == pytest.approx(np.linalg.norm(a - a[0], axis=1), abs=1e-9)
-
-
-@pytest.mark.parametrize(("bound", "levels"), [(100.0, [1, 3]), (1e-9, [1, 1])])
-def test_levels_within_a_bound_are_from_one_to_three(bound: float, levels: list[int]):
-    garments = [garment_of(SCENES[name](), 2) for name in ("flag", "skirt")]
-    choices = [LevelChoice(2, "", 0.01, 0.01, needed, (0, 0)) for needed in (0, 6)]
-    assert bounded(garments, choices, [Crowding()], bound=bound) == levels
-    between = bounded(garments, choices, [Crowding()], bound=seconds(garments, [1, 2], [Crowding()]))
-    assert between == [1, 2]
 
 
 @pytest.mark.slow

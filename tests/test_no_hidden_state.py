@@ -36,7 +36,6 @@ ALLOWED = {
     # Functions of topology or of materials.
     "contact/cloth.py ClothContact.mesh: _meshes": "of a level and what is sewn there",
     "contact/measure.py _Cloth.of: _known": "of a level's triangles",
-    "contact/passed.py Passed._pieces: _parts": "of a body's triangles",
     "frame/group.py Group.forces_for: _forces": "of the potential and the materials; of the last ones alone",
     "frame/group.py Group._built: _integrators": "of the method",
     "frame/scene_frame.py SceneCloth.group: _groups": "one a set of garments solved together",
@@ -47,8 +46,6 @@ ALLOWED = {
     "contact/broad_phase.py Bodies.pose: _poses": "the frame's poses",
     "contact/broad_phase.py Bodies.pose: _surfaces": "the frame's poses",
     "contact/measure.py _Cloth.move: _points": "the hierarchy is refitted before each question",
-    "contact/passed.py Passed.forget: _last": "what passed through is told by two frames",
-    "contact/passed.py Passed.look: _last": "what passed through is told by two frames",
 }
 """Module, class and method, and the field; and why it may be written there."""
 RUN = "Refiner"

@@ -278,7 +278,7 @@ def test_a_painted_value_that_is_no_array_is_validated(tmp_path: Path):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_mesh_without_edges_is_no_traceback(tmp_path: Path, count: int):
-    """Faces all of whose corners are one vertex; the estimate looked for their edges."""
+    """Faces all of whose corners are one vertex."""
     shot = sheet_shot(tmp_path / "shot.usda")
     stage = Usd.Stage.Open(shot)
     mesh = UsdGeom.Mesh.Get(stage, CLOTH)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..errors import GarmentError, StageError
-from ..solver.contact.crowding import Crowding, CrowdingMeter
 from ..solver.fabric import Fabric
 from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects, in_brief
@@ -33,16 +32,13 @@ from .up_axis import across_gravity
 from .warnings import of_gravity, of_strain, of_unfelt
 
 
-def begin_report(
-    report: RefineReport, opened: Shot, options: RefineOptions, *, before_a_run: bool = False
-) -> list[str]:
+def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> list[str]:
     """Fill in a report before the first frame: choose the levels, and look for what a few frames give away.
 
     Args:
         report: An empty one.
         opened: The shot.
         options: The run's options.
-        before_a_run: Whether to look how crowded the cages are, which decides what a frame takes.
 
     Returns:
         What the user should know.
@@ -57,8 +53,7 @@ def begin_report(
         | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
         for part in parts
     ]
-    crowding = _crowding(opened, frames, options) if before_a_run else ()
-    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), crowding=crowding).plain()
+    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options)).plain()
     known = _strained(opened, report, frames)
     candidates = find_candidates(opened)
     report.candidates = {
@@ -117,7 +112,7 @@ def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     """Plan of a refinement: garments, values and their sources, and every defect found, as plain values."""
     report = RefineReport(opened.path, None, options.plain())
-    warnings = begin_report(report, opened, options, before_a_run=True)
+    warnings = begin_report(report, opened, options)
     large = too_large(opened, report, options)
     return {
         "shot": opened.path,
@@ -222,19 +217,6 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),
     }
-
-
-def _crowding(opened: Shot, frames: Sequence[Frame], options: RefineOptions) -> list[Crowding]:
-    """How crowded the cages are in the frames that are sampled, without what is switched off."""
-    if not all(len(garment.mesh.triangulate(garment.rest).triangles) for garment in opened.scene.garments):
-        return []
-    meter = CrowdingMeter(opened.scene)
-    found = [meter.measure(frame) for frame in frames]
-    if options.contact == "off":
-        found = [dataclasses.replace(each, inside=0.0, touches=False) for each in found]
-    if options.self_contact == "off":
-        found = [dataclasses.replace(each, crossings=0.0, near=0.0) for each in found]
-    return found
 
 
 def _unfelt(report: RefineReport, beside: Sequence[Candidate]) -> list[str]:

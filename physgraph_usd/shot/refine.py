@@ -121,7 +121,7 @@ def _run(
     began = clock.perf_counter()
     try:
         with signals_noted(), memory_is_named(), closing(open_for(shot, options)) as opened:
-            warnings = begin_report(report, opened, options, before_a_run=options.dry_run)
+            warnings = begin_report(report, opened, options)
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
                 raise large
@@ -213,7 +213,7 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
 
     Args:
         shot: The stage to read, a file or open.
-        timed: Whether to solve two frames in the middle of the shot, for what a run takes on this machine.
+        timed: Whether to solve three frames in the middle of the shot, for the time that a run takes on this machine.
         given: Options of `RefineOptions` that concern reading.
 
     Returns:

@@ -31,7 +31,7 @@ _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error"
 _GARMENT: dict[str, Any] = dict.fromkeys(
     (
         "start", "levels", "milliseconds", "energy_joules", "strain", "sharp_folds", "contact", "near",
-        "together", "collapsed", "passed_through", "broken_before", "jumped_from", "not_solved", "time_limit",
+        "together", "collapsed", "broken_before", "jumped_from", "not_solved", "time_limit",
     )
 )  # fmt: skip
 _CONTACT: dict[str, Any] = dict.fromkeys(("bodies", "cloth", "repaired", "projected"))

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import time as clock
 from collections.abc import Generator, Sequence
+from statistics import mean
 from typing import Any
 
 import torch
@@ -110,10 +111,10 @@ def sampled_at(shot: Shot, time: float | None) -> list[bool]:
 
 
 def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[str, float]:
-    """Wall time of a frame from nothing, of the one after it, and of the whole shot by these [s].
+    """Wall time of a cold frame, of a warm one on average, and of the whole shot by these [s], on this machine.
 
     Args:
-        shot: The shot, of which two frames in the middle are solved.
+        shot: The shot, of which up to three frames in the middle are solved: one cold, then two warm.
         options: Those of a run.
         levels: Subdivisions of each garment.
     """
@@ -121,11 +122,12 @@ def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[s
     threads = min(MOST_THREADS, max(1, os.cpu_count() or 1))
     refiner = Refiner(shot.scene, options.solve_settings(), levels=levels, device=options.device, threads=threads)
     times, spent = list(shot.scene.times) or [None], []
-    middle = (len(times) - 1) // 2
-    for time in times[middle : middle + 2]:
+    middle = max(len(times) // 2 - 1, 0)
+    for time in times[middle : middle + 3]:
         began = clock.perf_counter()
         refiner.solve(shot.frame(time))
         spent.append(clock.perf_counter() - began)
-    whole = spent[0] + spent[-1] * (len(times) - 1)
-    seconds = {"first_frame_seconds": spent[0], "seconds_a_frame": spent[-1], "whole_shot_seconds": whole}
+    warm = mean(spent[1:] or spent)
+    whole = spent[0] + warm * (len(times) - 1)
+    seconds = {"first_frame_seconds": spent[0], "seconds_a_frame": warm, "whole_shot_seconds": whole}
     return {name: float(f"{value:.3g}") for name, value in seconds.items()}

@@ -92,12 +92,6 @@ WARNINGS = {
         "{left} are left",
         "--heat-map shows where, to mend the cage there",
     ),
-    "passed_through": Kind(
-        "the coarse cloth passes right through a body",
-        "the body is too fast for the samples: add samples, or `physgraph:contact:exclude`",
-        "the coarse cloth has passed right through <{body}> since the frame before, with at most {points} at once",
-        "the refined cloth follows it to the other side",
-    ),
     "broken_before": Kind(
         "leaves its place for this frame alone",
         "mend the cage or the body in that frame; the next frame starts from the one before it",
@@ -196,18 +190,9 @@ def of_frames(report: RefineReport) -> list[str]:
         (garment, {frame["time"]: frame["garments"][index] for frame in report.frames if "garments" in frame})
         for index, garment in enumerate(report.garments)
     ]
-    checks = (_of_bodies_that_passed, _of_jumps, of_contact)
+    checks = (_of_jumps, of_contact)
     found = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
     return [*found, *_of_unsolved(report.unsettled)]
-
-
-def _of_bodies_that_passed(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning for each body that passed through a garment."""
-    found = {time: entry.get("passed_through") or {} for time, entry in entries.items()}
-    for body in sorted({body for counts in found.values() for body in counts}):
-        times = [time for time, counts in found.items() if body in counts]
-        points = counted(max(found[time][body] for time in times), "point")
-        yield WARNINGS["passed_through"](garment["path"], times, body=body, points=points)
 
 
 def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:

@@ -15,7 +15,6 @@ from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_point
 from physgraph_usd.errors import GarmentError, SchemaError
 from physgraph_usd.shot.cuts import jumps
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.solver.contact.passed import Passed
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
@@ -139,20 +138,6 @@ class TestFramesWithoutTheGarment:
         layer = Sdf.Layer.FindOrOpen(str(out))
         assert isinstance(layer.QueryTimeSample("/World/lining.points", 3.0), Sdf.ValueBlock)
         assert not any(problem.severity == "error" for problem in validate_layer(out, shot))
-
-    def test_are_no_way_through_a_body(self, tmp_path: Path):
-        """A ball lies between the sheet's border and its middle, and another sheet has the frame."""
-        stage = new_stage(tmp_path / "s.usda")
-        for name in ("cloth", "other"):
-            add_sheet(stage, f"/World/{name}", times=TIMES)
-        block(stage, f"{CLOTH}.points", 3.0)
-        ball = UsdGeom.Sphere.Define(stage, "/World/ball")
-        ball.CreateRadiusAttr(0.3)
-        UsdGeom.XformCommonAPI(ball).SetTranslate((1.0, 0.75, 0.0))
-        ball.GetPrim().AddAppliedSchema(COLLIDER_API)
-        shot = open_shot(save(stage))
-        passed = Passed(shot.scene.garments, shot.scene.colliders)
-        assert [passed.look(shot.frame(time))[0] for time in TIMES] == [{}] * len(TIMES)
 
     def test_are_an_error_of_a_layer_that_has_cloth_there(self, tmp_path: Path):
         stage = new_stage(tmp_path / "s.usda")

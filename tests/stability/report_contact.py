@@ -17,7 +17,7 @@ from report_solver import Result, under
 from scenes import shot_of
 from test_contact import MESH as WIDE
 from test_contact import REST as WIDE_REST
-from test_contact import draped, up
+from test_contact import draped
 from test_contact_bodies import KINDS, STILL, jaws, pane
 from test_contact_cloth import THICK, WEIGHTLESS, counted, crossed, seam_gap, told, tube_of_cloth
 from test_contact_moving import STEP, needles
@@ -217,14 +217,3 @@ def s30_fast(method: str) -> Result:
         over = np.linalg.norm(answer.points[0][:, [0, 2]], axis=1) < 0.05
         wrong += inside(answer) + int((answer.points[0][over, 1] < lift[1] + 0.14).sum())
     return none_of(wrong, "inside or under")
-
-
-def s30_sphere() -> Result:
-    """Whether a sphere that comes through a still cloth between two samples is told."""
-    shape = up("sphere", (0.06, 0.06, 0.06))
-    one = refiner_with([named(SHEET)], ["sphere"], times=(0.0, 1.0))
-    said = False
-    for time, height in ((0.0, -0.5 * STEP), (1.0, 0.5 * STEP)):
-        pose = type(shape)(shape.kind, shape.turn, np.array([0.0, height, 0.0]), shape.size)
-        said = bool(one.solve(frame_with([REST], pose, time=time)).telemetry[0].get("passed_through"))
-    return Result(said, "told" if said else "not told")

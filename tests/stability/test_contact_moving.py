@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from bodies import Soup, ball, box
+from bodies import Soup, ball
 from cloth import Answer
 from folds import EDGE, folded, frame_with, named, refiner_with, square, strip
 from test_contact import up
@@ -127,7 +127,7 @@ STEP = 5 * EDGE
 
 
 class TestFast:
-    """S30; what passes right through between two frames is told: tests/test_passed.py."""
+    """S30."""
 
     @pytest.mark.parametrize("kind", ["mesh", "sphere"])
     def test_s30_a_body_that_rises_five_edges_a_frame_takes_the_cloth_along(self, kind: str):
@@ -145,21 +145,16 @@ class TestFast:
             over = np.linalg.norm(answer.points[0][:, [0, 2]], axis=1) < 0.05
             assert (answer.points[0][over, 1] > lift[1] + 0.14).all()
 
-    @pytest.mark.parametrize("thin", [0.02, 0.0002])
-    def test_s30_a_plate_that_comes_through_a_still_cloth_is_told(self, thin: float):
-        points, triangles = box((0.2, thin, 0.2))
-        one = refiner_with([named(SHEET)], ["mesh"], times=tuple(range(3)))
-        told = []
-        for time, height in ((0.0, -0.6 * STEP), (1.0, 0.4 * STEP), (2.0, 1.4 * STEP)):
-            answer = one.solve(frame_with([REST], (points + np.array([0.0, height, 0.0]), triangles), time=time))
-            told.append(bool(answer.telemetry[0].get("passed_through")))
-        assert told == [False, True, False]
-
-    @pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "cube"])
-    def test_s30_a_primitive_that_comes_through_is_told(self, kind: str):
-        shape = up(kind, (0.06, 0.06, 0.06))
-        one = refiner_with([named(SHEET)], [kind], times=(0.0, 1.0))
-        for time, height in ((0.0, -0.5 * STEP), (1.0, 0.5 * STEP)):
-            pose = type(shape)(shape.kind, shape.turn, np.array([0.0, height, 0.0]), shape.size)
-            answer = one.solve(frame_with([REST], pose, time=time))
-        assert answer.telemetry[0].get("passed_through")
+    def test_s30_a_ball_that_goes_to_and_fro_through_still_cloth_leaves_nothing_inside(self):
+        """Few vertices are let through on their way to where the cage has them, and none once the ball has gone."""
+        one = refiner_with([named(SHEET)], ["mesh"], times=tuple(range(6)))
+        points, triangles = ball(0.12, level=4)
+        passing = 0
+        for time, height in enumerate((-1.4, -0.4, 0.6, -0.3, 0.7, 1.7)):
+            pose = points + np.array([0.03, 0.03 + height * STEP, 0.03]), triangles
+            found = bodies(one.solve(frame_with([REST], pose, time=float(time))))
+            if found:
+                assert found[0]["after"]["inside"] == 0
+                passing = found[0]["after"]["passing"]
+                assert passing < 40
+        assert passing == 0

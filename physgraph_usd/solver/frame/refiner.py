@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from ..contact.bodies import Touching
-from ..contact.passed import Passed
 from ..deadline import ends_after
 from ..mesh.subdivide import Refinement
 from ..scene import Frame, Scene, State, refuse_far
@@ -63,7 +62,6 @@ class Refiner:
         """
         chosen = levels if levels is not None else [garment.level for garment in scene.garments]
         self._cloth = SceneCloth(scene, chosen, dtype=dtype, device=device, threads=threads)
-        self._passed = Passed(scene.garments, scene.colliders, device=device, threads=threads)
         self.scene, self._settings, self._heat_map = scene, settings, heat_map
         self._memories = (Memory(),) * len(scene.garments)
         self._time: float | None = None
@@ -86,7 +84,6 @@ class Refiner:
 
     def forget(self) -> None:
         """Start the next frame cold, as if it were the first."""
-        self._passed.forget()
         self._cloth.bodies.forget()
         self._memories, self._time, self._walked = (Memory(),) * len(self._memories), None, None
 
@@ -160,8 +157,6 @@ class Refiner:
     def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> State:
         refuse_far(self.scene, frame)
         gap = self._is_gap(frame.time)
-        if gap:
-            self._passed.forget()
         if self._settings.temporal == "off":  # A frame by itself is a function of that frame alone, to the bit.
             self._cloth.bodies.forget()
         self._cloth.bodies.pose(frame.colliders)
@@ -174,8 +169,6 @@ class Refiner:
         points = [answers[index].points if index in answers and asked[index] else None for index in range(count)]
         absent: dict[str, object] = {"start": "left out: the garment has no sample here"}
         telemetry = [absent if points[index] is None else answers[index].telemetry for index in range(count)]
-        for index, passed in enumerate(self._passed.look(frame)):
-            telemetry[index] = telemetry[index] | ({"passed_through": passed} if passed else {})
         heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
