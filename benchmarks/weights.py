@@ -5,8 +5,8 @@
 
 The shots, levels and frames of `benchmarks.whole_frames`, each in a process of its own on one core: a cold frame and
 those that follow it, by the default method with the steps it makes by itself, the network's weights from each file in
-turn. Prints a row a shot, level and kind of frame, and the geometric means of the ratios; a run is higher or lower by more
-than 2%, or level. What was measured lies in the journal, build/weights.jsonl unless it is named.
+turn. Prints a row a shot, level and kind of frame, and the geometric means of the ratios; a run is higher or lower by
+more than 2%, or level. What was measured lies in the journal, build/weights.jsonl unless it is named.
 """
 
 from __future__ import annotations
