@@ -99,7 +99,7 @@ def main() -> None:
         for name in names:
             if found := measured(name, level, journal, given.device):
                 lines.append(placed(name, level, found))
-    head = ("shot", "level", "vertices", "gap", "ms", "fastest to that gap", "ratio", "the default went")
+    head = ("shot", "level", "vertices", "gap", "ms", "fastest to that gap", "ratio")
     say(table(head, [line for line, _, _ in lines]))
     say("\n" + "\n".join(f"- {line[0]}, level {line[1]}: {known}" for line, _, known in lines))
     say(f"\non the front (up to {TOLERANCE:g}): {sum(on for _, on, _ in lines)} of {len(lines)}")
@@ -173,16 +173,8 @@ class Bench:
         """Time a method; returns its milliseconds."""
         solved, spent = timed(lambda: self._timed.solve(self._frame, settings))
         energy = self._judge.judge(self._frame, solved.points).energy
-        self._add(method, steps, ms=round(spent, 2), energy=energy, chosen=self._chosen(method))
+        self._add(method, steps, ms=round(spent, 2), energy=energy)
         return spent
-
-    def _chosen(self, method: str) -> str:
-        """What the default chose, in its own words."""
-        if method != DEFAULT:
-            return ""
-        self._timed.refiner.forget()
-        state = self._timed.refiner.solve(self._frame)
-        return str(state.telemetry[0].get("chosen", "")).partition(":")[0]
 
     def _add(self, method: str, steps: int, **values: Any) -> None:
         row = self._about | {"method": method, "steps": steps} | values
@@ -214,9 +206,8 @@ def placed(name: str, level: int, rows: Sequence[dict[str, Any]]) -> tuple[list[
     times = {method: time for method, points in curves.items() if (time := quickest(points, gap)) is not None}
     best = min(times, key=lambda method: times[method])
     ratio = ms / times[best]
-    chosen = next(row["chosen"] for row in rows if row["method"] == DEFAULT)
     line = [name.partition(".")[0].partition("/")[0], f"{level}", f"{start['vertices']:,}", f"{gap:.2%}", f"{ms:.0f}"]
-    return [*line, f"{best}, {times[best]:.0f} ms", f"{ratio:.2f}", chosen], ratio <= TOLERANCE, known
+    return [*line, f"{best}, {times[best]:.0f} ms", f"{ratio:.2f}"], ratio <= TOLERANCE, known
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ class SheetOverBall:
         quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
         one = np.ones(ids.size)
         mesh = PolygonMesh(np.full(len(quads), 4), quads.ravel(), ids.size)
-        garment = Garment("/Sheet", mesh, self._flat(), 2, False, False, one, one, one, one, 0.0 * one, colliders=(0,))
+        garment = Garment("/Sheet", mesh, self._flat(), 2, False, one, one, one, one, 0.0 * one, colliders=(0,))
         ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=self.radius)
         points = np.asarray(ball.vertices) - np.array([0.0, self.radius, 0.0])
         scene = Scene((garment,), np.array([0.0, -9.81, 0.0]), (), (Collider("/Ball", "mesh"),))

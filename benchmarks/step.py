@@ -84,7 +84,7 @@ def sheet(edges: int, device: str) -> tuple[System, torch.Tensor]:
     )
     mesh = PolygonMesh(np.full(len(triangles), 3), triangles.ravel(), len(rest))
     one = np.ones(len(rest))
-    garment = Garment("/Sheet", mesh, rest, 0, False, False, one, one, one, one, 0 * one)
+    garment = Garment("/Sheet", mesh, rest, 0, False, one, one, one, one, 0 * one)
     settings = SolveSettings(METHODS["quasi-newton"])
     group = Group.of([garment], [()], np.zeros(3), settings, dtype=torch.float32, device=device, threads=2)
     points = rest * [0.9, 1.0, 1.0] + 0.004 * np.sin(40.0 * rest[:, :1]) * [0, 0, 1.0]

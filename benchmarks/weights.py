@@ -3,10 +3,10 @@
     python -m benchmarks.weights FIRST.safetensors OTHER.safetensors... [--folder SHOTS] [--levels 1,2] [--shots ...]
         [--jobs 16] [--journal FILE]
 
-The shots, levels and frames of `benchmarks.choice`, each in a process of its own on one core: a cold frame and those
-that follow it, by the default method with the steps it makes by itself, the network's weights from each file in turn.
-Prints a row a shot, level and kind of frame, and the geometric means of the ratios; a run is higher or lower by more
-than 2%, or level. What was measured lies in the journal, build/weights.jsonl unless it is named.
+The shots, levels and frames of `benchmarks.whole_frames`, each in a process of its own on one core: a cold frame and
+those that follow it, by the default method with the steps it makes by itself, the network's weights from each file in
+turn. Prints a row a shot, level and kind of frame, and the geometric means of the ratios; a run is higher or lower by
+more than 2%, or level. What was measured lies in the journal, build/weights.jsonl unless it is named.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import Any
 
 import click
 
-from benchmarks import choice
 from benchmarks.rows import say, table
+from benchmarks.whole_frames import Bench, cases_of, energy, milliseconds, open_one, read, run_all
 from physgraph_usd.lab.chart.problem import DEFAULT, plain_detail
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.integrate import method_named
@@ -49,18 +49,18 @@ def main(
         return measure(name, int(level), folder, files)
     journal.parent.mkdir(parents=True, exist_ok=True)
     journal.touch()
-    known = {(row["shot"], row["level"]) for row in choice.read(journal)}
-    cases = [each for each in choice.cases_of(levels, shots, folder) if each not in known]
+    known = {(row["shot"], row["level"]) for row in read(journal)}
+    cases = [each for each in cases_of(levels, shots, folder) if each not in known]
     options = [*map(str, files), *(["--folder", str(folder)] if folder else [])]
-    choice.run_all(cases, options, journal, jobs, program="benchmarks.weights")
-    report(list(choice.read(journal)), [str(file) for file in files])
+    run_all(cases, options, journal, jobs, program="benchmarks.weights")
+    report(list(read(journal)), [str(file) for file in files])
 
 
 def measure(name: str, level: int, folder: Path | None, files: Sequence[Path]) -> None:
     """Write the rows of one shot at one level to standard output."""
     prepare_device("cpu")
-    shot, first, more = choice.open_one(name, level, folder)
-    bench = choice.Bench(shot, level, "cpu", {"shot": name, "level": level})
+    shot, first, more = open_one(name, level, folder)
+    bench = Bench(shot, level, "cpu", {"shot": name, "level": level})
     times = shot.scene.times
     first = min(first, max(len(times) - 1 - more, 0))
     frames = [plain_detail(shot.frame(each)) for each in times[first : first + 1 + more]]
@@ -94,13 +94,13 @@ def report(rows: Sequence[dict[str, Any]], files: Sequence[str]) -> None:
 def cell(run: Sequence[dict[str, Any]]) -> str:
     """Time, energy and what is left of a run's frames."""
     left = [sum(row[what] for row in run) for what in ("cloth", "body", "unsettled", "jumps")]
-    return f"{choice.milliseconds(run):.0f} ms, {choice.energy(run):.4g} J, {left}"
+    return f"{milliseconds(run):.0f} ms, {energy(run):.4g} J, {left}"
 
 
 def compared(pairs: Sequence[tuple[Sequence[dict[str, Any]], Sequence[dict[str, Any]]]]) -> str:
     """Geometric means of the ratios of energies and of times, and how many runs are higher and lower."""
-    energies = [choice.energy(after) / choice.energy(before) for before, after in pairs if choice.energy(before) > 0.0]
-    times = [choice.milliseconds(after) / choice.milliseconds(before) for before, after in pairs]
+    energies = [energy(after) / energy(before) for before, after in pairs if energy(before) > 0.0]
+    times = [milliseconds(after) / milliseconds(before) for before, after in pairs]
     higher, lower = sum(each > 1.0 + SAME for each in energies), sum(each < 1.0 - SAME for each in energies)
     means = [math.exp(statistics.fmean(map(math.log, each))) for each in (energies, times)]
     return f"energy {means[0]:.3f}, time {means[1]:.2f}; higher {higher}, lower {lower} of {len(energies)}"

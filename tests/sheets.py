@@ -30,7 +30,7 @@ def garment_of(mesh: PolygonMesh, rest: np.ndarray, *, bent: bool = False, **pai
     one = np.ones(mesh.vertex_count)
     paint = {"stretch_scale": one, "bend_scale": one, "guide_scale": one, "detail_scale": one, "pin": 0 * one}
     values: dict[str, Any] = paint | painted
-    return Garment("/World/Sheet", mesh, rest, 0, False, bent, **values)
+    return Garment("/World/Sheet", mesh, rest, 0, bent, **values)
 
 
 def level_of(

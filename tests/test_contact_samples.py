@@ -146,12 +146,9 @@ def test_one_frame_is_refined(sample: Callable[[str], Path], tmp_path: Path, nam
     assert faults(layer, sample(name)) == []
 
 
-def test_layers_are_a_few_millimetres_apart_and_told_from_the_inside_out(sample: Callable[[str], Path]) -> None:
+def test_layers_are_a_few_millimetres_apart() -> None:
     trousers, shirt, belt = of_role("layers", "garment")
     form = of_role("layers", "collider")[0]
-    stage = Usd.Stage.Open(str(sample("layers")))
-    for order, mesh in enumerate((trousers, shirt, belt)):
-        assert stage.GetPrimAtPath(f"/LayersShot/{mesh.name}").GetAttribute("physgraph:contact:layer").Get() == order
     for frame in range(0, 30, 4):
         for outer, inner in ((belt, shirt), (shirt, trousers), (trousers, form)):
             points, height = place(outer, frame), belt.points[:, 1]

@@ -15,8 +15,8 @@ from physgraph_usd.lab.chart.table import quickest
 
 def rows(*runs: tuple[str, int, float, float]) -> list[dict[str, Any]]:
     """Runs as (method, steps, milliseconds, energy), the start at 1 J and Phi* at 0."""
-    found = [{"method": "start", "steps": 0, "ms": 0.0, "energy": 1.0, "vertices": 9, "chosen": ""}]
-    found += [{"method": m, "steps": s, "ms": ms, "energy": e, "chosen": "level by level"} for m, s, ms, e in runs]
+    found = [{"method": "start", "steps": 0, "ms": 0.0, "energy": 1.0, "vertices": 9}]
+    found += [{"method": m, "steps": s, "ms": ms, "energy": e} for m, s, ms, e in runs]
     return [*found, {"method": "least", "steps": 0, "ms": 0.0, "energy": 0.0, "by": "many steps", "apart": 0.01}]
 
 

@@ -74,43 +74,6 @@ class TestCrossing:
         assert crossed[gaps.corners[-out:].long()].all()
 
 
-class TestLayers:
-    """Two wavy sheets of 8 by 8 cells, 8 mm apart; their fronts face down, so outside is below."""
-
-    def penetration(self, height: float, turn: float, *, upper_is_outer: bool, order: bool = True) -> np.ndarray:
-        """How far each pair is under what it keeps [m]; waves are so many fine edges high, and turn so fast an edge."""
-        layers = (0, 1) if upper_is_outer else (1, 0)
-        garments = [named(square(8), name, layer=layer) for name, layer in zip("AB", layers, strict=True)]
-        levels = levels_of(*garments)
-        x, edge = levels[-1].rest.clone(), float(levels[-1].spacing.mean())
-        x[:, 1] = height * edge * torch.sin(turn * x[:, 0] / edge) + 0.2 * edge * torch.sin(1.3 * x[:, 2] / edge)
-        upper = torch.arange(len(x)) >= len(x) // 2
-        x[upper] += torch.tensor([0.13 * edge, 0.008, 0.0])
-        view = view_of(levels, garments, thickness=0.01)
-        assert view.crossings(x).count == 0
-        tangles = view.tangles(x, order=order)
-        assert (tangles is not None) == (upper_is_outer and order)
-        term = view.term(x, order=order)
-        assert isinstance(term, SelfContact)
-        assert len(term.gaps.corners) > 1000
-        # Towards where it belongs the outer sheet goes down, which raises the inner one against it.
-        first = term.gaps.corners[:, 0].long() >= len(x) // 2
-        up = torch.where(first, term.gaps.normal[:, 1], -term.gaps.normal[:, 1])
-        return torch.sign(up).numpy() * term.gaps.penetration(x).abs().numpy()
-
-    @pytest.mark.parametrize(("height", "turn"), [(0.0, 1.0), (1.0, 1.0), (1.0, 1.5), (2.0, 1.0)])
-    def test_none_is_sent_back_that_lies_right(self, height: float, turn: float):
-        """Beyond the next wave an outer sheet lies behind the inner one's normals, and is outside all the same."""
-        assert self.penetration(height, turn, upper_is_outer=False).min() > -1e-6
-
-    @pytest.mark.parametrize("height", [0.0, 0.5])
-    def test_all_are_sent_back_that_lie_wrong(self, height: float):
-        assert (self.penetration(height, 1.0, upper_is_outer=True) < -0.001).mean() > 0.95
-
-    def test_nor_is_any_where_nobody_asked_for_the_order(self):
-        assert self.penetration(0.0, 1.0, upper_is_outer=True, order=False).min() > -1e-6
-
-
 def test_the_energy_of_each_pair_counts_for_the_garment_of_its_first_corner():
     garments = [named(square(4), name) for name in "AB"]
     levels = levels_of(*garments)

@@ -11,7 +11,7 @@ import torch
 from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.frame.problem import Choice, LevelProblem, Problem
+from physgraph_usd.solver.frame.problem import LevelProblem, Problem
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.base import System
@@ -147,12 +147,12 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
     frames = [[GarmentFrame(wave(rest, phase=phase), fabric, GUIDE)] for phase, fabric in shown]
     fresh = Problem.level
 
-    def lasting(problem: Problem, index: int, choice: Choice, *, since: float) -> LevelProblem:
+    def lasting(problem: Problem, index: int, *, since: float) -> LevelProblem:
         detailed, stiffness = problem.start.detailed, problem.tether
         tie = None if detailed is None or stiffness is None else (stiffness, detailed)
         angles = None if problem.creases is None else problem.creases.rest_angle
         system = problem.forces[index].lasting_system(problem.aim, tie, rest_angle=angles)
-        return replace(fresh(problem, index, choice, since=since), alone=system)
+        return replace(fresh(problem, index, since=since), alone=system)
 
     results = []
     for level in (fresh, lasting):

@@ -78,8 +78,7 @@ class Fold:
             integrator=QuasiNewton(),
             untangler=QuasiNewton(),
             budget=Budget(steps, tolerance=1e-6),
-            touching=Budget(steps, tolerance=1e-6),
-            outward=torch.ones(1),
+            near=0.0,
         )
         smoothing = None if warm else torch.zeros_like(x)
         return solve_one_level(cast(LevelProblem, problem), x, smoothing)[:2]

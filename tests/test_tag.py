@@ -72,22 +72,18 @@ def test_a_collider_can_be_tagged_alone(untagged: Path, tmp_path: Path) -> None:
     assert schemas(stage, COAT) == []
 
 
-def test_a_layer_and_a_side_are_authored_where_they_mean_something(untagged: Path, tmp_path: Path) -> None:
-    out = tag(untagged, tmp_path / "tagged.usda", garments=[COAT], colliders=["/World/ball"], layer=2, side="start")
+def test_a_side_is_authored_on_colliders(untagged: Path, tmp_path: Path) -> None:
+    out = tag(untagged, tmp_path / "tagged.usda", garments=[COAT], colliders=["/World/ball"], side="start")
     stage = Usd.Stage.Open(str(out))
-    coat, ball = (stage.GetPrimAtPath(path) for path in (COAT, "/World/ball"))
-    layer, side = coat.GetAttribute("physgraph:contact:layer"), ball.GetAttribute("physgraph:collider:side")
-    assert (layer.Get(), str(layer.GetTypeName()), layer.GetVariability()) == (2, "int", Sdf.VariabilityUniform)
+    side = stage.GetPrimAtPath("/World/ball").GetAttribute("physgraph:collider:side")
     assert (side.Get(), str(side.GetTypeName()), side.GetVariability()) == ("start", "token", Sdf.VariabilityUniform)
-    scene = open_shot(str(out)).scene
-    assert (scene.garments[0].layer, scene.colliders[0].side) == (2, "start")
+    assert open_shot(str(out)).scene.colliders[0].side == "start"
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"garments": [COAT], "side": "front"}, "a side for colliders; name one"),
-        ({"colliders": ["/World/ball"], "layer": 1}, "a layer is for garments"),
+        ({"garments": [COAT], "side": "front"}, "a side is for colliders; name one"),
         ({"colliders": ["/World/ball"], "side": "up"}, "unknown side 'up'; known sides: auto, winding, start"),
     ],
 )

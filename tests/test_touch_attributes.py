@@ -9,7 +9,6 @@ from pxr import Usd, UsdGeom
 from stages import COLLIDER_API, add_sheet, author, new_stage, save
 
 from physgraph_usd.cli.printing import outline
-from physgraph_usd.errors import SchemaError, UsageError
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.scene import Garment
 from physgraph_usd.usd.read.reader import Shot, open_shot
@@ -29,42 +28,27 @@ def garment(stage: Usd.Stage, *overrides: str) -> tuple[Garment, dict[str, str]]
     return shot.scene.garments[0], shot.sources[0].sources
 
 
-class TestSelfContactAndLayer:
-    def test_a_garment_feels_itself_and_has_no_layer_unless_it_says_so(self, stage: Usd.Stage):
+class TestSelfContact:
+    def test_a_garment_feels_itself_unless_it_says_otherwise(self, stage: Usd.Stage):
         read, sources = garment(stage)
-        assert (read.self_contact, read.layer) == (True, None)
-        assert (sources["contact:selfCollision"], sources["contact:layer"]) == ("fallback", "fallback")
+        assert read.self_contact
+        assert sources["contact:selfCollision"] == "fallback"
 
-    @pytest.mark.parametrize("layer", [0, 3, -1])
-    def test_both_are_read_with_their_source(self, stage: Usd.Stage, layer: int):
-        prim = stage.GetPrimAtPath(CLOTH)
-        author(prim, "physgraph:contact:selfCollision", False, kind="bool")
-        author(prim, "physgraph:contact:layer", layer, kind="int")
+    def test_it_is_read_with_its_source(self, stage: Usd.Stage):
+        author(stage.GetPrimAtPath(CLOTH), "physgraph:contact:selfCollision", False, kind="bool")
         read, sources = garment(stage)
-        assert (read.self_contact, read.layer) == (False, layer)
-        assert sources["contact:layer"] == f"<{CLOTH}>.physgraph:contact:layer"
+        assert not read.self_contact
+        assert sources["contact:selfCollision"] == f"<{CLOTH}>.physgraph:contact:selfCollision"
 
-    def test_an_ancestor_gives_them_in_any_numeric_type(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath("/World/rig"), "userProperties:physgraph:contact:layer", 2.0, kind="double")
+    def test_an_ancestor_gives_it_in_any_numeric_type(self, stage: Usd.Stage):
         author(stage.GetPrimAtPath("/World/rig"), "userProperties:physgraph:contact:selfCollision", 0, kind="int")
-        read, _ = garment(stage)
-        assert (read.self_contact, read.layer) == (False, 2)
-        assert type(read.layer) is int
+        assert not garment(stage)[0].self_contact
 
     def test_set_goes_before_the_stage(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath(CLOTH), "physgraph:contact:layer", 1, kind="int")
-        read, sources = garment(stage, "layer=4", "selfCollision=off")
-        assert (read.self_contact, read.layer) == (False, 4)
-        assert sources["contact:layer"] == "--set"
-
-    def test_a_layer_between_two_layers_is_refused(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath("/World/rig"), "physgraph:contact:layer", 1.5)
-        with pytest.raises(SchemaError, match="must be a whole number"):
-            garment(stage)
-
-    def test_auto_is_a_level_and_no_layer(self, stage: Usd.Stage):
-        with pytest.raises(UsageError, match="layer=auto"):
-            garment(stage, "layer=auto")
+        author(stage.GetPrimAtPath(CLOTH), "physgraph:contact:selfCollision", True, kind="bool")
+        read, sources = garment(stage, "selfCollision=off")
+        assert not read.self_contact
+        assert sources["contact:selfCollision"] == "--set"
 
 
 class TestExclusion:

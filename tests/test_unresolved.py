@@ -20,7 +20,6 @@ from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.folds import EDGES_PER_WAVE, FOLDING, carried_bend, raised_by
 from physgraph_usd.solver.forces import elastic_terms
 from physgraph_usd.solver.forces.bending import Bending
-from physgraph_usd.solver.integrate import saddle
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
 from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.usd.read.reader import open_shot
@@ -36,10 +35,6 @@ def level_of(edge: float, **fields: object) -> Level:
 def weight(level: Level, fabric: Fabric, *, raised: bool, potential: str = "continuum") -> torch.Tensor:
     terms = elastic_terms(level, [fabric], potential=potential, raised=[raised])
     return next(each for each in terms if isinstance(each, Bending)).weight
-
-
-def test_folds_begin_where_a_start_lets_cloth_buckle():
-    assert FOLDING == saddle.LEAST_COMPRESSION
 
 
 @pytest.mark.parametrize("fabric", PRESETS.values(), ids=PRESETS)

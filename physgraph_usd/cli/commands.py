@@ -95,7 +95,6 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 @of_field("garments", help=PRIMS)
 @of_field("colliders", help=PRIMS, metavar="PATH")
 @click.option("--preset", metavar="FABRIC", help=f"Fabric of the garments, or of all tagged: {', '.join(PRESETS)}.")
-@click.option("--layer", type=int, metavar="N", help="Order of the garments; lower is nearer to the body.")
 @click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
 @of_field("asset_paths")
 @overwrite_option

@@ -212,7 +212,6 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "fabric": dataclasses.asdict(frame.fabric) | {"guide": frame.guide, "detail": frame.detail},
         "sources": dict(source.sources),
         "self_contact": garment.self_contact,
-        "layer": garment.layer,
         "apart_from": dict(source.apart_from),
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..solver.frame.settings import SolveSettings
 
 AUTO = "auto"
-"""The integrator that is chosen frame by frame; always known."""
+"""The integrator of the shipped network; always known."""
 INTEGRATORS = (
     AUTO, "quasi-newton", "quasi-newton-flat", "lbfgs", "adam", "gd", "newton", "physgraph", "physgraph-paper",
 )  # fmt: skip

@@ -87,8 +87,8 @@ WARNINGS = {
     ),
     "contact": Kind(
         "crossings or vertices inside a body are left",
-        "`--heat-map` writes where: mend the cage there; `physgraph:contact:layer` orders garments, "
-        "`physgraph:collider:side` mends a wrong side. Some frames come out clean alone (`--frames`)",
+        "`--heat-map` writes where: mend the cage there; `physgraph:collider:side` mends a wrong "
+        "side. Some frames come out clean alone (`--frames`)",
         "{left} are left",
         "--heat-map shows where, to mend the cage there",
     ),

@@ -29,7 +29,7 @@ from .fabric import Fabric
 
 EDGES_PER_WAVE = 5.0
 FOLDING = 1e-3
-"""Compression at which cloth begins to fold: less it takes in its plane (`saddle.LEAST_COMPRESSION`)."""
+"""Compression at which cloth begins to fold: less it takes in its plane."""
 Edge = TypeVar("Edge", float, Float[Tensor, " hinges"])
 
 

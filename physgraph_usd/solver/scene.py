@@ -56,7 +56,6 @@ class Garment:
         mesh: The coarse cage, faces in authored order and winding, holes removed.
         rest: Rest positions of the cage [m], shape (V, 3), float64.
         level: Number of subdivisions.
-        flipped: Whether the authored winding is clockwise seen from outside.
         bent_rest: True: hinges rest at the rest shape's angles; False: flat.
         stretch_scale: Multiplier of the stretch stiffness, shape (V,).
         bend_scale: Multiplier of the bending stiffness, shape (V,).
@@ -65,7 +64,6 @@ class Garment:
         pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,).
         colliders: Numbers of the scene's colliders that the garment feels.
         self_contact: Whether it feels itself.
-        layer: Place in the order of garments, lower is nearer to the body; None, or equal to another's: not ordered.
         apart_from: Paths of the garments that it never touches; each of them names it too.
         grain: Which way its warp lies, and its painted ease; None is unknown, and none.
         raises_bending: Whether bending is raised on a level whose edges are too long for the fabric's folds.
@@ -81,7 +79,6 @@ class Garment:
     mesh: PolygonMesh
     rest: np.ndarray
     level: int
-    flipped: bool
     bent_rest: bool
     stretch_scale: np.ndarray
     bend_scale: np.ndarray
@@ -90,7 +87,6 @@ class Garment:
     pin: np.ndarray
     colliders: tuple[int, ...] = ()
     self_contact: bool = True
-    layer: int | None = None
     apart_from: tuple[str, ...] = ()
     grain: Grain | None = None
     raises_bending: bool = True
@@ -113,7 +109,7 @@ class Garment:
         """
         one, corners = np.ones(len(rest)), np.asarray(faces)
         mesh = PolygonMesh(np.full(len(corners), corners.shape[1]), corners.ravel(), len(rest))
-        return Garment(path, mesh, np.asarray(rest, float), level, False, False, one, one, one, one, 0 * one, colliders)
+        return Garment(path, mesh, np.asarray(rest, float), level, False, one, one, one, one, 0 * one, colliders)
 
 
 @dataclass(frozen=True, eq=False)

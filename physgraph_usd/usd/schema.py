@@ -210,11 +210,6 @@ PROPERTIES: tuple[Property, ...] = (
         "Whether the garment collides with itself.", "Self-Collision", CONTACT, uniform=True,
     ),
     Property(
-        GARMENT_API, "physgraph:contact:layer", "int", None, "", None, None,
-        "Order among garments: lower is nearer to the body; garments with equal or no layer are not ordered.",
-        "Layer", CONTACT, (-10, 10), uniform=True,
-    ),
-    Property(
         GARMENT_API, "physgraph:colliders", "rel", None, "", None, None,
         "Colliders of this garment; empty means every collider prim on the stage.", "Colliders", CONTACT,
     ),

@@ -34,7 +34,7 @@ def _trousers(times: np.ndarray) -> PlainMesh:
     cage = trousers(cells, lambda height: GAPS[0] + 0.015 * ease((0.62 - height) / 0.35))
     late = 0.006 * ease((0.5 - cage.points[:, 1]) / 0.4)
     samples = np.stack([walk(cage.points, time - late) for time in times])
-    return _garment("Trousers", cage, samples, Look("Denim", (0.12, 0.17, 0.30)), fabric=PRESETS["denim"], layer=0)
+    return _garment("Trousers", cage, samples, Look("Denim", (0.12, 0.17, 0.30)), fabric=PRESETS["denim"])
 
 
 def _shirt(times: np.ndarray) -> PlainMesh:
@@ -46,7 +46,7 @@ def _shirt(times: np.ndarray) -> PlainMesh:
         phase = 2 * np.pi * (time - 0.06) / 0.625
         swing = 0.004 * ease(time / 0.35) * np.array([np.sin(0.5 * phase), 0.0, np.sin(phase)])
         samples.append(walk(cage.points, time) + free[:, None] * swing)
-    return _garment("Shirt", cage, np.stack(samples), Look("Cotton", (0.72, 0.70, 0.64)), layer=1)
+    return _garment("Shirt", cage, np.stack(samples), Look("Cotton", (0.72, 0.70, 0.64)))
 
 
 def _belt(times: np.ndarray) -> PlainMesh:
@@ -54,15 +54,14 @@ def _belt(times: np.ndarray) -> PlainMesh:
     cage = tube(WAIST + np.linspace(0.0225, -0.0225, 4), 44, lambda height: np.full_like(height, GAPS[2]))
     samples = np.stack([walk(cage.points, time) for time in times])
     look = Look("Leather", (0.16, 0.09, 0.05), 0.5)
-    return _garment("Belt", cage, samples, look, fabric=PRESETS["leather"], layer=2)
+    return _garment("Belt", cage, samples, look, fabric=PRESETS["leather"], loose=False)
 
 
 def _garment(
-    name: str, cage: Cage, samples: np.ndarray, look: Look, *, layer: int, fabric: Fabric = PRESETS["cotton"]
+    name: str, cage: Cage, samples: np.ndarray, look: Look, *, fabric: Fabric = PRESETS["cotton"], loose: bool = True
 ) -> PlainMesh:
     """A garment; all but the belt are larger at rest and held by their top row."""
     points, top = cage.points, cage.points[:, 1] > cage.points[:, 1].max() - 1e-6
-    loose = layer < 2
     rest = (points - (0.0, WAIST, 0.0)) * (WIDER, LONGER, WIDER) + (0.0, WAIST, 0.0)
     return mesh(
         name,
@@ -73,5 +72,4 @@ def _garment(
         uv=cage.uv,
         pin=top.astype(float) if loose else None,
         fabric=fabric,
-        layer=layer,
     )

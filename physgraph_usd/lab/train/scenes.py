@@ -62,7 +62,7 @@ def moving_scene(rng: np.random.Generator, *, kind: str, frames: int, most_verti
     one, level = np.ones(len(rest)), 2 if len(rest) * 16 <= most_vertices and rng.random() < 0.6 else 1
     felt = (0,) if bodies else ()
     bent = bool(rng.random() < 0.3)
-    garment = Garment("/Cloth", mesh, edge * rest, level, False, bent, one, one, one, one, 0.0 * one, felt)
+    garment = Garment("/Cloth", mesh, edge * rest, level, bent, one, one, one, one, 0.0 * one, felt)
     fabric, guide = material(rng)
     turn = Rotation.random(random_state=rng).as_matrix() if kind == "tube" else np.eye(3)
     colliders = (Collider("/Body", "mesh"),) if bodies else ()

@@ -24,7 +24,7 @@ from .absence import Samples, absence
 from .cage import PointReader, read_cage
 from .grain import read_grain
 from .materials import Values, find_values
-from .placement import check_matrix, check_placement, is_flipped, place, to_metres
+from .placement import check_matrix, check_placement, place, to_metres
 from .rest import Animation, Rest, read_rest, rests_bent
 from .skinning import Bake
 
@@ -151,7 +151,6 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         str(prim.GetPath()),
         weld.mesh,
         weld.joined(rest.points),
-        flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
         **constants | pieces | painted,
@@ -192,17 +191,16 @@ def _animation(
 
 def _constants(prim: Usd.Prim, request: Request) -> tuple[dict[str, Any], dict[str, str]]:
     """Values of a garment that never change over a shot, by field name, and their sources by schema name."""
-    names = ("contact:selfCollision", "contact:layer", "refine:raiseBending", "refine:level")
-    self_contact, layer, raises, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
+    names = ("contact:selfCollision", "refine:raiseBending", "refine:level")
+    self_contact, raises, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
     if request.level is not None and level.source != "--set":
         level = Found(level.row, "--level", None, request.level)
     found = {
         "self_contact": bool(self_contact.at(None)),
-        "layer": None if (order := layer.at(None)) is None else round(order),
         "raises_bending": bool(raises.at(None)),
         "level": round(level.at(None) or 0.0),
     }
-    each = zip(names, (self_contact, layer, raises, level), strict=True)
+    each = zip(names, (self_contact, raises, level), strict=True)
     return found, {name: value.source for name, value in each}
 
 

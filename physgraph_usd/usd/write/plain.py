@@ -88,7 +88,6 @@ class PlainMesh:
         pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,), or None.
         fabric: Material values authored on a garment, or None.
         level: Number of subdivisions authored on a garment.
-        layer: Place in the order of garments, 0 innermost, or None.
         skin: Weights on the stage's skeleton, or None.
         left_handed: Whether faces run clockwise seen from outside.
         scheme: USD subdivision scheme.
@@ -107,7 +106,6 @@ class PlainMesh:
     pin: np.ndarray | None = None
     fabric: Fabric | None = None
     level: int = 2
-    layer: int | None = None
     skin: Skin | None = None
     left_handed: bool = False
     scheme: str = "none"

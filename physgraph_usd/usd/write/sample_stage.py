@@ -126,10 +126,9 @@ def _material(stage: Usd.Stage, look: Look) -> UsdShade.Material:
 def _write_garment(prim: Usd.Prim, mesh: PlainMesh) -> None:
     """Apply the garment schema by name and author its values."""
     prim.AddAppliedSchema("PhysGraphGarmentAPI")
-    for name, value in {"refine:level": mesh.level, "contact:layer": mesh.layer}.items():
-        if value is not None:
-            whole = Sdf.ValueTypeNames.Int
-            prim.CreateAttribute(f"physgraph:{name}", whole, False, Sdf.VariabilityUniform).Set(value)
+    if mesh.level is not None:
+        name, whole = "physgraph:refine:level", Sdf.ValueTypeNames.Int
+        prim.CreateAttribute(name, whole, False, Sdf.VariabilityUniform).Set(mesh.level)
     for name, value in ({} if mesh.fabric is None else fabric_values(mesh.fabric)).items():
         prim.CreateAttribute(f"physgraph:material:{name}", Sdf.ValueTypeNames.Float, False).Set(value)
 

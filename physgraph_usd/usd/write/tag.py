@@ -26,7 +26,6 @@ def tag(
     garments: Sequence[str] = (),
     colliders: Sequence[str] = (),
     preset: str | None = None,
-    layer: int | None = None,
     side: str | None = None,
     values: Mapping[str, Mapping[str, float]] | None = None,
     asset_paths: str = "relative",
@@ -40,7 +39,6 @@ def tag(
         garments: Prim paths, names, globs or collections of meshes; with a preset and without these, the tagged ones.
         colliders: The same, of anything with a surface.
         preset: Name of a fabric whose values are authored on the garments, or None.
-        layer: Place of the garments in the order of garments, lower is nearer to the body, or None.
         side: Where cloth belongs at the colliders, one of `SIDES`, or None.
         values: Of each garment, by its prim path: values to author, by the schema's short names, after the preset's.
         asset_paths: "relative" or "absolute": how the layer names the shot.
@@ -60,9 +58,9 @@ def tag(
     _check_word("preset", preset, sorted(PRESETS))
     _check_word("side", side, SIDES)
     _check_word("asset path", asset_paths, ASSET_PATHS)
-    if (layer is not None and not garments) or (side is not None and not colliders):
-        raise UsageError("a layer is for garments and a side for colliders; name one")
-    _check_values(values or {}, layer)
+    if side is not None and not colliders:
+        raise UsageError("a side is for colliders; name one")
+    _check_values(values or {})
     target = Path(out)
     check_suffix("the layer", target, LAYER_SUFFIXES)
     check_targets([("the layer", target)], files_of(shot))
@@ -76,7 +74,6 @@ def tag(
     for prim in cloth:
         spec = _applied(root, prim, GARMENT_API)
         authored = {} if preset is None else every_fabric_value(PRESETS[preset])
-        authored |= {} if layer is None else {"contact:layer": layer}
         for name, value in (authored | dict((values or {}).get(str(prim.GetPath()), {}))).items():
             _author_over(spec, prim, GARMENT[name], value)
     for prim in solid:
@@ -92,11 +89,10 @@ def _check_word(what: str, word: str | None, words: Sequence[str]) -> None:
         raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(words)}")
 
 
-def _check_values(values: Mapping[str, Mapping[str, float]], layer: int | None) -> None:
+def _check_values(values: Mapping[str, Mapping[str, float]]) -> None:
     """Refuse a value that refining would refuse."""
-    every = {**values, "/": {} if layer is None else {"contact:layer": layer}}
     try:
-        for path, items in every.items():
+        for path, items in values.items():
             for name, value in items.items():
                 check_limits(GARMENT[name], value, f"<{path}>")
     except SchemaError as error:

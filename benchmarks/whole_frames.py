@@ -1,6 +1,6 @@
-"""What `auto` is to choose: energy against time of both integrators, cold and warm, shot by shot and level by level.
+"""Energy against time of both integrators, cold and warm, shot by shot and level by level.
 
-    python -m benchmarks.choice [FOLDER] [--levels 1,2] [--shots flag,10_style3d] [--device cuda] [--jobs 16]
+    python -m benchmarks.whole_frames [FOLDER] [--levels 1,2] [--shots flag,10_style3d] [--device cuda] [--jobs 16]
         [--seconds 300] [--journal FILE]
 
 FOLDER holds the real shots, which we may not ship. Each shot at each level is measured in a process of its own, on one
@@ -10,8 +10,8 @@ on. Time is of solving (on the CPU one core's processor time, on CUDA the wall's
 is their mean, judged anew at the positions returned, contact included.
 
 A ratio is a method's time over the least time of any method to the same energy; up to 1.1 counts as level. What was
-measured lies in the journal, build/choice.DEVICE.jsonl unless it is named: what is there is not measured again, and
-`--jobs 0` prints its table.
+measured lies in the journal, build/whole_frames.DEVICE.jsonl unless it is named: what is there is not measured again,
+and `--jobs 0` prints its table.
 """
 
 from __future__ import annotations
@@ -41,8 +41,6 @@ from benchmarks.temporal import detail_of
 from physgraph_usd.lab.chart.problem import DEFAULT, judge, plain_detail
 from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.frame import solve as solving
-from physgraph_usd.solver.frame.problem import LONGER, LONGER_CUDA
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import METHODS
@@ -80,6 +78,8 @@ COARSE = ("04_tiered_dress_kick_zup.usdc",)
 """Those that take too long at more than one subdivision."""
 STEPS = (12, 6, 24, 3)
 """Steps of the finest level; alone it takes `LONGER` times as many."""
+LONGER = {"cpu": 4, "cuda": 8}
+"""How many times as many steps the finest level takes alone, by device."""
 COLD_AFTER = (0, 3)
 """Frames after the first that are solved cold."""
 LEVEL_WITH = 1.1
@@ -109,7 +109,7 @@ def main(
     if one:
         name, level = one.rsplit(":", 1)
         return measure(name, int(level), folder, device, seconds)
-    journal = journal or Path("build") / f"choice.{device.partition(':')[0]}.jsonl"
+    journal = journal or Path("build") / f"whole_frames.{device.partition(':')[0]}.jsonl"
     journal.parent.mkdir(parents=True, exist_ok=True)
     journal.touch()
     known = {(row["shot"], row["level"]) for row in read(journal)}
@@ -137,7 +137,7 @@ def run_all(
     journal: Path,
     jobs: int,
     *,
-    program: str = "benchmarks.choice",
+    program: str = "benchmarks.whole_frames",
 ) -> None:
     """Measure cases side by side, each on a core of its own; their rows go to the journal as they come."""
     cores: queue.Queue[int] = queue.Queue()
@@ -174,7 +174,7 @@ def read(journal: Path) -> Iterator[dict[str, Any]]:
 
 def ways(device: str) -> Iterator[tuple[str, int, SolveSettings]]:
     """Every method by its name with its steps over the finest level's, those that tell most first."""
-    more = LONGER if device == "cpu" else LONGER_CUDA
+    more = LONGER[device.partition(":")[0]]
     for steps in STEPS:
         if steps == DEFAULT.steps:
             yield "auto", steps, DEFAULT
@@ -217,58 +217,47 @@ class Bench:
 
     def __init__(self, shot: Shot, level: int, device: str, about: dict[str, Any]) -> None:
         """Build the levels."""
-        self._about, self._seen = about, list[dict[str, Any]]()
+        self._about = about
         self._clock = time.process_time if device == "cpu" else time.perf_counter
         levels = [level] * len(shot.scene.garments)
         self._refiner = Refiner(shot.scene, DEFAULT, levels=levels, device=device, threads=1)
-        choose = solving.choose
-
-        def noted(problem: Any, nested: bool | None) -> Any:
-            began = self._clock()
-            known = ("finest", "warm", "crossed", "crowding", "remaining")
-            self._seen.append({key: getattr(problem, key) for key in known})
-            self._seen[-1]["ms"] = 1e3 * (self._clock() - began)
-            return choose(problem, nested)
-
-        solving.choose = noted
 
     def run(self, method: str, steps: int, settings: SolveSettings, *rows: Sequence[Frame]) -> None:
         """Solve frames in a row, each row from a cold start, and write a row for each frame; none without a method."""
         for frames in rows:
             self._refiner.use(settings)
             solved, details = [self._solved(frame) for frame in frames], list[np.ndarray]()
-            for number, (frame, (state, spent, seen)) in enumerate(zip(frames, solved, strict=True)):
+            for number, (frame, (state, spent)) in enumerate(zip(frames, solved, strict=True)):
                 points = [each for each in state.points if each is not None]
                 found = judge(self._refiner, frame, points)
                 details.append(detail_of(self._refiner, frame, state.points))
                 row = self._about | {"method": method, "steps": steps, "time": frame.time, "number": number}
                 row |= {"ms": round(spent, 3), "energy": found.energy, "body": found.crossings, "cloth": found.tangles}
-                row |= {"inside": found.inside, "jumps": jumps(np.array(details[-3:])), "seen": seen}
+                row |= {"inside": found.inside, "jumps": jumps(np.array(details[-3:]))}
                 row["unsettled"] = sum(unsettled(each, DEFAULT.tolerance) is not None for each in state.telemetry)
                 row["vertices"] = sum(map(len, points))
-                row["made"], row["chosen"] = made(state.telemetry)
+                row["made"] = made(state.telemetry)
                 if method:
                     say(json.dumps(row))
 
-    def _solved(self, frame: Frame) -> tuple[Any, float, list[dict[str, Any]]]:
-        """A frame's state, its time of solving [ms] and what the choice saw of it."""
-        self._seen.clear()
+    def _solved(self, frame: Frame) -> tuple[Any, float]:
+        """A frame's state and its time of solving [ms]."""
         wall, began = time.perf_counter(), self._clock()
         state = self._refiner.solve(frame)
         busy = (self._clock() - began) / (time.perf_counter() - wall)
         entries: list[Any] = list({id(each["levels"]): each for each in state.telemetry if "levels" in each}.values())
         spent = sum(each["milliseconds"]["solve"] for each in entries)
-        return state, busy * spent - sum(each["ms"] for each in self._seen), list(self._seen)
+        return state, busy * spent
 
 
-def made(telemetry: Sequence[Mapping[str, Any]]) -> tuple[dict[str, int], str]:
-    """How many steps each mover made, and what was chosen."""
+def made(telemetry: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """How many steps each mover made."""
     movers: dict[str, int] = defaultdict(int)
     for entry in {id(each["levels"]): each for each in telemetry if "levels" in each}.values():
         for report in entry["levels"]:
             for mover, count in report["movers"].items():
                 movers[mover] += count
-    return dict(movers), "; ".join(dict.fromkeys(str(each.get("chosen", "")) for each in telemetry))
+    return dict(movers)
 
 
 def report(rows: Sequence[dict[str, Any]]) -> None:
