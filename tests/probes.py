@@ -215,7 +215,7 @@ def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int 
 def hang(level: Level, start: np.ndarray, fabric: Fabric) -> np.ndarray:
     """Rest positions of a pinned sheet under its own weight, z up."""
     weight = Gravity(level, torch.tensor([fabric.density]), np.array([0.0, 0.0, -G]))
-    forces = (*elastic_terms(level, [fabric], potential="continuum"), weight)
+    forces = (*elastic_terms(level, [fabric]), weight)
     return relax(level, forces, torch.as_tensor(start)).numpy()
 
 

@@ -109,7 +109,6 @@ class RefineOptions:
     )
     mode: str = _layer("over", "Refine in place, or beside the coarse mesh.", choices=("over", "sibling"))
     temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
-    potential: str = _solver("continuum", "Which form of the energy.", choices=("continuum", "paper"))
     contact: str = _solver("quadratic", "How bodies push the cloth.", choices=("quadratic", "off"))
     self_contact: str = _solver("auto", "How cloth pushes cloth.", choices=("auto", "off"))
     workers: int = _solver(
@@ -204,7 +203,6 @@ class RefineOptions:
             budget_ms=self.budget_ms,
             frame_limit=self.frame_limit,
             temporal=self.temporal,
-            potential=self.potential,
             contact=self.contact_settings(),
         )
 
