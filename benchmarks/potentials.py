@@ -25,12 +25,12 @@ from benchmarks.rows import Found, Row, run_alone, table, under
 from benchmarks.shots import distances, frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import Problem, with_garments
 from physgraph_usd.lab.chart.reference import Reference, find_reference
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.forces import body_terms, elastic_terms
 from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.integrate import METHODS, Method
-from physgraph_usd.solver.integrate.learned import integrator_of
-from physgraph_usd.solver.integrate.weights import shipped_network
+from physgraph_usd.solver.integrate import Method
+from physgraph_usd.solver.integrate.weights import integrator_of, shipped_network
 from physgraph_usd.solver.level import Level, hinge_geometry
 from physgraph_usd.solver.scene import Frame
 
@@ -211,7 +211,7 @@ def in_paper_form(problem: Problem, frame: Frame, points: Sequence[np.ndarray]) 
         }
         for term in terms:
             term.add_force(x, torch.zeros_like(x))
-            energy, owner = term.split(x)
+            energy, owner = term.split(x)  # pyright: ignore[reportAttributeAccessIssue]
             found[term.name] += float((energy * weights[term.name] / area[owner.long()]).sum())
     return found
 

@@ -45,7 +45,8 @@ from physgraph_usd.lab.chart.reference import Solutions
 from physgraph_usd.lab.chart.run import chart_shot
 from physgraph_usd.lab.chart.table import Chart, Point, collate, typical
 from physgraph_usd.lab.chart.words import advice, settings
-from physgraph_usd.solver.integrate import METHODS, Method
+from physgraph_usd.lab.methods import METHODS
+from physgraph_usd.solver.integrate import Method
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.scene import Frame
 

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 """The integrator that is chosen frame by frame; always known."""
-INTEGRATORS = (
-    AUTO, "quasi-newton", "quasi-newton-flat", "lbfgs", "adam", "gd", "newton", "physgraph", "physgraph-paper",
-)  # fmt: skip
-"""Names of `integrate.METHODS`, which imports torch."""
+INTEGRATORS = (AUTO, "quasi-newton", "physgraph")
+"""Names of the solver's own methods in `integrate.METHODS`, which imports torch."""
 REPORT_NAME, PAGE_NAME = "report.json", "report.html"
 """Names of the report and its page in a folder of their own."""
 LIST = "; repeatable"
